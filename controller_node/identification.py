@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from controller_node.policy import ProjectedLaw
@@ -22,6 +23,7 @@ from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
+from loop_method.reduce.subspace import subspace_model
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,9 @@ class DesignSettings:
         Magnitude at which actions saturate; 0: none. The gains are designed without it.
     cost : sequence of str
         The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it.
-    identification : {"field", "regression", "dmdc"}
-        "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
+    identification : {"field", "regression", "subspace", "dmdc"}
+        "field": the regression, or a law from a model of the whole field (`field_law`) that is better;
+        "subspace": a model in innovation form, for a law with a filter gain.
     dmdc_rank, dmdc_order : int
         p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
     law : str
@@ -119,7 +122,9 @@ def examined(
     channels: Channels = NUMBERED,
 ) -> Identifiability:
     """How well trajectories determine a model of `identify` or `design`; p as given there."""
-    found = examine(trajectories, model.U, channels)
+    # Of a model in innovation form: the directions of the measurements that it sees.
+    U = linalg.orth(model.U) if method == "subspace" else model.U
+    found = examine(trajectories, U, channels)
     if method != "dmdc":
         return found
     more = dmdc.truncation_remarks(trajectories, p or sum(np.shape(model.B)), channels)
@@ -129,7 +134,7 @@ def examined(
 def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
     """ValueError if one episode of this many steps is too short for the requested model."""
     n_s, n_a = min(model_order(asdict(settings)), state_size), settings.n_a
-    if not n_s:
+    if not n_s or settings.identification == "subspace":
         return  # as the data suggest
     if settings.identification == "dmdc":
         dmdc.check_sizes(settings.dmdc_rank or n_s + n_a, n_s, n_z=state_size, n_a=n_a, steps=steps)
@@ -184,6 +189,21 @@ def designed(
     ValueError
         The data allow or determine no model of this order, or the model no stabilising gains.
     """
+    weights: dict[str, Any] = {
+        "state_weight": settings.state_weight,
+        "action_weight": settings.action_weight,
+        "cost": Cost.parse(settings.cost),
+    }
+    filtered = settings.law in FILTERED
+    if settings.identification == "subspace":
+        if not filtered:
+            raise ValueError(
+                "the identification 'subspace' gives a filter, which the law "
+                f"'{settings.law}' does not have; take the law 'observer'"
+            )
+        every = [*trajectories, *further]
+        found_model = subspace_model(every, order=settings.reduced_order, channels=channels)
+        return Designed(lqg.law_of_innovations(found_model, target, **weights))
     truncated = settings.identification == "dmdc"
     model = identify(
         trajectories,
@@ -192,15 +212,9 @@ def designed(
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
     )
-    weights: dict[str, Any] = {
-        "state_weight": settings.state_weight,
-        "action_weight": settings.action_weight,
-        "cost": Cost.parse(settings.cost),
-    }
     gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
-    filtered = settings.law in FILTERED
     if settings.identification != "field":
         return Designed(lqg.with_filter(rows, trajectories) if filtered else rows)
     with threadpool_limits(limits=1):  # as in the identification itself

@@ -46,6 +46,13 @@ class ModelRows:
         """[K_a K_b], shape (n_a, 2 n_s)."""
         return np.hstack([self.K_a, self.K_b])
 
+    @property
+    def measurement(self) -> Array:
+        """What a reduced state looks like, z = measurement @ s, (n_z, n_s); U, if orthonormal."""
+        if self.L is None:
+            return self.U
+        return np.asarray(np.linalg.pinv(self.U.T), dtype=np.float64)
+
 
 def pack(model: ModelRows) -> Array:
     """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s), with a filter gain n_s more."""

@@ -74,12 +74,13 @@ ACTUATORS = _section(
 IDENTIFICATION = Spec(
     "identification",
     "regression",
-    choices=("field", "regression", "dmdc"),
+    choices=("field", "regression", "subspace", "dmdc"),
     nodes="CT",
     group="budget and method",
 ).means(
     "regression: least squares in reduced coordinates; field: a linearised model of the whole field, "
-    "where its law is better; dmdc: the paper's truncated DMDc. An optimizer may have a default of "
+    "where its law is better; subspace: a model in innovation form with its filter, from measurements "
+    "alone, for the law observer; dmdc: the paper's truncated DMDc. An optimizer may have a default of "
     "its own: model_based has field, two_point dmdc"
 )
 

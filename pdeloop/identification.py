@@ -144,9 +144,14 @@ class Identified:
         if self.channels.states and self.channels.inputs:
             states, inputs = (_row(own) for own in (self.channels.states, self.channels.inputs))
             names = f", with z = {states} and a = {inputs}"
+        assert isinstance(self.model, ModelRows)
+        law = "a = K_a U^T z + K_b s_r"
+        if self.model.L is not None:
+            law = "a = K_a x + K_b s_r, x = p + L (U^T z - p), and then p = A x + B a"
+            names += "; p = U^T z at first"
         return [
             *loop.text(self.sample_time),
-            f"to apply the law elsewhere: a = K_a U^T z + K_b s_r{every}{names}",
+            f"to apply the law elsewhere: {law}{every}{names}",
         ]
 
 
@@ -228,7 +233,9 @@ def _identified(
     remarks: tuple[str, ...] = (),
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
-    if given.get("reduced_order", 0) > n_z:
+    known = {**recorded, **given}
+    of_past = known.get("identification") == "subspace" and target is not None
+    if given.get("reduced_order", 0) > n_z and not of_past:
         raise ParameterError(
             f"expected an order of at most {n_z}, the numbers of a state, got {given['reduced_order']}"
         )
@@ -241,7 +248,7 @@ def _identified(
         raise ParameterError(
             f"{flags} weigh a law, for which there is no target: give --target too"
         )
-    values = {**recorded, **given}
+    values = known
     study, none = None, ""
     try:
         study = study_orders(trajectories, channels=channels)
@@ -250,10 +257,15 @@ def _identified(
     except ValueError as error:  # too few steps; the model itself may still be had
         none = str(error)
     defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
-    order = model_order({**defaults, **values}) or (study and study.suggested)
-    if not order:
+    suggested = None if of_past else study and study.suggested
+    order = model_order({**defaults, **values}) or suggested
+    if not order and not of_past:
         raise ParameterError(f"no order can be suggested: {none}; or give one with --order")
-    own = {"n_a": trajectories[0][1].shape[1], "reduced_order": order, "dmdc_order": order}
+    own = {
+        "n_a": trajectories[0][1].shape[1],
+        "reduced_order": order or 0,
+        "dmdc_order": order or 0,
+    }
     settings = DesignSettings.of({**defaults, **values, **own})
     method, p = settings.identification, settings.dmdc_rank
     if given.get("dmdc_rank") and method != "dmdc":
@@ -261,8 +273,10 @@ def _identified(
             f"--rank is that of the identification dmdc, and this one is {method}: "
             "add --identification dmdc, or leave --rank out"
         )
-    if target is None and given.get("identification") == "field":
-        raise ParameterError("--identification field designs a law for a target: give --target too")
+    if target is None and method in ("field", "subspace") and "identification" in given:
+        raise ParameterError(
+            f"--identification {method} designs a law for a target: give --target too"
+        )
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
     if target is not None:
@@ -295,9 +309,9 @@ def _identified(
 def save(found: Identified, path: Path) -> None:
     """Write the model as an .npz archive.
 
-    A, B, U, with a target also K_a, K_b, s_r and `model`, the rows of the topic; sample_time and the
-    names of the channels where they are known; the arrays of a model of the whole field, with `field_`
-    in front of their names.
+    A, B, U, with a target also K_a, K_b, s_r, with a filter L, and `model`, the rows of the topic;
+    sample_time and the names of the channels where they are known; the arrays of a model of the whole
+    field, with `field_` in front of their names.
     """
     model = found.model
     arrays: dict[str, Any] = {

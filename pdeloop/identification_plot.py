@@ -69,14 +69,15 @@ def plot(found: Identified) -> Figure:
 
 
 def predicted(model: ReducedModel | ModelRows, states: Array, actions: Array) -> Array:
-    """U s_k of the model under the recorded actions, from s_0 = U^T z_0, (N + 1, n_z)."""
+    """The measurements of the model under the recorded actions, from s_0 = U^T z_0, (N + 1, n_z)."""
     s = model.U.T @ states[0]
     reduced = [s]
     with np.errstate(over="ignore", invalid="ignore"):
         for a in actions:
             s = model.A @ s + model.B @ a
             reduced.append(s)
-    return np.asarray(np.array(reduced) @ model.U.T)
+    seen = model.measurement if isinstance(model, ModelRows) else model.U
+    return np.asarray(np.array(reduced) @ seen.T)
 
 
 def _orders(ax: Axes, study: OrderStudy | None, order: int) -> None:

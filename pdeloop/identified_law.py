@@ -93,4 +93,6 @@ def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) ->
         reduced.append(s)
         applied.append(a)
     recorded = np.abs(actions).max(axis=0)
-    return ClosedLoop(np.array(reduced) @ law.U.T, np.array(applied), target, radius, recorded)
+    return ClosedLoop(
+        np.array(reduced) @ law.measurement.T, np.array(applied), target, radius, recorded
+    )

@@ -112,6 +112,11 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
             f"the optimizer '{values['optimizer']}' improves the gains of the law 'affine' alone, and "
             f"the law is '{values['law']}'; take an optimizer that knows no law, such as two_point"
         )
+    if values["identification"] == "subspace" and law.name not in FILTERED:
+        raise ParameterError(
+            f"the identification 'subspace' is for the law {' or '.join(FILTERED)}, and the law is "
+            f"'{law.name}'; give --law {FILTERED[0]}, or another identification"
+        )
     return law
 
 

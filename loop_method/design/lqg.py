@@ -32,9 +32,11 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
-from loop_method.design.lqt import DesignError
-from loop_method.reduce.reduced_model import Steps, repeated, steps_of
+from loop_method.design.lqt import DesignError, track_outputs
+from loop_method.reduce.reduced_model import ReducedModel, Steps, repeated, steps_of
+from loop_method.reduce.subspace import InnovationModel
 
 _SEEN = 1e-10
 """A mode that the readings show by less than this, relative to the mode that they show best, counts as
@@ -211,3 +213,53 @@ def _measured_variance(AV: Array, parts: Sequence[Array]) -> float:
     error = float(np.std(products, ddof=1)) / np.sqrt(len(products))
     weight = float(np.sum(AV * AV))
     return found / weight if weight > 0.0 and found > _STANDARD_ERRORS * error else 0.0
+
+
+def law_of_innovations(
+    model: InnovationModel,
+    target: Array,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+) -> ModelRows:
+    """The LQG law of a model in innovation form, for the cost of what is measured.
+
+    The gains K_a are those of the state x, of which y = U C x is the target. s = C^+ U^T z is the least
+    state with a measurement z; as A M = G gives the innovations' gain in the estimate after it,
+    L = M C lets L s = M U^T z.
+
+    Parameters
+    ----------
+    model : InnovationModel
+        Of the plant as it is measured.
+    target : (n_z,) array
+        z_r, of what is measured.
+    state_weight, action_weight : float
+        q and r.
+    cost : Cost, optional
+        In place of them.
+
+    Raises
+    ------
+    DesignError
+        The actuators do not reach a mode that does not decay, or the measurements do not see one.
+    """
+    A, B, C = model.A, model.B, model.C
+    n_z, n_a = len(model.U), B.shape[1]
+    if cost is None or cost.plain:
+        cost = Cost(
+            n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
+        )
+    with threadpool_limits(limits=1):
+        require_detectable(A, C)
+        seen = ReducedModel(A, B, model.U @ C)
+        gains = track_outputs(seen, cost)
+        b = gains.K_b @ (seen.U.T @ cost.field_target)
+        back = linalg.pinv(C)
+        M = linalg.lstsq(A, model.G)[0]
+        U = model.U @ back.T
+        s_r = U.T @ target
+        size = float(s_r @ s_r)
+        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(gains.K_a)
+    return ModelRows(A=A, B=B, U=U, K_a=gains.K_a, K_b=K_b, s_r=s_r, L=M @ C)

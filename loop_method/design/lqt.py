@@ -132,7 +132,7 @@ def track(
     if not isinstance(model, ReducedModel):
         raise ValueError(f"model is {model!r}; expected a ReducedModel")
     if cost is not None and not cost.plain:
-        return _track_any(model, cost)
+        return track_outputs(model, cost)
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
@@ -148,8 +148,11 @@ def track(
     return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles)
 
 
-def _track_any(model: ReducedModel, cost: Cost) -> Gains:
-    """The gains of any quadratic cost; see `loop_method.design.tracking` for its terms."""
+def track_outputs(model: ReducedModel, cost: Cost) -> Gains:
+    """The gains of any quadratic cost; see `loop_method.design.tracking` for its terms.
+
+    The columns of U need not be orthonormal: it is what the state looks like, z = U s.
+    """
     with threadpool_limits(limits=1):
         E, R = cost.residual(model.U), cost.action_matrix
         P, S, K_a, poles = _feedback(model, model.B, E.T @ E, R)

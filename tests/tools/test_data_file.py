@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loop_interfaces.model_rows import unpack
+from loop_method.laws import Observer
+from loop_method.laws.calls import along
 from loop_method.reduce.regression import exact_regression
 from pdeloop import data_file
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import read_measurements
 from tests.support.linear_system import linear_system, trajectory
+from tuner_node.build import read_model
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "measurements.csv"
 Array = np.ndarray
@@ -140,6 +144,33 @@ def refused(path: Path, words: str) -> None:
     with pytest.raises(ValueError, match=words) as failed:
         read_measurements(path)
     assert "\n" not in str(failed.value) and path.name in str(failed.value)
+
+
+def test_a_law_with_a_filter_is_identified_and_applied_as_it_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, words = tmp_path / "model.npz", ["identify", "--data", str(EXAMPLE)]
+    assert main([*words, "--identification", "subspace"]) == FAILED
+    assert "gives a filter, which the law 'affine' does not have" in capsys.readouterr().err
+    filtered = ["--law", "observer", "--identification", "subspace", "--out", str(out)]
+    assert main([*words, *filtered]) == 0
+    assert "x = p + L (U^T z - p), and then p = A x + B a" in capsys.readouterr().out
+    rows = read_model(out, 2, "observer")
+    m = unpack(rows, 2, "observer")
+    law = Observer(m, 60)
+    (states, actions), *_ = read_measurements(EXAMPLE).trajectories
+    p, expected = m.U.T @ states[0], []
+    for z, a in zip(states, actions, strict=False):
+        x = p + m.L @ (m.U.T @ z - p)
+        expected.append(m.K_a @ x + m.K_b @ m.s_r)
+        p = m.A @ x + m.B @ a
+    np.testing.assert_allclose(
+        along(law, law.theta_start, states[:-1], actions), expected, atol=1e-9
+    )
+    with pytest.raises(
+        ValueError, match="designed for the law 'observer', and the law is 'affine'"
+    ):
+        read_model(out, 2)
 
 
 def test_the_command_line_says_it_in_one_line(

@@ -35,11 +35,12 @@ def test_a_controller_that_is_killed_under_a_law_with_memory_changes_nothing(
     loop: Processes, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    words = [str(SMALL), "--law", "observer", "--iterations", "60", "--out", str(out)]
-    run = loop.pdeloop("train", *words)
+    law = {"law": "observer", "identification": "subspace"}
+    flags = [word for name, value in law.items() for word in (f"--{name}", value)]
+    run = loop.pdeloop("train", str(SMALL), *flags, "--iterations", "60", "--out", str(out))
     until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
     (pid,) = loop.pids("controller_node")
     os.kill(pid, signal.SIGKILL)
     told = loop.wait(run, LIMIT)
     assert "controller_node was killed by SIGKILL; starting it again" in told
-    assert_same_training(out, train_here(parameters(law="observer", iterations=60)))
+    assert_same_training(out, train_here(parameters(**law, iterations=60)))

@@ -1,0 +1,308 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A model in innovation form from what is measured: predictor-based subspace identification.
+
+    x_{k+1} = A x_k + B a_k + G e_k,        y_k = U (C x_k + e_k)
+
+U holds the first r POD modes of the measurements z_k, at most as many as the order n. The innovations
+e_k are what the past does not tell of a measurement, so that the model is its own steady-state filter.
+Nothing is known of the state but that it is what the past says of the future:
+
+1. A vector ARX of p steps, by ridge regression whose weight generalised cross-validation chooses,
+
+       U^T z_k = sum_{i <= p} X_i [a_{k-i}; U^T z_{k-i}] + e_k,
+
+   has as coefficients the Markov parameters X_i = C (A - G C)^{i-1} [B G] of the predictor.
+2. From them follows what the last p steps say of the next p measurements. Its leading n directions over
+   the data, by a singular value decomposition, are the state, with the second moment I.
+3. C, and A and B, by least squares on these states. G is the gain of the Kalman filter with the
+   covariances of what both leave, whose Riccati equation makes it stable.
+
+p and n are those of the least error in predicting held-out measurements one step ahead.
+
+References
+----------
+Chiuso, "The role of vector autoregressive modeling in predictor-based subspace identification",
+Automatica 43(6), 2007 (1 to 3). Golub, Heath, Wahba, Technometrics 21(2), 1979 (generalised
+cross-validation).
+Van der Veen, van Wingerden, Bergamasco, Lovera, Verhaegen, "Closed-loop subspace identification
+methods: an overview", IET Control Theory & Applications 7(10), 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg
+from threadpoolctl import threadpool_limits
+
+from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import NUMBERED, Channels
+from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
+from loop_method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
+
+PASTS = (1, 2, 3, 4, 6, 8)
+"""Steps p of the vector ARX that are tried."""
+ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
+"""Orders that are tried where none is given."""
+FOLDS = 4
+"""Parts of the trajectories, each held out once."""
+AS_GOOD = 1.02
+"""Times the least error up to which a lower order is taken."""
+RESOLVED = 1e-10
+"""Least singular value of what the past says of the future, relative to the largest."""
+LEAST = 1e-8
+"""Least variance of an innovation, relative to that of the measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class InnovationModel:
+    """A model in innovation form.
+
+    Attributes
+    ----------
+    A, B, C, G : (n, n), (n, n_a), (r, n) and (n, r) arrays
+    U : (n_z, r) array
+        Orthonormal columns; U^T z is predicted by C x.
+    innovations : (r, r) array
+        Covariance of e.
+    past : int
+        p.
+    error : float
+        Of predicting held-out measurements one step ahead, relative to their changes in a step; NaN
+        where past and order were given.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    G: Array
+    U: Array
+    innovations: Array
+    past: int
+    error: float = np.nan
+
+
+def subspace_model(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    order: int = 0,
+    past: int = 0,
+    channels: Channels = NUMBERED,
+) -> InnovationModel:
+    """Identify a model in innovation form.
+
+    Parameters
+    ----------
+    trajectories : sequence of (measurements (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}. All numbers of z may be of a few points only.
+    order : int
+        n, or less where the data do not determine as many; 0: that of the least error on held-out data.
+    past : int
+        p; 0: that of the least error.
+    channels : Channels
+        Names of states and inputs in what is refused.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity, or data that do not determine a model.
+    """
+    data = steps_of(trajectories)
+    copies = repeated(trajectories)
+    known = [
+        (np.asarray(z, dtype=np.float64), np.asarray(a, dtype=np.float64))
+        for number, (z, a) in enumerate(trajectories)
+        if number not in copies
+    ]
+    with threadpool_limits(limits=1):
+        pasts = (past,) if past else PASTS
+        # The data may not determine as many states as were asked for.
+        asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)] or [ORDERS]
+        for asked in asked_for:
+            if tried := [(p, n) for p in pasts for n in asked if _determined(p, n, known)]:
+                break
+        else:
+            n_a = data.inputs.shape[1]
+            raise NotIdentifiableError(
+                f"{len(data.inputs)} steps do not determine a model with {n_a} inputs in innovation "
+                f"form: expected more than {n_a + 1} after the first ones of every part, while a "
+                "quarter is held out; take a longer horizon, or add a log"
+            )
+        if len(tried) == 1:
+            p, n = tried[0]
+            error = np.nan
+        else:
+            p, n, error = _choose(tried, known)
+        return _fitted(known, p, n, channels, error)
+
+
+def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
+    """Whether p steps can show n states, and samples are more than the unknowns of a row.
+
+    They are those after p steps, while a quarter of the data is held out.
+    """
+    n_z, n_a = known[0][0].shape[1], known[0][1].shape[1]
+    parts = _parts(known)
+    held = max(sum(max(len(a) - p, 0) for _, a in parts[i::FOLDS]) for i in range(FOLDS))
+    samples = sum(max(len(a) - p, 0) for _, a in parts) - held
+    return bool(n <= p * min(n, n_z) and n + n_a < samples)
+
+
+def _choose(
+    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory]
+) -> tuple[int, int, float]:
+    """p and n with the least error on parts that were held out, and that error."""
+    parts = _parts(known)
+    errors = np.full(len(tried), np.inf)
+    for i, (p, n) in enumerate(tried):
+        total = change = 0.0
+        for fold in range(FOLDS):
+            others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
+            own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
+            try:
+                model = _fitted(others, p, n, NUMBERED, np.nan, check=False)
+            except (linalg.LinAlgError, ValueError):
+                total = np.inf
+                break
+            for z, a in own:
+                wrong, moved = _missed(model, z, a)
+                total, change = total + wrong, change + moved
+        errors[i] = np.sqrt(total / change) if change > 0.0 else np.inf
+    if not np.isfinite(errors).any():
+        return (*tried[0], np.nan)
+    good = [i for i in range(len(tried)) if errors[i] <= AS_GOOD * errors.min()]
+    least = min(tried[i][1] for i in good)
+    best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
+    return (*tried[best], float(errors[best]))
+
+
+def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
+    """At least as many as there are folds, of one trajectory its quarters."""
+    if len(known) >= FOLDS:
+        return list(known)
+    cut: list[Trajectory] = []
+    for z, a in known:
+        edges = np.linspace(0, len(a), FOLDS + 1).astype(int)
+        cut += [(z[b : e + 1], a[b:e]) for b, e in pairwise(edges) if e > b]
+    return cut
+
+
+def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
+    """Sums of squares of what the filter misses one step ahead, and of the changes in a step.
+
+    The first steps, p at most, are the filter's to find the state.
+    """
+    begin = min(max(PASTS), len(a) // 2)
+    y = z @ model.U
+    outside = z - y @ model.U.T
+    x = linalg.pinv(model.C) @ y[0]
+    wrong = moved = 0.0
+    for k in range(len(a)):
+        x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x)
+        if k >= begin:
+            e = y[k + 1] - model.C @ x
+            wrong += float(e @ e) + float(outside[k + 1] @ outside[k + 1])
+            change = z[k + 1] - z[k]
+            moved += float(change @ change)
+    return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
+
+
+def _fitted(
+    known: Sequence[Trajectory],
+    p: int,
+    n: int,
+    channels: Channels,
+    error: float,
+    *,
+    check: bool = True,
+) -> InnovationModel:
+    """The model of given sizes. Call it with one LAPACK thread."""
+    after = np.concatenate([z[1:] for z, _ in known])
+    values = linalg.svdvals(after)
+    floor = max(after.shape) * np.finfo(np.float64).eps * values[0]
+    r = min(n, int(np.count_nonzero(values > floor)))
+    U, _ = leading_modes(after, max(r, 1), channels)
+    regressors, targets, firsts = [], [], []
+    for z, a in known:
+        if len(a) < p:
+            continue
+        w = np.hstack([a, z[:-1] @ U])
+        rows = np.stack([w[k - p : k].ravel() for k in range(p, len(a) + 1)])
+        regressors.append(rows)
+        targets.append(z[p:] @ U)
+        firsts.append(a[p:])
+    if not regressors:
+        raise ValueError(f"no trajectory has {p} steps")
+    past, y = np.concatenate(regressors), np.concatenate(targets)
+    if len(past) <= n:
+        raise ValueError(f"{len(past)} samples do not determine {n} states")
+    unit = np.sqrt(np.mean(past**2, axis=0))
+    unit[unit == 0.0] = 1.0
+    markov = _ridge(past / unit, y).T / unit
+    states, kept = _states(past, markov, p, r, n)
+    C, e = _regressed(states, y)
+    ends = np.cumsum([len(rows) for rows in regressors])
+    last = np.zeros(len(past), dtype=bool)
+    last[ends - 1] = True
+    before, next_ = states[~last], states[1:][~last[:-1]]
+    inputs = np.concatenate(firsts)
+    if check:
+        examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
+    joint, w = _regressed(np.hstack([before, inputs]), next_)
+    A, B = joint[:, :kept], joint[:, kept:]
+    e = e[~last]
+    count = len(e)
+    V, W, S = e.T @ e / count, w.T @ w / count, w.T @ e / count
+    level = LEAST * float(np.trace(y.T @ y)) / len(y) / r
+    V[np.diag_indices(r)] += level
+    W[np.diag_indices(kept)] += LEAST
+    try:
+        P = linalg.solve_discrete_are(A.T, C.T, W, V, s=S)
+    except (linalg.LinAlgError, ValueError) as failed:
+        raise NotIdentifiableError(
+            f"the measurements do not determine a stable filter of order {kept} ({failed}): take a "
+            "lower order, or excite more"
+        ) from failed
+    innovations = C @ P @ C.T + V
+    G = linalg.solve(innovations, (A @ P @ C.T + S).T, assume_a="pos").T
+    return InnovationModel(A, B, C, G, U, innovations, p, error)
+
+
+def _ridge(X: Array, y: Array) -> Array:
+    """Ridge regression whose weight has the least generalised cross-validation error, (d, r)."""
+    left, s, right = linalg.svd(X, full_matrices=False)
+    projected = left.T @ y
+    outside = float(np.sum(y * y) - np.sum(projected * projected))
+    least, chosen = np.inf, 0.0
+    for weight in s[0] ** 2 * np.logspace(-14, 0, 29):
+        shrunk = weight / (s * s + weight)
+        free = len(X) - float(np.sum(1.0 - shrunk))
+        if free <= 0.0:
+            continue
+        error = (max(outside, 0.0) + float(np.sum((shrunk[:, None] * projected) ** 2))) / free**2
+        if error < least:
+            least, chosen = error, weight
+    found: Array = right.T @ ((s / (s * s + chosen))[:, None] * projected)
+    return found
+
+
+def _states(past: Array, markov: Array, p: int, r: int, n: int) -> tuple[Array, int]:
+    """The states (N, n) that the past gives, of second moment I, and how many there are."""
+    block = past.shape[1] // p
+    rows = np.zeros((p * r, past.shape[1]))
+    for j in range(p):
+        rows[j * r : (j + 1) * r, j * block :] = markov[:, : (p - j) * block]
+    left, s, _ = linalg.svd(rows @ past.T / np.sqrt(len(past)), full_matrices=False)
+    kept = max(r, min(n, int(np.count_nonzero(s > RESOLVED * s[0]))))
+    states: Array = past @ rows.T @ (left[:, :kept] / s[:kept])
+    return states, kept
+
+
+def _regressed(X: Array, y: Array) -> tuple[Array, Array]:
+    """Coefficients (of y, of X) by least squares, and residuals."""
+    found = linalg.lstsq(X, y)[0]
+    return found.T, y - X @ found

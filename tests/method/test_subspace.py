@@ -1,0 +1,120 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Subspace identification: the model of a plant of which little is measured, and its law."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from loop_interfaces.cost import Cost
+from loop_method.design.lqg import kalman_filter, law_of_innovations
+from loop_method.design.lqt import DesignError, track_outputs
+from loop_method.laws import Observer
+from loop_method.reduce.channels import Channels
+from loop_method.reduce.identifiability import NotIdentifiableError
+from loop_method.reduce.reduced_model import ReducedModel
+from loop_method.reduce.subspace import InnovationModel, subspace_model
+
+N, N_A, N_Y = 4, 2, 3
+RNG = np.random.default_rng(2)
+A = RNG.standard_normal((N, N))
+A *= 0.95 / np.abs(linalg.eigvals(A)).max()
+B = np.diag([2.0, 1.0, 0.2, 3.0])[:, :N_A]  # unequal actuators
+C = RNG.standard_normal((N_Y, N))
+W, V = 0.05 * np.eye(N), 0.1 * np.eye(N_Y)
+Q, R = 1.0, 0.3
+
+
+@cache
+def measured(steps: int = 3000) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Two trajectories with white actions."""
+    found, rng = [], np.random.default_rng(7)
+    for _ in range(2):
+        x, a = rng.standard_normal(N), rng.standard_normal((steps, N_A))
+        y = []
+        for k in range(steps + 1):
+            y.append(C @ x + np.sqrt(V) @ rng.standard_normal(N_Y))
+            if k < steps:
+                x = A @ x + B @ a[k] + np.sqrt(W) @ rng.standard_normal(N)
+        found.append((np.array(y), a))
+    return found
+
+
+@cache
+def identified() -> InnovationModel:
+    return subspace_model(measured(), order=N)
+
+
+def test_it_finds_the_response_to_actions_and_the_innovations_of_the_kalman_filter() -> None:
+    model, true = identified(), kalman_filter(A, C, W, V)
+    power, own = np.eye(N), np.eye(N)
+    for _ in range(6):
+        expected = C @ power @ B
+        found = model.U @ model.C @ own @ model.B
+        assert np.linalg.norm(found - expected) < 0.05 * np.linalg.norm(C @ B)
+        power, own = A @ power, model.A @ own
+    expected = C @ true.P @ C.T + V
+    found = model.U @ model.innovations @ model.U.T
+    np.testing.assert_allclose(found, expected, atol=0.05 * np.trace(expected))
+    assert np.abs(linalg.eigvals(model.A - model.G @ model.C)).max() < 1.0
+
+
+def cost_of(law: Observer) -> float:
+    """What the law costs in the long run on the true plant, about the target 0."""
+    p, U = law.parts(law.theta_start), law.model.U
+    into_s = U.T @ C
+    acts = np.hstack([p["D"] @ into_s, p["K"]])
+    matrix = np.block([[A, np.zeros((N, len(U.T)))], [p["G"] @ into_s, p["F"]]])
+    matrix += np.vstack([B, law.model.B]) @ acts
+    noisy = np.vstack([B @ p["D"], p["G"] + law.model.B @ p["D"]]) @ U.T
+    into = np.hstack([np.vstack([np.eye(N), np.zeros((len(U.T), N))]), noisy])
+    moments = linalg.solve_discrete_lyapunov(matrix, into @ linalg.block_diag(W, V) @ into.T)
+    own = p["D"] @ U.T
+    action = acts @ moments @ acts.T + own @ V @ own.T
+    return float(Q * np.trace(C @ moments[:N, :N] @ C.T) + R * np.trace(action))
+
+
+def test_its_law_costs_what_lqg_with_the_true_plant_costs() -> None:
+    law = law_of_innovations(identified(), np.zeros(N_Y), state_weight=Q, action_weight=R)
+    found, true = cost_of(Observer(law, 10)), kalman_filter(A, C, W, V)
+    cost = Cost(N_Y, N_A, 1, state_weight=Q, action_weight=R)
+    gains = track_outputs(ReducedModel(A, B, C), cost)
+    error = (np.eye(N) - true.M @ C) @ true.P
+    S = R * np.eye(N_A) + B.T @ gains.P @ B
+    optimum = np.trace(gains.P @ W) + np.trace(gains.K_a.T @ S @ gains.K_a @ error)
+    assert optimum <= found * (1 + 1e-9) and found < 1.02 * optimum
+
+
+def test_the_order_and_the_past_are_those_of_the_least_error_on_held_out_measurements() -> None:
+    trajectories = [(z[:801], a[:800]) for z, a in measured()]
+    found = subspace_model(trajectories)
+    assert len(found.A) == N and found.past > 1
+    assert 0.0 < found.error < 1.0
+    # Fewer readings than states, with as much past as that needs.
+    few = subspace_model([(z[:, :1], a) for z, a in trajectories], order=N)
+    assert len(few.A) == N and few.U.shape == (1, 1) and few.past >= N
+
+
+def test_data_that_do_not_determine_it_are_refused_by_name() -> None:
+    z, a = measured()[0]
+    with pytest.raises(
+        NotIdentifiableError, match="4 steps do not determine a model with 2 inputs"
+    ):
+        subspace_model([(z[:5], a[:4])])
+    with pytest.raises(NotIdentifiableError, match="the input valve never moved"):
+        still = a * [1.0, 0.0]
+        subspace_model([(z, still)], order=N, channels=Channels(inputs=("pump", "valve")))
+    blind = InnovationModel(
+        np.diag([1.1, 0.5]),
+        np.ones((2, 1)),
+        np.eye(2)[1:],
+        np.ones((2, 1)),
+        np.eye(1),
+        np.eye(1),
+        2,
+    )
+    with pytest.raises(DesignError, match=r"do not see a mode that grows by the factor 1\.1"):
+        law_of_innovations(blind, np.zeros(1), state_weight=Q, action_weight=R)
