@@ -33,6 +33,7 @@ PROGRAMS = {
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
     "field_models": "which model of the whole field is believed, and how well it predicts",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
+    "scale": "what messages, bags, fits, memory and files cost as the state grows",
     "published": "tasks that others have published figures for, side by side",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",

@@ -15,6 +15,7 @@ from typing import Any
 
 from loop_interfaces.affinity import least_busy_cores, usable_cores
 from loop_interfaces.isolation import NETWORK, PROFILE
+from loop_interfaces.parameters import taken_by
 from loop_interfaces.ros_environment import prepared
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
@@ -108,17 +109,21 @@ def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
 class Transport:
     """How a training is carried out; nothing of this changes its results.
 
-    in_process: without ROS; recorder: as the tuner's parameter says it; network: let the messages
-    leave this machine; pairs: of plant and controller; view: with a viewer_node of the first pair.
+    in_process: without ROS; recorder: as the tuner's parameter says it; record_every: steps from one
+    state that is recorded to the next; network: let the messages leave this machine; pairs: of plant
+    and controller; view: with a viewer_node of the first pair.
     """
 
     in_process: bool = False
     recorder: str = "none"
+    record_every: int = 1
     network: bool = False
     pairs: int = 1
     view: bool = False
 
     def __post_init__(self) -> None:
+        if self.record_every > 1 and not self.recorded:
+            raise ParameterError("--record-every is about a recording; give --record as well")
         if self.in_process and (self.recorded or self.network):
             raise ParameterError("--record and --network are about topics; leave out --in-process")
         if self.network and os.environ.get(PROFILE):
@@ -129,6 +134,9 @@ class Transport:
         if self.in_process and (self.pairs > 1 or self.view):
             raise ParameterError("--pairs and --view are about nodes; leave out --in-process")
         PAIRS.check(self.pairs)
+        next(s for s in taken_by("recorder_node") if s.name == "state_every").check(
+            self.record_every
+        )
 
     def require(self) -> None:
         """Refuse what the nodes would end with: no ROS, a wrong ROS domain."""
@@ -168,7 +176,8 @@ class Transport:
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
         if self.recorded:
-            nodes.insert(0, LoopNode("recorder_node", "recorder_node", serving, cores=others))
+            own = {**serving, "state_every": self.record_every}
+            nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
         tuner = {
             **serving,
             "out": str(folder.resolve()),

@@ -34,7 +34,7 @@ from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError
 from recorder_node.matching import Matching
-from recorder_node.recording import Recording
+from recorder_node.recording import Recording, large_bag
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 
 RECORDING_FAILED = 3
@@ -65,7 +65,8 @@ class RecorderNode:
         self._sources = [source for name in self._namespaces for source in sources(name)]
         self._sources += [DIAGNOSTICS, ROSOUT, CLOCK]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
-        self._recording = Recording(Path(folder), self._sources)
+        self._every = int(values["state_every"])
+        self._recording = Recording(Path(folder), self._sources, self._every)
         self._rate = Rate()
         self.join(node, loop)
         self._log.info(f"recording to {self._recording.path}")
@@ -173,7 +174,10 @@ class RecorderNode:
         self._matching.look(now)
         run = self._recording.run
         if run and self._matching.changed(run):
-            self._recording.note(run, self._matching.parameters())
+            parameters = self._matching.parameters()
+            self._recording.note(run, parameters)
+            if text := large_bag(parameters, self._every):
+                self._log.warning(text)
         if self._status is None and self._matching.complete(now):
             self._status = self._node.create_publisher(
                 String, RECORDER_STATUS, QoSProfile(depth=1, durability=LATCHED)

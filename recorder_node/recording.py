@@ -16,20 +16,47 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.frames import FrameError
-from loop_interfaces.topics import START
+from loop_interfaces.topics import START, STATE
 from recorder_node.bag import BagError, BagWriter
 from recorder_node.sources import NOTES, PARAMETERS_TOPIC, Source
 
 PARAMETERS = "parameters.json"
 CDR = bytes.fromhex("00010000")
 """How the serialisation of a message begins: CDR, little endian."""
+LARGE_BAG = 2**30
+"""Bytes of states that a run is told of before they are recorded."""
+EVERY = "state_every"
+"""The recorder's parameter that stands among those of the nodes, where it is not 1."""
+
+
+def large_bag(values: Mapping[str, Any], every: int = 1) -> str:
+    """A sentence where the states of a run with these parameters take much room; else nothing.
+
+    >>> large_bag({"n_z": 65536, "horizon": 100, "rollouts": 20, "evaluation_fields": 5})
+    'the states of this run take about 1.9 GB in its bag: --record-every N (state_every) keeps fewer'
+    >>> large_bag({"n_z": 128, "horizon": 300, "rollouts": 20})
+    ''
+    """
+    known = {"n_z": 0, "horizon": 0, "rollouts": 0, "evaluation_fields": 0, "seeds": 1, **values}
+    rollouts = known["seeds"] * (known["rollouts"] + 3 * known["evaluation_fields"])
+    size = 8 * known["n_z"] * rollouts * -(-(known["horizon"] + 1) // every)
+    if size < LARGE_BAG:
+        return ""
+    return (
+        f"the states of this run take about {size / 1e9:.1f} GB in its bag: --record-every N ({EVERY}) "
+        "keeps fewer"
+    )
 
 
 class Recording(BagWriter):
-    """A bag of the messages that `take` is given, with the nodes' parameters next to it."""
+    """A bag of the messages that `take` is given, with the nodes' parameters next to it.
 
-    def __init__(self, path: Path, what: Sequence[Source]) -> None:
+    state_every: steps from one state that is recorded to the next.
+    """
+
+    def __init__(self, path: Path, what: Sequence[Source], state_every: int = 1) -> None:
         super().__init__(path, [source.channel for source in (*what, NOTES)])
+        self._every = state_every
         self.run = 0
         """The run of the newest episode; 0 before the first."""
         self._notes: dict[str, Any] = {}
@@ -39,11 +66,16 @@ class Recording(BagWriter):
         if source.array is START:
             with contextlib.suppress(FrameError):
                 self.run = source.codec.decode(raw).run
+        if source.array is STATE and self._every > 1:
+            with contextlib.suppress(FrameError):
+                if source.codec.decode(raw).step % self._every:
+                    return
         self.write(source.channel.topic, when, raw)
 
     def note(self, run: int, parameters: Mapping[str, Any]) -> None:
         """Add to the known parameters of a run."""
-        self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters)
+        own = {EVERY: self._every} if self._every > 1 else {}
+        self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters) | own
         text = json.dumps({str(run): self._notes[str(run)]}).encode() + b"\0"
         when = self._last if self.messages else time.time_ns()
         self.write(PARAMETERS_TOPIC, when, CDR + len(text).to_bytes(4, "little") + text)

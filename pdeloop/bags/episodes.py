@@ -7,6 +7,7 @@ A reader follows the messages with it in the order in which they were recorded.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,6 +64,8 @@ class RecordedEpisode:
         The models that its policies are about.
     contradictions : list of str
         Messages that were recorded twice with different content, in words.
+    state_every : int
+        Steps from one state that was to be recorded to the next.
     """
 
     key: Key
@@ -77,6 +80,7 @@ class RecordedEpisode:
     failure: ModelFailure | None = None
     bases: Frame | None = None
     contradictions: list[str] = field(default_factory=list)
+    state_every: int = 1
 
     @property
     def number(self) -> int:
@@ -118,21 +122,24 @@ class RecordedEpisode:
             return [*lacking, "an end: it is void"]
         if self.horizon < 1:
             return [*lacking, "steps: its cost is of step 0"]
-        for samples, count, name in (
-            (self.states, self.horizon + 1, "states"),
-            (self.actions, self.horizon, "actions"),
+        for samples, steps, name in (
+            (self.states, range(0, self.horizon + 1, self.state_every), "states"),
+            (self.actions, range(self.horizon), "actions"),
         ):
-            lost = count - sum(step < count for step in samples)
-            lacking += [f"{lost} of {count} {name}"] if lost else []
+            lost = len(steps) - sum(step in steps for step in samples)
+            lacking += [f"{lost} of {len(steps)} {name}"] if lost else []
             shapes = {frame.values.shape for frame in samples.values()}
             if len(shapes) > 1 or any(shape[0] != self.environments for shape in shapes):
                 lacking.append(f"{name} of one shape, a row for each environment")
         return lacking
 
     def trajectory(self) -> tuple[Array, Array]:
-        """States (T + 1, M, n_z) and actions (T, M, n_a) of a complete episode."""
+        """States (T + 1, M, n_z), those that were to be recorded, and actions (T, M, n_a).
+
+        Of a complete episode.
+        """
         assert not self.missing
-        states = [self.states[k].values for k in range(self.horizon + 1)]
+        states = [self.states[k].values for k in range(0, self.horizon + 1, self.state_every)]
         return np.stack(states), np.stack([self.actions[k].values for k in range(self.horizon)])
 
     def over(self, now: int, newest: int) -> bool:
@@ -164,9 +171,13 @@ class RecordedEpisode:
 
 
 class EpisodeIndex:
-    """Sorts messages into episodes and tells which of these are over."""
+    """Sorts messages into episodes and tells which of these are over.
 
-    def __init__(self) -> None:
+    every: steps from one recorded state to the next, by run, where not all were recorded.
+    """
+
+    def __init__(self, every: Mapping[int, int] | None = None) -> None:
+        self._every = every or {}
         self._open: dict[Key, RecordedEpisode] = {}
         self._over: deque[Key] = deque(maxlen=REMEMBERED)
         self._models: dict[Key, Frame] = {}
@@ -233,7 +244,8 @@ class EpisodeIndex:
         if key not in self._open:
             if key in self._over:
                 return None
-            self._open[key] = RecordedEpisode(key, when, when)
+            every = self._every.get(key[1], 1)
+            self._open[key] = RecordedEpisode(key, when, when, state_every=every)
         episode = self._open[key]
         episode.first, episode.last = min(episode.first, when), max(episode.last, when)
         return episode

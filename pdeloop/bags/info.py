@@ -30,6 +30,7 @@ def describe(path: Path) -> dict[str, Any]:
                 "name": episode.name,
                 "environments": episode.environments,
                 "exploratory": episode.exploratory,
+                "state_every": episode.state_every,
                 "seconds": (episode.last - episode.first) / 1e9,
                 "mean_cost": None if episode.cost is None else episode.cost.values[:, 0].tolist(),
                 "missing": episode.missing,
@@ -97,6 +98,8 @@ def _listed(episodes: Sequence[dict[str, Any]]) -> list[str]:
             (episode["name"], str(episode["environments"]), f"{episode['seconds']:.2f}", spread)
         )
         found = ["exploratory"] if episode["exploratory"] else []
+        every = episode["state_every"]
+        found += [f"every {every} steps a state"] if every > 1 else []
         found += [f"lacks {what}" for what in episode["missing"]]
         found += [f"of {episode['namespace']}"] if several else []
         notes.append(", ".join(found))

@@ -21,7 +21,7 @@ from pdeloop.bags.mcap_messages import CONVERTED, Message, files, finished, read
 from pdeloop.bags.metadata import Findings, check, read_metadata, repeated
 from pdeloop.bags.survey import Survey, by_run, survey
 from recorder_node.bag import METADATA, BagError
-from recorder_node.recording import PARAMETERS
+from recorder_node.recording import EVERY, PARAMETERS
 from recorder_node.sources import source_of
 from tuner_node.run_folder import RunFolder
 
@@ -102,7 +102,12 @@ class Bag:
 
     def episodes(self) -> Iterator[RecordedEpisode]:
         """The episodes in the order of their ends, each when nothing more of it is to come."""
-        index, known = EpisodeIndex(), cache(source_of)
+        every = {
+            run: value
+            for run, values in self.parameters().items()
+            if type(value := values.get(EVERY)) is int and value > 0
+        }
+        index, known = EpisodeIndex(every), cache(source_of)
         for message in self.messages():
             source = known(message.topic)
             if source is not None:

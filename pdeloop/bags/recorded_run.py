@@ -199,13 +199,19 @@ class RecordedRun:
         seeds = rows[:, StartColumn.SEED].astype(np.int64)
         again = rollout(plant, law, seeds, noise_seeds(rows))
         report.compare("initial fields", f"z_0 of {where}", states[0], again.states[0])
-        for what, name, first, recorded, computed in (
-            ("actions", "a", 0, actions, again.actions),
-            ("steps", "z", 1, states[1:], again.states[1:]),
+        every = episode.state_every
+        for what, name, step, recorded, computed in (
+            ("actions", "a", range(len(actions)), actions, again.actions),
+            (
+                "steps",
+                "z",
+                range(every, len(again.states), every),
+                states[1:],
+                again.states[::every][1:],
+            ),
         ):
-            for k in range(len(recorded)):
-                text = f"{name}_{k + first} of {where}"
-                if not report.compare(what, text, recorded[k], computed[k]):
+            for k, own, other in zip(step, recorded, computed, strict=True):
+                if not report.compare(what, f"{name}_{k} of {where}", own, other):
                     break
         costs = again.costs.rows()
         report.compare("costs", f"cost of {where}", episode.cost.values, costs)
@@ -213,7 +219,9 @@ class RecordedRun:
             assert self._values is not None
             settings = DesignSettings.of(self._values)
             numbers = rows[:, StartColumn.MODEL].astype(int).tolist()
-            designed = design_each(states, actions, numbers, plant.target, settings)
+            # Where not all states were recorded, those between them are what was computed again.
+            whole = states if every == 1 else again.states
+            designed = design_each(whole, actions, numbers, plant.target, settings)
             for env, (model, own) in enumerate(zip(episode.model.values, designed, strict=True)):
                 text = f"model of {where}, environment {env}"
                 report.compare("rows of models", text, model, own)

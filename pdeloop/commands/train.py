@@ -68,6 +68,13 @@ def add(commands: Commands) -> None:
         help="as --record, and stop the training if the recording fails",
     )
     add(
+        "--record-every",
+        type=int,
+        default=1,
+        metavar="N",
+        help="record the states of every N-th step only, for large fields [1]",
+    )
+    add(
         "--view",
         action="store_true",
         help="also start a viewer_node, for RViz, Foxglove and PlotJuggler (docs/watching.md)",
@@ -91,6 +98,7 @@ def _train(options: argparse.Namespace) -> int:
     transport = Transport(
         options.in_process,
         recorder="required" if options.record_or_stop else "start" if recorded else "none",
+        record_every=options.record_every,
         network=options.network,
         pairs=options.pairs,
         view=options.view,
