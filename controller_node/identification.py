@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from controller_node.policy import ProjectedLaw
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import FILTERED, ModelRows, pack
 from loop_interfaces.parameters import model_order
+from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
 from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
 from loop_method.reduce import dmdc, regression
@@ -23,7 +24,9 @@ from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
+from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 from loop_method.reduce.subspace import subspace_model
+from loop_method.settings import settings_from
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,9 @@ class DesignSettings:
         Name of the law that answers.
     horizon : int
         Steps of an episode, for a law that has parameters for each of them.
+    constants : dict
+        Parameters `identification_settings.NAME` and `law_settings.NAME` as given; others have their
+        defaults.
     """
 
     n_a: int
@@ -64,11 +70,24 @@ class DesignSettings:
     dmdc_order: int = 0
     law: str = "affine"
     horizon: int = 1
+    constants: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DesignSettings:
         """Those among the parameters."""
-        return DesignSettings(**{item.name: values[item.name] for item in fields(DesignSettings)})
+        names = {item.name for item in fields(DesignSettings)} - {"constants"}
+        constants = (IDENTIFICATION_SETTINGS, LAW_SETTINGS)
+        return DesignSettings(
+            **{name: values[name] for name in names},
+            constants={name: value for name, value in values.items() if name.startswith(constants)},
+        )
+
+    @property
+    def method(self) -> IdentificationSettings:
+        """The constants of the identification. ParameterError for one out of range."""
+        return settings_from(
+            IDENTIFICATION_SETTINGS, IdentificationSettings, self.constants, "identification"
+        )
 
 
 def identify(
@@ -78,6 +97,7 @@ def identify(
     n_s: int,
     p: int = 0,
     channels: Channels = NUMBERED,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> ReducedModel:
     """The reduced model of one plant.
 
@@ -93,6 +113,8 @@ def identify(
         Rank of "dmdc"; 0: n_s + n_a.
     channels : Channels
         Names of states and inputs in what is refused.
+    settings : IdentificationSettings
+        How an order is suggested.
 
     Raises
     ------
@@ -106,7 +128,7 @@ def identify(
         )
     if p and method != "dmdc":
         raise ValueError(f"p is the rank of 'dmdc', and method is {method!r}; leave it out")
-    n_s = n_s or study_orders(trajectories, channels=channels).suggested
+    n_s = n_s or study_orders(trajectories, channels=channels, settings=settings).suggested
     if method == "regression":
         return regression.exact_regression(trajectories, n_s=n_s, channels=channels)
     n_a = np.shape(trajectories[0][1])[-1]
@@ -211,6 +233,7 @@ def designed(
         n_s=min(model_order(asdict(settings)), target.size),
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
+        settings=settings.method,
     )
     gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
@@ -219,7 +242,12 @@ def designed(
         return Designed(lqg.with_filter(rows, trajectories) if filtered else rows)
     with threadpool_limits(limits=1):  # as in the identification itself
         found = field_law(
-            [*trajectories, *further], target, rows, action_limit=settings.action_limit, **weights
+            [*trajectories, *further],
+            target,
+            rows,
+            action_limit=settings.action_limit,
+            settings=settings.method,
+            **weights,
         )
     chosen = found.rows if found.better and found.rows else rows
     return Designed(lqg.with_filter(chosen, trajectories) if filtered else chosen, found)

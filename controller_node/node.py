@@ -32,7 +32,11 @@ from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
+from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
 from loop_interfaces.topics import Topic
+from loop_method.laws.registry import law_kind
+from loop_method.reduce.settings import IdentificationSettings
+from loop_method.settings import parameters_of, with_defaults
 
 FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path") else None
 """Answers states in compiled code, where that can be had; without it the responder answers all."""
@@ -40,13 +44,27 @@ FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path")
 Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]
 
 
+def declare_parameters(node: Node) -> dict[str, Any]:
+    """The controller's parameters, with the settings of law and identification."""
+    given = given_parameters(node, "controller_node")
+    values = declare(node, taken_by("controller_node"), given)
+    methods = (
+        (LAW_SETTINGS, law_kind(values["law"]).Settings, f"law '{values['law']}'"),
+        (IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
+    )
+    for prefix, kind, method in methods:
+        with_defaults(
+            prefix, kind, given, method
+        )  # refuses a setting that the method does not have
+        values |= declare(node, parameters_of(prefix, kind), given)
+    return values
+
+
 class ControllerNode:
     """Moves messages between the topics and the responder."""
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
-        values = declare(
-            node, taken_by("controller_node"), given_parameters(node, "controller_node")
-        )
+        values = declare_parameters(node)
         pin_process(values["pin"])
         responder = Responder(DesignSettings.of(values))
         self._responder = responder

@@ -60,7 +60,7 @@ class Responder:
 
     def __init__(self, settings: DesignSettings) -> None:
         """ValueError if there is no law of that name, or it is code that is not allowed."""
-        self._settings, self._law_kind = settings, law_kind(settings.law)
+        self._settings, self._law_kind = settings, law_kind(settings.law, settings.constants)
         self._targets: OrderedDict[int, np.ndarray] = OrderedDict()
         self._runs: OrderedDict[int, RunState] = OrderedDict()
         self._served = (-1, -1)

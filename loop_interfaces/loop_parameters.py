@@ -7,13 +7,23 @@ from typing import Any
 
 from loop_interfaces.parameter_file import ParameterFile, read_parameter_file
 from loop_interfaces.parameters import NODES, table
-from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError
+from loop_interfaces.spec import (
+    IDENTIFICATION_SETTINGS,
+    LAW_SETTINGS,
+    OPTIMIZER_SETTINGS,
+    ParameterError,
+)
 from loop_interfaces.text import shown
 
 ROS_OWN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 """Parameters of every ROS node, or the beginnings of their names."""
-DECLARED_BY = {"physical.": "P", OPTIMIZER_SETTINGS: "T"}
-"""Who takes the parameters that an equation, a plant or an optimiser declares."""
+DECLARED_BY = {
+    "physical.": "P",
+    OPTIMIZER_SETTINGS: "T",
+    LAW_SETTINGS: "CT",
+    IDENTIFICATION_SETTINGS: "CT",
+}
+"""Who takes the parameters that an equation, a plant or a method declares."""
 
 
 def read_problem(path: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from loop_interfaces.parameters import (
     with_names,
 )
 from loop_interfaces.spec import (
-    OPTIMIZER_SETTINGS,
+    SETTINGS,
     ParameterError,
     check,
     check_names,
@@ -66,7 +66,7 @@ def load_parameters(
 ) -> dict[str, Any]:
     """The checked parameters of all nodes: a problem's file, then `options`, then the defaults.
 
-    preferred: adds defaults that depend on what is given. `physical.*` and `optimizer_settings.*` are
+    preferred: adds defaults that depend on what is given. `physical.*` and the settings of methods are
     included as given; a relative file of user code ('file.py:Class') is relative to the YAML file.
     name: empty where the options name a plant, which needs no file. What a plant of a user's own says
     itself (OF_THE_PLANT) is left out where nothing else is given.
@@ -89,7 +89,7 @@ def load_parameters(
         given["equation"] = given["equation"] or "burgers"
         POINTS.check(given.get("n_z", POINTS.default))
         values = check(table(), given)
-    settings = {k: value for k, value in given.items() if k.startswith(OPTIMIZER_SETTINGS)}
+    settings = {k: value for k, value in given.items() if k.startswith(SETTINGS)}
     return with_budget(values) | _physical(given) | settings
 
 

@@ -18,8 +18,12 @@ from loop_interfaces.text import shown
 
 Value = bool | int | float | str | list[str] | list[float]
 OPTIMIZER_SETTINGS = "optimizer_settings."
-FREE = ("physical.", OPTIMIZER_SETTINGS)
-"""How the names of parameters begin that an equation or an optimiser declares."""
+LAW_SETTINGS = "law_settings."
+IDENTIFICATION_SETTINGS = "identification_settings."
+SETTINGS = (OPTIMIZER_SETTINGS, LAW_SETTINGS, IDENTIFICATION_SETTINGS)
+"""How the names of parameters begin that are constants of a method."""
+FREE = ("physical.", *SETTINGS)
+"""How the names of parameters begin that an equation, a plant or a method declares."""
 MAX_YAML_BYTES = 4_000_000
 MAX_PARAMETERS, MAX_NAME = 10_000, 500
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")

@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
-from loop_interfaces.spec import Spec
+from loop_interfaces.spec import ParameterError, Spec
+
+_Own = TypeVar("_Own", bound="Settings")
 
 
 def setting(
@@ -57,3 +61,35 @@ class Settings:
             for item in fields(cls)
             if "description" in item.metadata
         )
+
+
+def parameters_of(prefix: str, kind: type[Settings]) -> list[Spec]:
+    """The settings as parameters, whose names begin with the prefix."""
+    return [replace(spec, name=f"{prefix}{spec.name}") for spec in kind.specs()]
+
+
+def with_defaults(
+    prefix: str, kind: type[Settings], values: Mapping[str, Any], method: str
+) -> dict[str, Any]:
+    """All settings of a method by their names as parameters, checked.
+
+    values: parameters, with any others among them; method: what it is called in errors.
+    ParameterError for a setting that it does not have, or that is out of its range.
+    """
+    specs = {spec.name: spec for spec in parameters_of(prefix, kind)}
+    given = {name: value for name, value in values.items() if name.startswith(prefix)}
+    for name in given:
+        if name not in specs:
+            close = difflib.get_close_matches(name, specs, n=1) or specs
+            known = f"known: {', '.join(close)}" if close else "it has no settings"
+            raise ParameterError(f"unknown parameter '{name}' of the {method}; {known}")
+    return {
+        name: spec.check(given.get(name, spec.default), f"parameter '{name}'")
+        for name, spec in specs.items()
+    }
+
+
+def settings_from(prefix: str, kind: type[_Own], values: Mapping[str, Any], method: str) -> _Own:
+    """The settings that parameters give; arguments as of `with_defaults`."""
+    found = with_defaults(prefix, kind, values, method)
+    return kind(**{name.removeprefix(prefix): value for name, value in found.items()})

@@ -79,7 +79,7 @@ class FinishedRun:
         ValueError if it is code that is not allowed.
         """
         return laws_of(
-            law_kind(self.values["law"]),
+            law_kind(self.values["law"], self.values),
             self.models,
             self.values["horizon"],
             self.values.get("cost", ()),

@@ -37,7 +37,7 @@ class LocalPair:
         self.plant = plant or build_plant(values)
         self.fingerprint = self.plant.definition.fingerprint
         self._settings = DesignSettings.of(values)
-        self._kind = law_kind(self._settings.law)
+        self._kind = law_kind(self._settings.law, self._settings.constants)
         self._law: LawBatch | None = None
         self._generation = 0
 

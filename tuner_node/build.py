@@ -104,7 +104,7 @@ def check_budget(
 def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     """The class of the law. ParameterError if there is none, or the optimiser cannot improve it."""
     try:
-        law = law_kind(values["law"])
+        law = law_kind(values["law"], values)
     except ValueError as error:
         raise ParameterError(str(error)) from error
     if kind.needs_affine_law and law is not Affine:

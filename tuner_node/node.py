@@ -36,7 +36,7 @@ from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.narration import Narration
-from tuner_node.optimizer_parameters import kind_of, setting_specs, with_settings
+from tuner_node.optimizer_parameters import setting_specs, with_settings
 from tuner_node.pair import PairPublication
 from tuner_node.participants import Participants, Publishers
 from tuner_node.results import summarise
@@ -62,7 +62,7 @@ def declare_parameters(node: Node) -> dict[str, Any]:
     values = with_budget(declare(node, taken_by("tuner_node"), given))
     # Those of the equation are the plant's to check; here they only identify the run.
     values |= {name: value for name, value in given.items() if name.startswith(FREE)}
-    return with_settings(values) | declare(node, setting_specs(kind_of(values)), given)
+    return with_settings(values) | declare(node, setting_specs(values), given)
 
 
 class TunerNode:

@@ -1,18 +1,26 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the parameters say of the optimiser: which it is, and its settings `optimizer_settings.*`."""
+"""The optimiser that the parameters name, and the settings of optimiser, law and identification."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from loop_interfaces.parameters import OPTIMIZER
 from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
+from loop_interfaces.spec import (
+    IDENTIFICATION_SETTINGS,
+    LAW_SETTINGS,
+    OPTIMIZER_SETTINGS,
+    ParameterError,
+    Spec,
+    flatten,
+)
 from loop_method.adapt import Optimizer
 from loop_method.adapt.registry import optimizer_kind
+from loop_method.laws.registry import law_kind
+from loop_method.reduce.settings import IdentificationSettings
+from loop_method.settings import Settings, parameters_of, with_defaults
 
 
 def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
@@ -23,32 +31,33 @@ def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
         raise ParameterError(str(error)) from error
 
 
-def setting_specs(kind: type[Optimizer]) -> list[Spec]:
-    """The settings of an optimiser as parameters."""
+def _methods(values: Mapping[str, Any]) -> list[tuple[str, type[Settings], str]]:
+    """Optimiser, law and identification: how their settings begin, their class, and their name."""
+    try:
+        law = law_kind(values["law"])
+    except ValueError as error:
+        raise ParameterError(str(error)) from error
     return [
-        replace(spec, name=f"{OPTIMIZER_SETTINGS}{spec.name}") for spec in kind.Settings.specs()
+        (OPTIMIZER_SETTINGS, kind_of(values).Settings, f"optimizer '{values['optimizer']}'"),
+        (LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
+        (IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
     ]
 
 
-def with_settings(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with all settings of their optimiser, checked.
+def setting_specs(values: Mapping[str, Any]) -> list[Spec]:
+    """The settings of all methods as parameters."""
+    return [spec for prefix, kind, _ in _methods(values) for spec in parameters_of(prefix, kind)]
 
-    ParameterError for a setting that it does not have, or that is out of its range.
+
+def with_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters with all settings of their optimiser, law and identification, checked.
+
+    ParameterError for a setting that the method does not have, or that is out of its range.
     """
-    specs = {spec.name: spec for spec in setting_specs(kind_of(values))}
-    given = {name: value for name, value in values.items() if name.startswith(OPTIMIZER_SETTINGS)}
-    for name in given:
-        if name not in specs:
-            close = difflib.get_close_matches(name, specs, n=1) or specs
-            known = f"known: {', '.join(close)}" if close else "it has no settings"
-            raise ParameterError(
-                f"unknown parameter '{name}' of the optimizer '{values['optimizer']}'; {known}"
-            )
-    checked = {
-        name: spec.check(given.get(name, spec.default), f"parameter '{name}'")
-        for name, spec in specs.items()
-    }
-    return {**values, **checked}
+    found = dict(values)
+    for prefix, kind, method in _methods(values):
+        found |= with_defaults(prefix, kind, values, method)
+    return found
 
 
 def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
@@ -59,7 +68,7 @@ def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
 
 
 def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Like `load_parameters`, with the optimiser's preferred defaults and its settings.
+    """Like `load_parameters`, with the optimiser's preferred defaults and all settings.
 
     options: by dotted names, or nested, as optimizer_settings={"fields": 5}.
     """

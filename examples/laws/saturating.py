@@ -1,20 +1,30 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law of one's own: an action that never exceeds a limit, and is smooth where it comes near it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 import pdeloop
+from loop_method.settings import Settings, setting
 
-LIMIT = 0.5
+
+@dataclass(frozen=True, kw_only=True)
+class SaturatingSettings(Settings):
+    """What can be set."""
+
+    limit: float = setting(0.5, "magnitude that no action exceeds", 1e-6, 1e6)
 
 
 class Saturating(pdeloop.Law):
     """a = A tanh((K s + b) / A), which begins with the LQ-tracking gains."""
 
     name = "saturating"
+    Settings = SaturatingSettings
 
     def start(self):
         return {"K": self.model.K_a, "b": self.model.K_b @ self.model.s_r}
 
     def action(self, theta, z, memory, k):
-        return LIMIT * np.tanh((theta["K"] @ self.reduced(z) + theta["b"]) / LIMIT)
+        limit = self.settings.limit
+        return limit * np.tanh((theta["K"] @ self.reduced(z) + theta["b"]) / limit)

@@ -34,15 +34,7 @@ from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fi
 from loop_method.models.base import Law, saturated
 from loop_method.models.prediction import predicted
 from loop_method.reduce.reduced_model import Trajectory, pieces
-
-LARGEST = 512
-"""Points of a field, at most: the work grows with their third power."""
-PIECES, REPRODUCED = 8, 0.05
-"""Largest error of a usable model, over whole trajectories or pieces, relative to sum |z - z_r|^2."""
-THINNING = 5
-"""Interval between the simulated states that the modes are computed from."""
-ROOM = 2
-"""Modes per actuator from which on the rows of K come first."""
+from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,21 +103,25 @@ def _cost(cost: float) -> str:
 
 
 def best_model(
-    trajectories: Sequence[Trajectory], target: Array, action_limit: float = 0.0
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    action_limit: float = 0.0,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> FittedModel | None:
     """The model of the whole field that predicts the trajectories best, or pieces of them.
 
-    Pieces, as a chaotic plant forgets where it began.
+    Pieces, as a chaotic plant forgets where it began. The work grows with the third power of the size
+    of the state, so that there is a largest one.
     """
-    if len(target) > LARGEST:
+    if len(target) > settings.field_largest:
         return None
     best: FittedModel | None = None
-    for parts in (trajectories, pieces(trajectories, PIECES)):
+    for parts in (trajectories, pieces(trajectories, settings.field_pieces)):
         rollouts = [Measured(z, a) for z, a in parts if len(a)]
         found = fit_field_model(rollouts, target, action_limit=action_limit)
         if found is not None and (best is None or found.error < best.error):
             best = found
-        if best is not None and best.error <= REPRODUCED:
+        if best is not None and best.error <= settings.field_error:
             break
     return best
 
@@ -139,6 +135,7 @@ def field_law(
     action_weight: float,
     cost: Cost | None = None,
     action_limit: float = 0.0,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
 
@@ -156,9 +153,11 @@ def field_law(
         In place of them.
     action_limit : float
         Magnitude at which actions saturate, in the data and under both laws; 0: none.
+    settings : IdentificationSettings
+        Those whose names begin with `field_`. Errors are relative to sum |z - z_r|^2.
     """
-    fitted = best_model(trajectories, target, action_limit)
-    if fitted is None or fitted.error > REPRODUCED:
+    fitted = best_model(trajectories, target, action_limit, settings)
+    if fitted is None or fitted.error > settings.field_error:
         return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]
     A, B = model.linearise(target, np.zeros(model.n_a))
@@ -179,7 +178,9 @@ def field_law(
     best = saturated(affine_law(K, b - K @ target), action_limit)
     none = affine_law(np.zeros_like(K), np.zeros_like(b))
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
-    U = _basis(K, np.concatenate(visited)[::THINNING], target, n_s)
+    U = _basis(
+        K, np.concatenate(visited)[:: settings.field_thinning], target, n_s, settings.field_room
+    )
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)
@@ -220,12 +221,12 @@ def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: 
     return predicted(model, [Measured(z[None], nothing, law) for z in fields])
 
 
-def _basis(K: Array, states: Array, target: Array, n_s: int) -> Array:
+def _basis(K: Array, states: Array, target: Array, n_s: int, room: float) -> Array:
     """U (n_z, n_s): the rows of K, and POD modes of the states and the target, so that there is a b."""
     n_a, n_z = K.shape
     weighted = np.vstack([states, np.sqrt(len(states)) * target])
     sensed = np.empty((n_z, 0))
-    if n_s >= ROOM * n_a:
+    if n_s >= room * n_a:
         _, values, rows = linalg.svd(K, full_matrices=False)
         sensed = rows[values > 1e-12 * max(values[0], 1e-300)].T
     left = weighted - weighted @ sensed @ sensed.T

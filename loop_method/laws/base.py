@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
+from loop_method.settings import Settings as _Settings
 
 Parts: TypeAlias = Mapping[str, Array]
 """The parts of theta by name, or a derivative by each of them."""
@@ -76,6 +77,10 @@ class Law(ABC):
     """Whether it has a compiled form: `gains`."""
     axes: ClassVar[int] = 1
     """Axes of theta in messages and files, where all laws but the affine one have a vector."""
+    Settings: ClassVar[type[_Settings]] = _Settings
+    """Its constants; none if it does not say otherwise."""
+    settings: ClassVar[_Settings] = _Settings()
+    """The constants of this training: parameters `law_settings.NAME`."""
     memory_size: int = 0
     cost: Cost | None = None
 
@@ -83,6 +88,8 @@ class Law(ABC):
         super().__init_subclass__(**named)
         if "name" not in vars(cls):
             cls.name = cls.__name__
+        if "Settings" in vars(cls):
+            cls.settings = cls.Settings()
 
     def __init__(self, model: ModelRows, horizon: int) -> None:
         self.model, self.horizon = model, horizon

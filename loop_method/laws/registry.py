@@ -6,14 +6,18 @@ Which code may be run: `loop_interfaces.own_code`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from types import MappingProxyType
+from typing import Any
 
 from loop_interfaces.own_code import OwnCode, name_of
+from loop_interfaces.spec import LAW_SETTINGS
 from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law
 from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
+from loop_method.settings import settings_from
 
 OWN_LAWS = OwnCode(
     "law",
@@ -31,16 +35,25 @@ def offered() -> list[str]:
     return [*OWN_LAWS.shipped, *sorted(others)]
 
 
-def law_kind(name: str) -> type[Law]:
-    """The class of the law of that name.
+def law_kind(name: str, values: Mapping[str, Any] = MappingProxyType({})) -> type[Law]:
+    """The class of the law of that name, with the settings that parameters give it.
+
+    values: parameters, of which those that begin with "law_settings." are taken.
 
     Raises
     ------
     ValueError
         Nothing of that name can be loaded, it is code that is not allowed, or no complete `Law`.
+    ParameterError
+        A setting that it does not have, or out of its range.
     """
     OWN_LAWS.require(name)
-    return _handed_over.get(name) or complete(name, OWN_LAWS.load(name))
+    kind = _handed_over.get(name) or complete(name, OWN_LAWS.load(name))
+    chosen = settings_from(LAW_SETTINGS, kind.Settings, values, f"law '{name}'")
+    if chosen == kind.settings:
+        return kind
+    own = {"settings": chosen, "name": kind.name, "__module__": kind.__module__}
+    return type(kind.__name__, (kind,), own)
 
 
 def hand_over(kind: type[Law]) -> str:

@@ -40,12 +40,9 @@ from loop_method.reduce.reduced_model import (
     steps_of,
 )
 from loop_method.reduce.regression import fit
+from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
-FOLDS, PIECES = 4, 8
-SHARE = 0.8
-"""Of the fall of the logarithm of the one-step error, from the lowest order to the best one, that the
-suggested order reaches. Noise lets the error fall less, and has lower orders suggested."""
 ROUNDING = 1e-9
 """Smaller errors are equal."""
 
@@ -63,8 +60,9 @@ class OrderStudy:
     one_step, rollout : (K,) arrays
         Relative errors on held-out data; infinity where a rollout overflows.
     suggested : int
-        The lowest order that reaches `SHARE` of what the best one gains, in digits of the one-step
-        error.
+        The lowest order that reaches a share (`IdentificationSettings.order_share`) of what the best
+        one gains, in digits of the one-step error. Noise lets the error fall less, and has lower orders
+        suggested.
     """
 
     singular_values: Array
@@ -116,6 +114,7 @@ def study_orders(
     orders: Iterable[int] = ORDERS,
     *,
     channels: Channels = NUMBERED,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> OrderStudy:
     """Try orders of a reduced model on held-out parts of trajectories of one plant.
 
@@ -129,6 +128,8 @@ def study_orders(
         n_s + n_a of them must be left, for one.
     channels : Channels
         Names of states and inputs in what is refused.
+    settings : IdentificationSettings
+        `order_pieces`, `order_folds` and `order_share`.
 
     Returns
     -------
@@ -169,7 +170,7 @@ def study_orders(
         singular_values: Array = linalg.svdvals(everything.after)
         if len(everything.inputs) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
-        for fitted, held in _folds(known):
+        for fitted, held in _folds(known, settings):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
             most = min(numerical_rank(values, *data.after.shape), _determined(data, modes))
@@ -188,7 +189,7 @@ def study_orders(
     with np.errstate(divide="ignore", invalid="ignore"):
         one_step, rollout = np.sqrt(np.nan_to_num(total / scales, nan=np.inf)).T
     digits = -np.log10(np.maximum(one_step, ROUNDING))
-    enough = digits[0] + SHARE * (digits.max() - digits[0])
+    enough = digits[0] + settings.order_share * (digits.max() - digits[0])
     suggested = tried[int(np.argmax(digits >= enough))]
     return OrderStudy(singular_values, np.array(tried), one_step, rollout, suggested)
 
@@ -204,13 +205,13 @@ def _determined(data: Steps, modes: Array) -> int:
 
 
 def _folds(
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory], settings: IdentificationSettings
 ) -> Iterator[tuple[list[Trajectory], list[Trajectory]]]:
     """Pieces to fit to and pieces that are held out."""
-    cut = pieces(trajectories, PIECES)
-    for fold in range(FOLDS):
-        held = cut[fold::FOLDS]
-        fitted = [piece for i, piece in enumerate(cut) if i % FOLDS != fold]
+    cut, folds = pieces(trajectories, settings.order_pieces), settings.order_folds
+    for fold in range(folds):
+        held = cut[fold::folds]
+        fitted = [piece for i, piece in enumerate(cut) if i % folds != fold]
         if held and fitted:
             yield fitted, held
 

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from loop_interfaces.parameters import table
-from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, assignment, check_names
+from loop_interfaces.spec import SETTINGS, ParameterError, assignment, check_names
 from loop_interfaces.text import shown
 
 PHYSICAL = "physical."
-"""Before the name of a parameter of the equation; `OPTIMIZER_SETTINGS` is that of an optimiser's."""
+"""Before the name of a parameter of the equation; `SETTINGS` are those of a method's."""
 OWN_FLAGS = {
     "out": "--out",
     "resume": "--resume",
@@ -33,7 +33,8 @@ def add_set(parser: argparse._ActionsContainer, what: str = "any parameter") -> 
         default=[],
         metavar="NAME=VALUE",
         help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME of the equation, and "
-        f"{OPTIMIZER_SETTINGS}NAME of the optimizer; may be repeated",
+        "optimizer_settings.NAME, law_settings.NAME and identification_settings.NAME of the methods; "
+        "may be repeated",
     )
 
     def complete(prefix: str, **_: object) -> list[str]:
@@ -64,7 +65,7 @@ def read_settings(texts: Iterable[str]) -> dict[str, Any]:
         if name.startswith(PHYSICAL):
             found[name] = _number(name, value)
             continue
-        if name.startswith(OPTIMIZER_SETTINGS):  # the optimiser knows what the value has to be
+        if name.startswith(SETTINGS):  # the method knows what the value has to be
             found[name] = assignment(f"{name}={value}")[1]
             continue
         check_names([name], specs)

@@ -245,7 +245,7 @@ def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) 
     policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     used = [models.get(name, data.models[data.shown]) for name in policies]
-    laws = laws_of(law_kind(values["law"]), used, values["horizon"], values.get("cost", ()))
+    laws = laws_of(law_kind(values["law"], values), used, values["horizon"], values.get("cost", ()))
     law = LawBatch(laws, plant.target, values["action_limit"])
     count = len(policies)
     law.set(np.stack([*policies.values()]), np.arange(count))

@@ -10,10 +10,11 @@ import pytest
 
 from controller_node.identification import DesignSettings, design, design_each, designed
 from loop_interfaces.model_rows import ModelRows, unpack
-from loop_method.design.field_law import REPRODUCED, FieldLaw, field_law, states_under
+from loop_method.design.field_law import FieldLaw, field_law, states_under
 from loop_method.design.finite_horizon import finite_horizon
 from loop_method.models import affine_law
 from loop_method.models.spectral import SpectralModel
+from loop_method.reduce.settings import IdentificationSettings
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 24, 3, 64
@@ -110,7 +111,10 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     noisy = [episode(plant(), noise=1.0)]
     found = designed(noisy, target, settings("field")).field
     assert found is not None and found.fitted is not None and found.rows is None
-    assert found.fitted.error > REPRODUCED and "not believed" in found.text()[-1]
+    assert (
+        found.fitted.error > IdentificationSettings().field_error
+        and "not believed" in found.text()[-1]
+    )
     rows, plain = (design(noisy, target, settings(name)) for name in ("field", "regression"))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
 

@@ -1,0 +1,49 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The constants of identification and of the design of the first law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loop_method.settings import Settings, setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentificationSettings(Settings):
+    """What can be set of the reduced model and the first law.
+
+    None has a unit: errors are relative to what the data hold.
+    """
+
+    order_pieces: int = setting(
+        8, "pieces of an exploratory episode when an order is suggested", 2, 1000
+    )
+    order_folds: int = setting(4, "parts of these pieces, each held out once", 2, 1000)
+    order_share: float = setting(
+        0.8,
+        "share of the digits that the best order gains in the one-step error, which the suggested "
+        "order reaches",
+        0.0,
+        1.0,
+    )
+    field_largest: int = setting(
+        512, "largest state of which a model of the whole field is made for the first law", 0, 65536
+    )
+    field_error: float = setting(
+        0.05, "largest error of such a model that a first law is designed from", 0.0, 1.0
+    )
+    field_pieces: int = setting(
+        8, "pieces of an episode that it may predict instead of the whole", 1, 1000
+    )
+    field_thinning: int = setting(
+        5, "interval between the simulated states that the basis is computed from", 1, 1000
+    )
+    field_room: float = setting(
+        2.0,
+        "modes per actuator from which on the rows of the field's feedback are part of the basis",
+        1.0,
+        1000.0,
+    )
+
+
+DEFAULTS = IdentificationSettings()

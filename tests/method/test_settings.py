@@ -1,0 +1,97 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The constants of identification and of laws are parameters, and steer what they say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import pdeloop
+from controller_node.identification import DesignSettings
+from loop_interfaces.spec import ParameterError
+from loop_method.laws.registry import OWN_LAWS, hand_over, law_kind
+from loop_method.reduce.order import study_orders
+from loop_method.reduce.settings import IdentificationSettings
+from loop_method.settings import Settings, setting
+from tests.support.interpreter import ROOT
+from tests.support.small import SMALL
+from tuner_node.optimizer_parameters import training_parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitSettings(Settings):
+    limit: float = setting(0.5, "magnitude that no action exceeds", 0.01, 1.0)
+
+
+class Limited(pdeloop.Law):
+    Settings = LimitSettings
+
+    def start(self) -> dict[str, np.ndarray]:
+        return {"K": np.full((1, 1), self.settings.limit)}  # type: ignore[attr-defined]
+
+    def action(
+        self, theta: dict[str, np.ndarray], z: np.ndarray, memory: np.ndarray, k: int
+    ) -> np.ndarray:
+        return theta["K"][0]
+
+
+def test_the_settings_of_a_law_are_given_to_its_class(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    name = hand_over(Limited)
+    assert law_kind(name) is Limited and Limited.settings == LimitSettings()
+    other = law_kind(name, {"law_settings.limit": 0.25, "law": name})
+    assert other.settings == LimitSettings(limit=0.25) and other.name == Limited.name
+    assert Limited.settings == LimitSettings(), "the class itself is as it was"
+    with pytest.raises(ParameterError, match=r"'law_settings\.limits' of the law .*known: law_set"):
+        law_kind(name, {"law_settings.limits": 0.25})
+    with pytest.raises(ParameterError, match="it has no settings"):
+        law_kind("affine", {"law_settings.limit": 0.25})
+    with pytest.raises(ParameterError, match=r"law_settings\.limit' is 2.*0\.01 to 1"):
+        law_kind(name, {"law_settings.limit": 2.0})
+
+
+def test_a_run_records_all_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    given = {"law": hand_over(Limited), "optimizer": "two_point"}
+    values = training_parameters(
+        str(SMALL), {**given, "identification_settings": {"order_folds": 2}}
+    )
+    assert values["law_settings.limit"] == 0.5
+    assert values["identification_settings.order_folds"] == 2
+    assert values["identification_settings.order_share"] == 0.8
+    settings = DesignSettings.of(values)
+    assert settings.method == IdentificationSettings(order_folds=2)
+    assert law_kind(settings.law, settings.constants) is Limited
+    with pytest.raises(ParameterError, match=r"parameter 'identification_settings\.folds'"):
+        training_parameters(str(SMALL), {"identification_settings": {"folds": 2}})
+    with pytest.raises(ParameterError, match="order_folds' is 1; expected"):
+        training_parameters(str(SMALL), {"identification_settings": {"order_folds": 1}})
+
+
+def test_a_larger_share_suggests_a_higher_order() -> None:
+    """Of a plant whose modes matter less and less, all of what the best order gains needs it."""
+    rng = np.random.default_rng(0)
+    A = np.diag([0.9, 0.8, 0.7, 0.6])
+    B = np.diag([1.0, 0.3, 0.1, 0.03]) @ rng.normal(size=(4, 2))
+    a, z = rng.normal(size=(160, 2)), np.zeros((161, 4))
+    for k in range(160):
+        z[k + 1] = A @ z[k] + B @ a[k] + 1e-6 * rng.normal(size=4)
+
+    def suggested(share: float) -> int:
+        return study_orders([(z, a)], settings=IdentificationSettings(order_share=share)).suggested
+
+    assert suggested(0.0) == 1
+    assert suggested(1.0) == 4
+    assert suggested(0.0) <= suggested(0.3) <= suggested(1.0)
+
+
+def test_the_documents_table_is_that_of_the_class() -> None:
+    text = (ROOT / "docs" / "identification.md").read_text()
+    section = text.partition("## Settings\n")[2].partition("\n## ")[0]
+    rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in section.splitlines()]
+    assert [tuple(row) for row in rows if len(row) == 4][2:] == [
+        (spec.name, str(spec.default), spec.range.partition("from ")[2], spec.description)
+        for spec in IdentificationSettings.specs()
+    ]
