@@ -115,13 +115,15 @@ class Cost:
 
     def add(self, totals: Array, states: Array, actions: Array, k: int) -> None:
         """Add the stage costs of step k: states (M, n_z), actions (M, n_a), to totals (M,)."""
-        self._state.add(totals, states, self.wanted(k))
-        self._action.add(totals, actions, self.action_target)
+        with np.errstate(over="ignore", invalid="ignore"):  # whoever counts looks at the total
+            self._state.add(totals, states, self.wanted(k))
+            self._action.add(totals, actions, self.action_target)
 
     def add_terminal(self, totals: Array, states: Array) -> None:
         """Add the cost of the last states z_T (M, n_z)."""
         if self.terminal_weight.any():
-            self._terminal.add(totals, states, self.wanted(self.horizon))
+            with np.errstate(over="ignore", invalid="ignore"):
+                self._terminal.add(totals, states, self.wanted(self.horizon))
 
     def slopes(self, states: Array, actions: Array, k: int) -> tuple[Array, Array]:
         """Derivatives of the stage cost by states (M, n_z) and actions (M, n_a)."""
@@ -160,8 +162,11 @@ class Cost:
     @property
     def texts(self) -> list[str]:
         """The text of the parameter; empty if scalar weights and a constant target suffice."""
-        if self.plain:
-            return []
+        return [] if self.plain else self.packed
+
+    @property
+    def packed(self) -> list[str]:
+        """The cost as texts, whatever it is."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         packed = {n: _packed(a) for n, a in arrays.items() if a is not None}
         text = json.dumps([self.n_z, self.n_a, self.horizon, packed])

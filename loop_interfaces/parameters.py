@@ -105,8 +105,8 @@ PROBLEM = _section(
     Spec("grid", "", nodes="PTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
-    Spec("cost", [], nodes="CT").means(
-        "the cost as packed JSON, filled in by the plant; empty: numbers and a constant target"
+    Spec("cost", [], nodes="PCT").means(
+        "the cost as packed JSON, from Python or the plant; empty: numbers and a constant target"
     ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
         "length L of the periodic domain"

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
+from loop_interfaces.cost import Cost
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.equations import Equation, configured_equation
@@ -60,11 +61,12 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     own = {name: getattr(plant, name) for name in (*_FIXED, *SETTABLE)}
     axes = plant.grid.axes
     own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
-    own["cost"] = plant.cost.texts
+    own["cost"] = plant.cost.texts if values["plant"] else list(values.get("cost", ()))
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
         return plant, {**own, **given}
-    return plant, {**given, **{name: own[name] for name in ("grid", "cost")}}
+    names = ("grid", "cost", "state_weight", "action_weight") if own["cost"] else ("grid", "cost")
+    return plant, {**given, **{name: own[name] for name in names}}
 
 
 def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
@@ -80,7 +82,11 @@ def _spectral_plant(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, M
     grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
     physical = asdict(equation)
     del physical["length"]
-    return SpectralPlant(equation, **grid, compiled=compiled), physical
+    try:
+        cost = Cost.parse(values.get("cost", ()))
+    except ValueError as error:
+        raise ParameterError(f"parameter 'cost': {error}") from error
+    return SpectralPlant(equation, **grid, cost=cost, compiled=compiled), physical
 
 
 def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from inspect import signature
 from io import StringIO
 from numbers import Integral
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from controller_node import identification
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.own_code import refuse_while_executed
 from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
@@ -128,6 +130,7 @@ def problem(
     *,
     plant: Dynamics | Plant | str | None = None,
     physical: Mapping[str, Any] | None = None,
+    cost: Mapping[str, Any] | None = None,
     **parameters: Any,
 ) -> Problem:
     """A shipped problem or one from a YAML file, with other parameters where they are given.
@@ -142,6 +145,10 @@ def problem(
         ('file.py:Class'), whose code is then run. Without a `source` the rest is as the class has it.
     physical
         The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
+    cost
+        Of an equation's plant, what is another cost than that of the numbers `state_weight` and
+        `action_weight` and the equation's target: arguments of `loop_interfaces.cost.Cost` by name,
+        like {"output": C, "target": y_r}.
     parameters
         Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
         one's own ('file.py:Class') is run if it is named here as `equation`, `optimizer` or `law`,
@@ -169,9 +176,28 @@ def problem(
     ((101, 64), (100, 6))
     """
     name = "burgers" if source is None and plant is None else str(source or "")
-    given = named(name, {**parameters, "physical": physical, "plant": plant})
+    given = named(name, {**parameters, "physical": physical, "plant": plant, "cost": cost})
     _, values = complete(training_parameters(name, given), compiled=False)
     return Problem(name, given, values)
+
+
+def _with_cost(source: str, given: Mapping[str, Any], cost: object) -> dict[str, Any]:
+    """The parameter `cost`, of which the plant without it says the rest."""
+    if isinstance(cost, list):  # as a run has it
+        return {"cost": cost}
+    if not isinstance(cost, Mapping):
+        raise ValueError(f"cost is {cost!r}; expected a dict like {{'terminal_weight': 2.0}}")
+    if given.get("plant"):
+        raise ValueError("the class of a plant of your own says its cost; leave out the cost here")
+    plant, _ = complete(training_parameters(source, given), compiled=False)
+    own = {name: getattr(plant, name) for name in ("state_weight", "action_weight")}
+    if "output" not in cost:
+        own["target"] = plant.target
+    known = [name for name in signature(Cost).parameters if name not in ("n_z", "n_a", "horizon")]
+    if unknown := [name for name in cost if name not in known]:
+        raise ValueError(f"a cost has no {unknown[0]!r}; it has {', '.join(known)}")
+    made = Cost(plant.n_z, plant.n_a, plant.horizon, **{**own, **cost})
+    return {"cost": made.packed}
 
 
 def _plant_named(plant: Dynamics | Plant | str) -> dict[str, Any]:
@@ -186,10 +212,13 @@ def _plant_named(plant: Dynamics | Plant | str) -> dict[str, Any]:
     return hand_over(plant)
 
 
-def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def named(
+    source: str, parameters: Mapping[str, Any], base: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """The parameters by their names, those of `physical` among them; code that is named is allowed.
 
-    A plant may be an object, for whose name and parameters it then stands.
+    A plant may be an object, for whose name and parameters it then stands. base: parameters besides,
+    for the plant that a cost is made for.
 
     ValueError, with what was meant, where a parameter of the equation is given as one of the problem.
     """
@@ -204,6 +233,7 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
             given[code.word] = code.allow(given[code.word])
     if (plant := given.pop("plant", None)) is not None:
         given |= _plant_named(plant)
+    cost = given.pop("cost", None)
     given = flatten(given)
     known = [spec.name for spec in table()]
     for name, value in given.items() if plant is None else ():
@@ -218,7 +248,8 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
                     f"{name!r} is not a parameter of the problem; did you mean the equation's own, "
                     f"physical={{{meant!r}: {value!r}}}?"
                 )
-    return given | {f"physical.{name}": value for name, value in physical.items()}
+    given |= {f"physical.{name}": value for name, value in physical.items()}
+    return given if cost is None else given | _with_cost(source, {**(base or {}), **given}, cost)
 
 
 def identify(
@@ -338,7 +369,9 @@ def train(
         parameters |= {} if plant is None else {"plant": plant}
         parameters |= {} if law is None else {"law": law}
         where = Path(temporary) / "run" if out is None else Path(out)
-        folder, values = begin(source, {**given, **named(source, parameters)}, where, transport)
+        folder, values = begin(
+            source, {**given, **named(source, parameters, given)}, where, transport
+        )
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
             carry_out(folder, values, transport, display, lambda: None)

@@ -358,9 +358,14 @@ class Training:
             periodic=self.settings.periodic,
             line=self.settings.line,
             further=self.further[m],
-            cost=Cost.parse(self.settings.cost),
+            cost=self._cost(),
             law=law,
         )
+
+    def _cost(self) -> Cost | None:
+        """The whole cost where numbers and the target do not say it."""
+        cost = Cost.parse(self.settings.cost)
+        return None if cost is None or cost.plain else cost
 
     def _asked(self) -> list[list[Rollout]]:
         """What each optimiser asks for; its policies may be vectors."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
@@ -56,6 +57,8 @@ class SpectralPlant(BatchPlant):
         Internal step of the integrator.
     horizon, state_weight, action_weight, divergence_bound
         See `pde_sim_node.plant.Plant`.
+    cost
+        In place of that of the weights and the equation's target; see `loop_interfaces.cost.Cost`.
     compiled
         Whether the step is compiled now; otherwise by `load`, or with the first step.
 
@@ -72,7 +75,6 @@ class SpectralPlant(BatchPlant):
         A parameter has no usable value; the message names it and what would be right.
     """
 
-    parallel: ParallelStep
     supports: Array
 
     def __init__(
@@ -90,6 +92,7 @@ class SpectralPlant(BatchPlant):
         divergence_bound: float = 1e3,
         shape: str = "equation",
         positions: Sequence[float] = (),
+        cost: Cost | None = None,
         compiled: bool = True,
     ) -> None:
         if whole("n_z", n_z, 8) % 2:
@@ -99,6 +102,8 @@ class SpectralPlant(BatchPlant):
         n_x = grid_points(equation, n_z)
         self.x = equation.length * np.arange(n_x) / n_x
         self.forced = slice(equation.actuated * n_x, (equation.actuated + 1) * n_x)
+        if cost is not None:
+            state_weight, action_weight = cost.size
         super().__init__(
             grid=Grid.interval(equation.length, n_x, equation.components),
             n_a=n_a,
@@ -108,17 +113,36 @@ class SpectralPlant(BatchPlant):
             action_weight=action_weight,
             divergence_bound=divergence_bound,
             target=self._checked("target", result_of(equation.target, self.x)),
+            cost=cost,
         )
+        self._own_cost = cost
+        if cost is not None:
+            self._require_fitting(cost)
+            self.field_target = self.target = cost.field_target
         self.width, self.shape, self.positions = positive("width", width), shape, positions
         self.supports = actuator_supports(equation, self.x, self.n_a, width, shape, positions)
-        self.parallel = self._make_step()
+        self._step = self._make_step()
         self._bind()
         if compiled:
             self.load()
 
     def load(self) -> None:
         """Load the compiled step, or compile it; ValueError where the equation cannot be compiled."""
-        load(self.parallel, self.equation)
+        load(self._step, self.equation)
+
+    @property
+    def parallel(self) -> ParallelStep | None:  # type: ignore[override]
+        """The compiled step; None where its cost is more than compiled code counts."""
+        return self._step if self.cost.plain else None
+
+    def _require_fitting(self, cost: Cost) -> None:
+        """ValueError unless the cost is one of a state, actions and episodes of these sizes."""
+        for name in ("n_z", "n_a", "horizon"):
+            if getattr(cost, name) != getattr(self, name):
+                raise ValueError(
+                    f"the cost is one for {name} {getattr(cost, name)}, and this plant's is "
+                    f"{getattr(self, name)}: make it for that"
+                )
 
     def _make_step(self) -> ParallelStep:
         """The compiled step of this plant."""
@@ -137,12 +161,12 @@ class SpectralPlant(BatchPlant):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the compiled step, which holds addresses of this process: a copy makes its own."""
-        return {name: value for name, value in vars(self).items() if name != "parallel"}
+        return {name: value for name, value in vars(self).items() if name != "_step"}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         """Continue where the plant was when it was pickled or copied, to the bit."""
         vars(self).update(state)
-        self.parallel = self._make_step()
+        self._step = self._make_step()
         self._bind()
 
     def __repr__(self) -> str:
@@ -160,6 +184,8 @@ class SpectralPlant(BatchPlant):
             values["actuator_shape"] = self.shape
         if len(self.positions):
             values["actuator_positions"] = [float(position) for position in self.positions]
+        if self._own_cost is not None:
+            values["cost"] = "".join(self._own_cost.packed)
         sources = sources_of(type(self.equation), Equation)
         return Definition({**values, **asdict(self.equation)}, sources)
 
@@ -176,7 +202,7 @@ class SpectralPlant(BatchPlant):
 
         self.load()
         if not isinstance(self.equation, LinearEquation):
-            return adjoint.Adjoint(self.parallel, self.equation.nonlinearity)
+            return adjoint.Adjoint(self._step, self.equation.nonlinearity)
         n_z, n_a = self.n_z, self.n_a
         A_transposed, _ = self.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))
         B_transposed, _ = self.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))
@@ -188,7 +214,7 @@ class SpectralPlant(BatchPlant):
             return None
         given = {name: getattr(self, name) for name in (*_NUMBERS, "width", "shape", "positions")}
         given["integration_time"] /= 2
-        return SpectralPlant(self.equation, **given)
+        return SpectralPlant(self.equation, **given, cost=self._own_cost)
 
     def _allocate(self, batch: int) -> None:
         super()._allocate(batch)
@@ -196,7 +222,9 @@ class SpectralPlant(BatchPlant):
             self._bind()
 
     def _bind(self) -> None:
-        self.parallel.bind(self.states, self.actions, self.totals, self.diverged_step)
+        # What the compiled step counts counts only where there is no more to the cost.
+        counted = self.totals if self.cost.plain else np.zeros(self.batch)
+        self._step.bind(self.states, self.actions, counted, self.diverged_step)
 
     def _draw(self, seed: int) -> Array:
         rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
@@ -215,11 +243,26 @@ class SpectralPlant(BatchPlant):
         return values.flatten()
 
     def _advance(self) -> None:
-        self.parallel.step(self.step_index)
+        if self.cost.plain:
+            self._step.step(self.step_index)
+            return
+        alive = np.flatnonzero(self.diverged_step < 0)
+        before, totals = self.states[alive], self.totals[alive]
+        self.cost.add(totals, before, self.actions[alive], self.step_index)
+        self._step.step(self.step_index)
+        lost = ~np.isfinite(totals)
+        self.states[alive[lost]] = before[lost]
+        self.diverged_step[alive[lost]] = self.step_index
+        if self.step_index + 1 == self.horizon:
+            self.cost.add_terminal(totals, self.states[alive])
+        self.totals[alive] = totals
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
         costs, diverged_step = np.zeros(len(states)), np.full(len(states), -1, dtype=np.int64)
-        self.parallel.bind(states, actions, costs, diverged_step)
-        self.parallel.step(0)
+        counted = costs.copy()
+        if not self.cost.plain:
+            self.cost.add(costs, states, actions, 0)
+        self._step.bind(states, actions, counted, diverged_step)
+        self._step.step(0)
         self._bind()
-        return costs
+        return counted if self.cost.plain else costs

@@ -88,7 +88,7 @@ def test_a_deep_copy_and_its_original_do_not_touch_each_other() -> None:
     plant = pdeloop.problem("burgers", n_z=32, horizon=9).plant(2)
     advance(plant, 2)
     other, before = copy.deepcopy(plant), plant.states.copy()
-    del plant.parallel  # whose memory the copy must not need
+    del plant._step  # whose memory the copy must not need
     advance(other, 3)
     assert same_bits(plant.states, before) and plant.step_index == 2 and other.step_index == 5
     other.reset([1, 2, 3, 4])  # of another size
