@@ -23,7 +23,7 @@ def most_environments(max_batch: int, state_size: int, horizon: int) -> int:
     """Environments of an episode, at most: fewer than `max_batch` where states are large.
 
     >>> most_environments(1024, 256, 300), most_environments(1024, 65536, 50)
-    (434, 10)
+    (435, 10)
     """
     row = 8 * max(state_size, 1)
     fitting = min(MESSAGE_BYTES // row, EPISODE_BYTES // (row * (horizon + 1)))

@@ -57,7 +57,7 @@ class SnapshotBasis:
     --------
     >>> basis = SnapshotBasis(np.eye(1, 5))
     >>> basis.extend(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]]))
-    >>> basis.coordinates(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]]))[0, :3]
+    >>> np.abs(basis.coordinates(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]])))[0, :3]
     array([3., 4., 0.])
     """
 
