@@ -3,7 +3,12 @@
 
 import math
 import operator
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
+import numpy as np
+
+from loop_interfaces.arrays import Array, float_array
 from pde_sim_node.equations import Equation, LinearEquation
 
 MAX_INTERNAL_STEPS = 10**7
@@ -42,6 +47,25 @@ def positive(name: str, value: float) -> float:
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return float(value)
+
+
+Coefficient: TypeAlias = float | Sequence[float] | Callable[[Array], Array]
+"""A number, the values at the points of a grid, or a function of x that gives them."""
+
+
+def values_at(name: str, given: Coefficient, x: Array) -> Array:
+    """A coefficient at points x (n,); ValueError where it has not as many finite values.
+
+    >>> values_at("growth", lambda x: 1.0 - x, np.array([0.0, 0.5]))
+    array([1. , 0.5])
+    """
+    values = float_array(name, given(x.copy()) if callable(given) else given)
+    if values.shape not in ((), x.shape) or not np.isfinite(values).all():
+        raise ValueError(
+            f"{name} must be a finite number, {len(x)} of them or a function of x that gives as many, "
+            f"got {'NaN or infinity' if values.shape in ((), x.shape) else f'shape {values.shape}'}"
+        )
+    return np.broadcast_to(values, x.shape).copy()
 
 
 def internal_steps(sample_time: float, integration_time: float) -> int:

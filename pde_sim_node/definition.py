@@ -9,7 +9,7 @@ import json
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,13 @@ def described(name: str, value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype != object:
         raw = np.ascontiguousarray(value).tobytes()
         return [str(value.dtype), list(value.shape), hashlib.sha256(raw).hexdigest()]
+    if isinstance(value, FunctionType):
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        return [
+            code_of(value.__code__),
+            described(name, cells),
+            described(name, value.__defaults__),
+        ]
     try:
         return hashlib.sha256(pickle.dumps(value)).hexdigest()
     except Exception as error:

@@ -20,7 +20,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
-from pde_sim_node.arguments import internal_steps, positive, whole
+from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
 from pde_sim_node.dynamics import Dynamics
 
 
@@ -35,6 +35,8 @@ class BoundaryControlled(Dynamics):
         Factor of beta.
     rate
         g of beta = strength cos(g arccos x).
+    beta
+        Another beta: a function of x, or its values at the points.
     action_cost
         R; Q is 1 / n.
     step_time
@@ -51,12 +53,19 @@ class BoundaryControlled(Dynamics):
     grid: Grid
 
     def __init__(
-        self, intervals: int, strength: float, rate: float, action_cost: float, step_time: float
+        self,
+        intervals: int,
+        strength: float,
+        rate: float,
+        action_cost: float,
+        step_time: float,
+        beta: Coefficient | None,
     ) -> None:
         n = whole("intervals", intervals, 4)
         self.grid = Grid.interval(1.0, n + 1, periodic=False)
         self.x = self.grid.axes[0].points
-        self.beta = strength * np.cos(rate * np.arccos(self.x))
+        known = strength * np.cos(rate * np.arccos(self.x))
+        self.beta = known if beta is None else values_at("beta", beta, self.x)
         self.state_weight, self.action_weight = 1.0 / n, positive("action_cost", action_cost)
         steps = internal_steps(self.sample_time, positive("step_time", step_time))
         # The held end is a state that does not change within a sampling time.
@@ -102,8 +111,9 @@ class Transport(BoundaryControlled):
         rate: float = 7.35,
         action_cost: float = 0.1,
         step_time: float = 1e-4,
+        beta: Coefficient | None = None,
     ) -> None:
-        super().__init__(intervals, strength, rate, action_cost, step_time)
+        super().__init__(intervals, strength, rate, action_cost, step_time, beta)
 
     def rates(self) -> Array:
         """Upwind differences."""
@@ -125,8 +135,9 @@ class ReactionDiffusionBoundary(BoundaryControlled):
         rate: float = 8.0,
         action_cost: float = 0.1,
         step_time: float = 1e-5,
+        beta: Coefficient | None = None,
     ) -> None:
-        super().__init__(intervals, strength, rate, action_cost, step_time)
+        super().__init__(intervals, strength, rate, action_cost, step_time, beta)
         self.A[0], self.B[0] = 0.0, 0.0
 
     def rates(self) -> Array:

@@ -1,14 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One dimension with walls: heat, convection, reaction and Burgers on [0, L].
 
-    u_t = D u_xx - c u_x - s u u_x + r u - b u^3 + sum_j Phi_j(x) a_j(t)
+    u_t = (D u_x)_x - c u_x - s u u_x + r u - b u^3 + f + sum_j Phi_j(x) a_j(t)
 
-with alpha u + beta du/dn = g at each end, n outwards: "dirichlet" is u = g, "neumann" du/dn = g and
-"robin" h u + du/dn = g. An input through a wall is its g; the g of other walls is 0.
+with D, c, s, r, b and f numbers or functions of x, and alpha u + beta du/dn = g at each end, n
+outwards: "dirichlet" is u = g, "neumann" du/dn = g and "robin" h u + du/dn = g. An input through a wall
+is its g; the g of other walls is 0.
 
-Nodes x_i = i L / (n - 1), the walls among them; central differences, with a node beyond the wall
-eliminated where a derivative is given there. Crank-Nicolson for the linear part, Heun for the rest:
-second order in space and time.
+Nodes x_i = i L / (n - 1), the walls among them; central differences with D between the nodes, and a
+node beyond the wall eliminated where a derivative is given there. Crank-Nicolson for the linear part,
+Heun for the rest: second order in space and time.
 
 References
 ----------
@@ -18,13 +19,14 @@ chapters 2 and 9.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
-from pde_sim_node.arguments import internal_steps, positive, whole
+from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
 from pde_sim_node.dynamics import Dynamics
 
 Wall = Literal["dirichlet", "neumann", "robin"]
@@ -41,9 +43,9 @@ class Interval(Dynamics):
     length
         L.
     diffusivity, advection, steepening
-        D > 0, c and s.
+        D > 0, c and s, each a number, a function of x, or the values at the nodes.
     growth, saturation
-        r and b. With walls at u = 0 a uniform growth is unstable beyond D (pi/L)^2.
+        r and b, likewise. With walls at u = 0 a uniform growth is unstable beyond D (pi/L)^2.
     left, right
         "dirichlet", "neumann" or "robin".
     transfer
@@ -56,6 +58,10 @@ class Interval(Dynamics):
         Root mean square of the coefficients of the initial fields' four lowest waves.
     step_time
         Internal time step; a sample_time of 0.05 is a whole multiple of it.
+    forcing
+        f, likewise.
+    shapes
+        Phi of inputs inside: a function of x (n,) that gives (n, n_a), in place of Gaussians.
 
     Raises
     ------
@@ -69,11 +75,11 @@ class Interval(Dynamics):
         self,
         points: int = 65,
         length: float = 1.0,
-        diffusivity: float = 0.05,
-        advection: float = 0.0,
-        steepening: float = 0.0,
-        growth: float = 1.0,
-        saturation: float = 0.0,
+        diffusivity: Coefficient = 0.05,
+        advection: Coefficient = 0.0,
+        steepening: Coefficient = 0.0,
+        growth: Coefficient = 1.0,
+        saturation: Coefficient = 0.0,
         left: str = "dirichlet",
         right: str = "dirichlet",
         transfer: float = 1.0,
@@ -81,6 +87,8 @@ class Interval(Dynamics):
         actuators: int = 3,
         rms: float = 0.5,
         step_time: float = 0.01,
+        forcing: Coefficient = 0.0,
+        shapes: Callable[[Array], Array] | None = None,
     ) -> None:
         for name, given, known in (
             *(("left", left, Wall), ("right", right, Wall)),
@@ -94,11 +102,17 @@ class Interval(Dynamics):
         self.grid = Grid.interval(positive("length", length), n, periodic=False)
         self.x, self.rms = self.grid.axes[0].points, rms
         self._walls = {0: left, n - 1: right}
-        self._physics = (positive("diffusivity", diffusivity), advection, growth, transfer)
-        self._steepening, self._saturation = steepening, saturation
+        self._D = self._between(diffusivity)
+        self._c, self._r = (
+            values_at("advection", advection, self.x),
+            values_at("growth", growth, self.x),
+        )
+        self._steepening = values_at("steepening", steepening, self.x)
+        self._saturation = values_at("saturation", saturation, self.x)
+        self._h, self._steady = transfer, values_at("forcing", forcing, self.x)
         self._dt = positive("step_time", step_time)
         self._steps = internal_steps(self.sample_time, self._dt)
-        self._place_inputs(inputs, actuators)
+        self._place_inputs(inputs, actuators, shapes)
         from scipy.sparse import csc_matrix, eye  # which only some plants need
         from scipy.sparse.linalg import splu
 
@@ -116,31 +130,62 @@ class Interval(Dynamics):
         arguments, named = state["_given"]
         self.__init__(*arguments, **named)  # type: ignore[misc]
 
-    def _place_inputs(self, inputs: str, actuators: int) -> None:
+    def _between(self, diffusivity: Coefficient) -> Array:
+        """D half-way to both neighbours of each node, (n + 1,); the first and the last are beyond."""
+        x, at = self.x, values_at("diffusivity", diffusivity, self.x)
+        middle = 0.5 * (x[1:] + x[:-1])
+        inner = (
+            values_at("diffusivity", diffusivity, middle)
+            if callable(diffusivity)
+            else 0.5 * (at[1:] + at[:-1])
+        )
+        if not (at.min() > 0.0 and inner.min() > 0.0):
+            raise ValueError(
+                f"diffusivity must be positive, got {min(at.min(), inner.min()):g} somewhere"
+            )
+        # Beyond the walls as far as a straight line leads, which leaves the order.
+        return np.concatenate([[2 * at[0] - inner[0]], inner, [2 * at[-1] - inner[-1]]])
+
+    def _place_inputs(
+        self, inputs: str, actuators: int, shapes: Callable[[Array], Array] | None
+    ) -> None:
         """Phi, and how an action enters at the walls."""
         n, last = len(self.x), len(self.x) - 1
         driven = {"inside": [], "left": [0], "right": [last], "both": [0, last]}[inputs]
         self.n_a = len(driven) or whole("actuators", actuators, 1)
+        if shapes is not None:
+            given = float_array("shapes", shapes(self.x))
+            if driven or given.ndim != 2 or len(given) != n or not np.isfinite(given).all():
+                raise ValueError(
+                    f"shapes must give {n} x n_a finite numbers for inputs inside, got an array of "
+                    f"shape {given.shape} for inputs {inputs}"
+                )
+            self.n_a = given.shape[1]
         self.supports = np.zeros((n, self.n_a))
         self._driven = dict(zip(driven, range(self.n_a), strict=False))
-        if not driven:
+        if shapes is not None:
+            self.supports = given
+        elif not driven:
             centres = (np.arange(self.n_a) + 0.5) / self.n_a * self.x[-1]
             width = 0.25 * self.x[-1] / self.n_a
             self.supports = np.exp(-0.5 * ((self.x[:, None] - centres) / width) ** 2)
         for node, j in self._driven.items():
             self.supports[node, j] = 1.0
         self._inside = self.supports * (not driven)
+        for node, wall in self._walls.items():
+            if wall == "dirichlet":  # where u is given, nothing forces it
+                self._inside[node] = self._steady[node] = 0.0
 
     def _operator(self) -> Array:
-        """The matrix of D u_xx - c u_x + r u; a row of a wall where u is given is zero."""
-        D, c, r, h = self._physics
+        """The matrix of (D u_x)_x - c u_x + r u; a row of a wall where u is given is zero."""
+        D, c, h = self._D, self._c, self._h
         n, dx = len(self.x), float(self.x[1])
-        below, above = D / dx**2 + c / (2 * dx), D / dx**2 - c / (2 * dx)
-        A = np.diag(np.full(n, r - 2 * D / dx**2))
-        A += np.diag(np.full(n - 1, below), -1) + np.diag(np.full(n - 1, above), 1)
+        below, above = D[:-1] / dx**2 + c / (2 * dx), D[1:] / dx**2 - c / (2 * dx)
+        A = np.diag(self._r - (D[:-1] + D[1:]) / dx**2)
+        A += np.diag(below[1:], -1) + np.diag(above[:-1], 1)
         self._flux = {}
         for node, wall in self._walls.items():
-            inner, beyond = (1, below) if node == 0 else (n - 2, above)
+            inner, beyond = (1, below[0]) if node == 0 else (n - 2, above[-1])
             if wall == "dirichlet":
                 A[node] = 0.0
                 continue
@@ -174,7 +219,7 @@ class Interval(Dynamics):
 
     def step(self, z: Array, a: Array) -> Array:
         """See `Dynamics.step`."""
-        forcing = (self._inside * a).sum(axis=1)
+        forcing = (self._inside * a).sum(axis=1) + self._steady
         for node, flux in self._flux.items():
             if node in self._driven:
                 forcing[node] += flux * a[self._driven[node]]
@@ -189,7 +234,7 @@ class Interval(Dynamics):
     def _rest(self, u: Array) -> Array:
         """-s u u_x - b u^3, in the conservative form inside and one-sided at the walls."""
         rest = -self._saturation * u**3
-        if self._steepening:
+        if self._steepening.any():
             rest -= self._steepening * u * np.gradient(u, float(self.x[1]), edge_order=2)
         for node, wall in self._walls.items():
             if wall == "dirichlet":

@@ -76,3 +76,15 @@ def test_transport_ends_in_the_time_that_backstepping_promises() -> None:
         left.append(float(np.abs(z).max()))
     assert (np.array(left[1:]) < 0.7 * np.array(left[:-1])).all(), left
     assert left[-1] < 0.3 and np.abs(finely.step(np.ones(401), np.ones(1))).max() > 1.0
+
+
+def test_a_beta_of_ones_own_is_that_of_the_task_where_it_is_the_same() -> None:
+    for kind, strength, rate in ((Transport, 5.0, 7.35), (ReactionDiffusionBoundary, 50.0, 8.0)):
+        own = kind(beta=lambda x, s=strength, g=rate: s * np.cos(g * np.arccos(x)))
+        assert np.array_equal(own.A, kind().A)
+        still = kind(
+            intervals=20, beta=lambda x: 0.0 * x, step_time=1e-4 if kind is Transport else 1e-5
+        )
+        assert np.abs(np.linalg.eigvals(still.A)).max() < 1.0  # without beta nothing grows
+    with pytest.raises(ValueError, match="beta must be a finite number"):
+        Transport(beta=[1.0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import threading
 from typing import Any
 
 import numpy as np
@@ -355,8 +356,8 @@ def test_a_fingerprint_is_of_the_source_and_of_the_arguments() -> None:
 def test_an_array_as_argument_has_a_fingerprint_and_what_cannot_be_kept_has_none() -> None:
     first, second = np.arange(3.0), np.array([0.0, 1.0, 2.0 + 2**-50])
     assert described("x", first) == described("x", np.arange(3.0)) != described("x", second)
-    with pytest.raises(ValueError, match="the parameter x is a function, which has no fingerprint"):
-        described("x", lambda: 0)
+    with pytest.raises(ValueError, match="the parameter x is a lock, which has no fingerprint"):
+        described("x", threading.Lock())
 
 
 def test_a_plant_can_be_copied_and_pickled() -> None:
