@@ -22,11 +22,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from pdeloop.in_process import LocalPair, train
+from pdeloop.supervisor import die_with
 from pdeloop.training_run import resolve
 from tests.support.interpreter import ROOT
 from tests.support.relay.train import FAULTS
@@ -176,7 +178,7 @@ class _Training:
                     "PYTHONFAULTHANDLER": "1",
                 },
                 start_new_session=True,
-                preexec_fn=_hear_interruptions,
+                preexec_fn=partial(_begin, os.getpid()),
             )
 
     def _disturb(self, supervisor: subprocess.Popen[bytes], rng: np.random.Generator) -> None:
@@ -245,8 +247,9 @@ def _end(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
     raise RuntimeError(f"the supervisor did not end by {number.name}")
 
 
-def _hear_interruptions() -> None:
-    """For `preexec_fn`: a shell starts what runs in its background deaf to SIGINT."""
+def _begin(parent: int) -> None:
+    """For `preexec_fn`: it dies with its parent, and hears SIGINT, as in no shell's background."""
+    die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

@@ -2,9 +2,10 @@
 """Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
 
 Most of what it takes to start a node is imports and the loading of compiled code, a second of a
-core. So what a test starts itself, nodes, commands and pieces of Python, is forked from a process
-that has done that (`preloaded`). The nodes that a training starts are programs of their own, as
-always.
+core. So what a test starts, nodes, commands and pieces of Python, is forked from a process
+that has done that (`preloaded`), and so are the nodes of a training that was forked (`forked_nodes`).
+
+All of them die with the process that runs the tests, however that ends.
 """
 
 from __future__ import annotations
@@ -18,11 +19,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
 from loop_interfaces.isolation import loopback_environment
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
+from pdeloop.supervisor import die_with
+from tests.support import forked_nodes
 
 ROOT = Path(__file__).resolve().parents[2]
 FORKING = multiprocessing.get_context("forkserver")
@@ -86,7 +91,13 @@ class Forked:
 
 
 def become(log: Path, environment: Mapping[str, str]) -> None:
-    """Make a forked process one of a test's own: its session, output, environment and folder."""
+    """Make a forked process one of a test's own: its session, output, environment and folder.
+
+    It dies with the process that it was forked from, which ends with the one that runs the tests,
+    unless another holds the descriptor by which it knows.
+    """
+    die_with(os.getppid())
+    os.close(forkserver._forkserver._forkserver_alive_fd)
     os.setsid()
     with log.open("wb") as output, Path(os.devnull).open("rb") as nothing:
         for file, number in ((nothing, 0), (output, 1), (output, 2)):
@@ -104,8 +115,11 @@ def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, 
         sys.argv = [name, *arguments]
         exec(code, {"__name__": "__main__"})
         return
+    from tests.support.forked_nodes import fork_nodes
     from tests.support.preloaded import MAINS
 
+    if name == "pdeloop":
+        fork_nodes(log.parent)
     sys.argv = [name, *arguments]
     sys.exit(MAINS[name]())
 
@@ -149,6 +163,7 @@ class Processes:
                 env=self.environment,
                 cwd=self.folder,
                 start_new_session=True,
+                preexec_fn=partial(die_with, os.getpid()),
             )
         process.log = path  # type: ignore[attr-defined]
         self._alive.append(process)
@@ -196,6 +211,7 @@ class Processes:
         """Processes of this test that still run, also those its children started."""
         inside = f"ROS_LOG_DIR={self.folder}".encode()
         found = [forked.pid for forked in self._forked()]
+        found += forked_nodes.running(self.folder)
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 environment = (entry / "environ").read_bytes()
@@ -211,6 +227,8 @@ class Processes:
     def pids(self, node: str) -> list[int]:
         """Processes of this test that run the module `node`.node, whoever started them."""
         found = [forked.pid for forked in self._forked() if forked.name == node]
+        children = forked_nodes.running(self.folder)
+        found += [pid for pid, name in children.items() if name == node]
         for pid in self.left_behind():
             with contextlib.suppress(OSError):
                 words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")

@@ -8,15 +8,17 @@ import os
 import re
 import signal
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from pdeloop.supervisor import die_with
 from tests.support.loop_harness import ROOT, Processes
 
 pytestmark = pytest.mark.topics
 LIMIT = 180.0
-"""Seconds: the fits of a whole training of Burgers."""
+"""Seconds: a training of Burgers."""
 
 
 def blocks() -> list[str]:
@@ -43,7 +45,7 @@ def test_the_three_terminals_train_and_say_where_the_results_are(
         for block in found:
             assert "export ROS_DOMAIN_ID=42" in block
             text = block.replace("ROS_DOMAIN_ID=42", f"ROS_DOMAIN_ID={domain}")
-            text = text.replace("out:=my_run", "out:=my_run -p rollouts:=9")
+            text = text.replace("out:=my_run", "out:=my_run -p rollouts:=9 -p optimizer:=two_point")
             with (tmp_path / f"{len(started)}.log").open("wb") as log:
                 started.append(
                     subprocess.Popen(
@@ -54,6 +56,7 @@ def test_the_three_terminals_train_and_say_where_the_results_are(
                         stdout=log,
                         stderr=subprocess.STDOUT,
                         start_new_session=True,
+                        preexec_fn=partial(die_with, os.getpid()),
                     )
                 )
         assert started[2].wait(LIMIT) == 0

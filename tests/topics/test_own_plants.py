@@ -21,10 +21,12 @@ pytestmark = pytest.mark.topics
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
 PENDULUM = f"{PLANTS}/pendulum.py:upright"
-BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
-FLAGS = [
-    word for name, value in BUDGET.items() for word in (f"--{name.replace('_', '-')}", str(value))
-]
+BUDGET: dict[str, Any] = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
+
+
+def flags(budget: dict[str, Any]) -> list[str]:
+    named = [(f"--{name.replace('_', '-')}", str(value)) for name, value in budget.items()]
+    return [word for pair in named for word in pair]
 
 
 def policies(folder: Path) -> np.ndarray:
@@ -33,23 +35,29 @@ def policies(folder: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("name", "given"),
-    [(LINEAR, {"radius": 0.9}), (PLATE, {"nx": 6, "ny": 4}), (PENDULUM, {"horizon": 20})],
+    ("name", "given", "optimizer"),
+    [
+        (LINEAR, {"radius": 0.9}, "gauss_newton"),
+        (PLATE, {"nx": 6, "ny": 4}, "two_point"),
+        (PENDULUM, {"horizon": 20}, "model_based"),
+    ],
 )
 def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorded(
     loop: Processes,
     tmp_path: Path,
     name: str,
     given: dict[str, Any],
+    optimizer: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = tmp_path / "own.yaml"
     problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given}}}))
     out = tmp_path / "run"
-    words = [str(problem), "--plant", name, *FLAGS, "--record", "--out", str(out)]
+    budget = {**BUDGET, "optimizer": optimizer}
+    words = [str(problem), "--plant", name, *flags(budget), "--record", "--out", str(out)]
     loop.wait(loop.pdeloop("train", *words), LIMIT)
     monkeypatch.setenv(OWN_PLANTS.variable, "")
-    run = pdeloop.train(pdeloop.problem(plant=name, physical=given), **BUDGET)
+    run = pdeloop.train(pdeloop.problem(plant=name, physical=given), **budget)
     assert same_bits(policies(out), run.policies)
     assert json.loads((out / "result.json").read_text())["plant"] == run.result["plant"]
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out), "--plant", name), LIMIT)
@@ -70,7 +78,7 @@ def test_a_plant_that_fails_ends_its_node_and_the_training_with_the_cause(
             "        assert abs(z).max() < 3.5, 'too hot'\n        return self.A @ z",
         )
     )
-    words = ["--plant", f"{own}:RandomLinear", *FLAGS, "--out", str(tmp_path / "run")]
+    words = ["--plant", f"{own}:RandomLinear", *flags(BUDGET), "--out", str(tmp_path / "run")]
     told = loop.wait(loop.pdeloop("train", *words), LIMIT, code=1)
     assert f"pde_sim_node: RandomLinear.step fails: {own}, line 21: AssertionError: too hot" in told
     assert "Traceback" not in told

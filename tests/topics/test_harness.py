@@ -1,0 +1,48 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A test run that is killed leaves no process behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.forked_nodes import began
+from tests.support.loop_harness import Processes, until
+from tests.support.small_loop import LIMIT
+
+pytestmark = pytest.mark.topics
+
+TESTS = """
+import os, sys, time
+from pathlib import Path
+del os.environ["ROS_DOMAIN_ID"]  # it takes one of its own
+from tests.support.loop_harness import processes, until
+from tests.support.operator_harness import operator
+from tests.support.small import SMALL
+folder = Path(sys.argv[1])
+with processes(folder) as loop, operator(loop) as desk:
+    loop.start("-m", "tests.support.relay.node", "--ros-args", name="relay")
+    words = "train", str(SMALL), "--iterations", "100000", "--out", str(folder / "run")
+    loop.pdeloop(*words)
+    until((folder / "run" / "progress.jsonl").exists, 240, "training")
+    print(*loop.left_behind(), desk._process.pid, flush=True)
+    time.sleep(600)
+"""
+"""What a worker of pytest does: a program, a command and its nodes, an operator."""
+
+
+def test_all_that_the_tests_started_dies_with_the_process_that_runs_them(
+    loop: Processes, tmp_path: Path
+) -> None:
+    (tmp_path / "inner").mkdir()
+    worker = loop.program(sys.executable, "-c", TESTS, str(tmp_path / "inner"))
+    until(lambda: loop.output(worker).endswith("\n"), LIMIT, "processes")
+    started = [int(word) for word in loop.output(worker).split()]
+    assert len(started) >= 6 and all(map(began, started))
+    os.kill(worker.pid, signal.SIGKILL)
+    worker.wait()
+    until(lambda: not any(map(began, started)), LIMIT, "end of all processes")
