@@ -67,11 +67,12 @@ coverage: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not topics" -p pytest_cov --cov
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
-# jump, iproute2 for hosts made of network namespaces, zsh and fish for their
-# completion. Where they cannot be had, those tests are skipped and say so.
+# jump, iproute2 for hosts made of network namespaces, a C compiler for exported laws, zsh and fish for
+# their completion. Where they cannot be had, those tests are skipped and say so.
 packages:
 	@missing=(); \
 	command -v chromium >/dev/null || missing+=(chromium); \
+	command -v cc >/dev/null || missing+=(gcc libc6-dev); \
 	command -v ip >/dev/null || missing+=(iproute2); \
 	for shell in zsh fish; do command -v $$shell >/dev/null || missing+=($$shell); done; \
 	ls /usr/lib/*/faketime/libfaketime.so.1 >/dev/null 2>&1 || missing+=(faketime); \

@@ -28,7 +28,6 @@ from benchmarks.baselines import (
     run,
 )
 from benchmarks.methods import (
-    LIBRARIES,
     METHODS,
     Identified,
     LikeliestField,
@@ -62,9 +61,6 @@ AGENTS = ("ppo", "sac")
 
 
 def values_of(method: str) -> dict[str, Any]:
-    library, extra = LIBRARIES.get(method, ("", ""))
-    if library:
-        pytest.importorskip(library, reason=f"needs {library}: pip install 'pdeloop[{extra}]'")
     sensors = {"sensors": 8} if method in ("lqg", "true-model") else {}
     return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **sensors}
 
@@ -143,7 +139,6 @@ def plant() -> Plant:
 
 def designs(plant: Plant, limit: float, steps: int) -> tuple[Predictive, Any, np.ndarray]:
     """MPC and LQ tracking of one model, and S = R + B'PB."""
-    pytest.importorskip("osqp", reason="needs osqp: pip install 'pdeloop[bench]'")
     rng = np.random.default_rng(0)
     model = ReducedModel(
         A=rng.standard_normal((3, 3)) / 2,

@@ -14,9 +14,6 @@ import pytest
 
 from tests.support.interpreter import ROOT
 
-pytest.importorskip("matplotlib")
-pytest.importorskip("gymnasium")
-
 NAMES = re.findall(r"^::: (\S+)$", (ROOT / "docs/reference/index.md").read_text(), re.MULTILINE)
 ARRAYS = re.compile(r"\b(Array|ArrayLike|NDArray)\b")
 

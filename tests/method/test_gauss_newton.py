@@ -150,7 +150,8 @@ def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
         assert json.loads(json.dumps(row, allow_nan=False)) == row
         assert row["rollouts"] == total
         costs.append(row["cost"])
-    assert 24 - 2 * 3 < total <= 24  # what is left is no step of up to twice three fields
+    left = 24 - total  # fewer rollouts than a step takes on the fields of the end
+    assert 0 <= left < len(optimizer.state()["fields"])
     assert optimizer.ask() == []
     with pytest.raises(ValueError, match="done"):
         optimizer.tell([])

@@ -84,7 +84,9 @@ def test_what_is_no_run_is_refused(
     assert "expected two runs or more" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, the command cc")
+@pytest.mark.skipif(
+    shutil.which("cc") is None, reason="needs a C compiler, the command cc (make packages)"
+)
 @pytest.mark.parametrize(("name", "law", "seed"), [("plain", "adapted", 6), ("limited", "lqt", 0)])
 def test_the_law_in_c_is_the_law_of_the_loop(
     runs: dict[str, Path], tmp_path: Path, name: str, law: str, seed: int

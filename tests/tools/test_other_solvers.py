@@ -17,8 +17,9 @@ PLANTS = ROOT / "examples" / "plants"
 
 
 def needs(module: str, package: str) -> pytest.MarkDecorator:
-    why = f"{package} is not installed; it is part of the extra `solvers`"
-    return pytest.mark.skipif(find_spec(module) is None, reason=why)
+    return pytest.mark.skipif(
+        find_spec(module) is None, reason=f"{package} is not installed: extra solvers"
+    )
 
 
 def made(name: str, **given: Any) -> Any:
@@ -26,7 +27,6 @@ def made(name: str, **given: Any) -> Any:
     return vars(OWN_PLANTS._load_file(str(PLANTS / file)))[kind](**given)
 
 
-@needs("skfem", "scikit-fem")
 def test_finite_elements_conduct_heat_as_they_must_and_are_trained() -> None:
     plate = made("plate_skfem.py:Plate", refinements=2, rate=0.0)
     z = plate.initial_state(np.random.default_rng(0))

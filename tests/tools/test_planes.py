@@ -95,7 +95,6 @@ def test_a_history_for_ros_has_its_own_range_for_each_component() -> None:
 
 
 def test_an_episode_and_the_check_are_drawn_as_pictures() -> None:
-    pytest.importorskip("matplotlib")
     plant = as_plant(Sheet())
     episode = pdeloop.rollout(plant, lambda k, z: np.ones((2, 2)), [0, 1])
     drawn = [

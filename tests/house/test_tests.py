@@ -1,0 +1,128 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Every test can fail, and one that is skipped needs what a test run cannot install everywhere."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.support.interpreter import ROOT
+
+FILES = sorted((ROOT / "tests").rglob("*.py"))
+TREES = {file: ast.parse(file.read_text()) for file in FILES}
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|assert_")
+SKIPS = {
+    "tests/topics/test_isolation.py": ["needs root, and the right to make namespaces"],
+    "tests/topics/test_pairs.py": [
+        "needs root, iproute2, and a kernel with veth",
+        "needs two cores",
+    ],
+    "tests/topics/test_clock.py": ["needs Debian's faketime (make packages)"],
+    "tests/topics/test_discovery_server.py": ["str(error)"],
+    "tests/solver/test_workers.py": ["needs two cores"],
+    "tests/support/browser.py": ["needs a real browser, the command `chromium` (make packages)"],
+    "tests/support/small_disk.py": ["mounting a small disk needs root, and the right to mount"],
+    "tests/tools/test_command_line.py": ["needs {command[0]} (make packages)"],
+    "tests/tools/test_compare_and_export.py": [
+        "needs a C compiler, the command cc (make packages)"
+    ],
+    "tests/tools/test_layout.py": ["needs two cores"],
+    "tests/tools/test_other_solvers.py": ["{package} is not installed: extra solvers"],
+    "tests/tools/test_stable_baselines.py": ["stable-baselines3 is not installed: extra rl"],
+    "tests/benchmarks/test_baselines.py": ["stable-baselines3 is not installed: extra rl"],
+    "tests/tools/test_environment_pictures.py": ["MoviePy is not installed: extra rl"],
+    "tests/tools/test_study.py": ["another {name} cannot be had: {done.stderr"],
+}
+"""Where tests are skipped, and why: rights and programs of the machine, packages that bring PyTorch or
+JAX, a registry that cannot be reached."""
+
+
+def functions(tree: ast.AST) -> list[Function]:
+    return [node for node in ast.walk(tree) if isinstance(node, Function)]
+
+
+def checks(node: ast.AST) -> bool:
+    """Whether something in it compares or fails by itself."""
+    return any(
+        isinstance(part, ast.Assert | ast.Raise)
+        or (isinstance(part, ast.Call) and CHECKS.match(ast.unparse(part.func)))
+        for part in ast.walk(node)
+    )
+
+
+def called(node: ast.AST) -> set[str]:
+    """The names of functions and methods that it calls, or enters as a context, or asks for."""
+    names = {ast.unparse(c.func).split(".")[-1] for c in ast.walk(node) if isinstance(c, ast.Call)}
+    arguments = node.args.args if isinstance(node, Function) else []
+    return names | {argument.arg for argument in arguments}
+
+
+def helpers() -> dict[str, bool]:
+    """The functions of the tests and their support, and whether all of that name check something."""
+    every: dict[str, list[Function]] = {}
+    for tree in TREES.values():
+        for function in functions(tree):
+            every.setdefault(function.name, []).append(function)
+    known = {name: all(checks(f) for f in found) for name, found in every.items()}
+    while True:
+        further = [
+            name
+            for name, found in every.items()
+            if not known[name] and all(checks(f) or any_of(known, called(f)) for f in found)
+        ]
+        if not further:
+            return known
+        known |= dict.fromkeys(further, True)
+
+
+def any_of(known: dict[str, bool], names: set[str]) -> bool:
+    return any(known.get(name, False) for name in names)
+
+
+def test_every_test_can_fail() -> None:
+    known = helpers()
+    silent = []
+    for file, tree in TREES.items():
+        own = {function.name: checks(function) for function in functions(tree)}
+        for function in functions(tree) if file.name.startswith("test_") else ():
+            silence = not own[function.name] and not any_of({**known, **own}, called(function))
+            if function.name.startswith("test_") and silence:
+                silent.append(f"{file.relative_to(ROOT)}:{function.lineno}: {function.name}")
+    assert silent == []
+
+
+def reasons(tree: ast.Module) -> list[str]:
+    """Why its tests may be skipped, as far as the source says it."""
+    found = []
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func)
+        if name == "pytest.skip":
+            found.append(ast.unparse(call.args[0]))
+        elif name == "pytest.mark.skipif":
+            found += [ast.unparse(word.value) for word in call.keywords if word.arg == "reason"]
+        elif name in ("pytest.importorskip", "pytest.mark.skip", "pytest.mark.xfail"):
+            found.append(ast.unparse(call))
+    return found
+
+
+def test_only_what_cannot_be_had_everywhere_is_a_reason_to_skip() -> None:
+    found = {str(file.relative_to(ROOT)): reasons(tree) for file, tree in TREES.items()}
+    other = [
+        (name, reason)
+        for name, given in found.items()
+        for reason in given
+        if not any(words in reason for words in SKIPS.get(name, []))
+    ]
+    assert other == [], "a reason to skip that is not in the table above"
+    gone = {name: w for name, w in SKIPS.items() if len(found[name]) < len(w)}
+    assert gone == {}
+
+
+@pytest.mark.parametrize("name", ["osqp", "cmaes", "matplotlib", "gymnasium", "scikit-fem"])
+def test_what_tests_need_of_these_is_installed_with_them(name: str) -> None:
+    locked = Path(ROOT / "requirements" / "test.txt").read_text()
+    assert re.search(rf"^{re.escape(name)}==", locked, re.MULTILINE)
