@@ -98,7 +98,7 @@ def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -
 
 
 def documentation(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
-    """What a docstring says of a function and, by name, of its parameters, `%` doubled for argparse."""
+    """The documentation of a function and of its parameters by name, `%` doubled for argparse."""
     text, _, parameters = (inspect.getdoc(function) or "").partition("\n\nParameters\n----------\n")
     said: dict[str, list[str]] = {}
     names: list[str] = []

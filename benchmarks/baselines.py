@@ -174,7 +174,7 @@ def require_libraries(labels: Iterable[str]) -> None:
 
 
 def pairs(words: Sequence[str]) -> dict[str, Any]:
-    """What NAME=JSON words say."""
+    """Parse NAME=JSON words."""
     found = {}
     for word in words:
         name, _, value = word.partition("=")

@@ -25,7 +25,7 @@ WINDOW = 20
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended, and how far it had come.
+    """The end point of a descent, and its progress until then.
 
     x: the argument; cost; iterations; gradient_norm: |x| |dJ/dx|/J at the end; last_fall: of the last
     WINDOW iterations, relative to the cost; converged: whether that, or the gradient norm's square,

@@ -14,7 +14,7 @@ from benchmarks.processes import BenchError, machine, markdown
 from loop_interfaces.module_path import PROJECT
 
 PARTS = {"start (": "compile", "identify": "start-up", "adapt": "first law"}
-"""What ends when a line that begins so is printed, in this order."""
+"""The phases, in order, each by the beginning of the line that is printed at its end."""
 
 
 def run(*, python: str = "python3") -> dict[str, Any]:

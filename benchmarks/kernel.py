@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How long one sampling time of one environment takes: this plant against other implementations.
+"""Time per sampling time of one environment: this plant against other implementations.
 
 All of them integrate the same equation with the same ETDRK4 and the same dealiasing. NumPy stands
 for what one writes first, vectorised over the environments with SciPy's FFT; JAX for the same,
@@ -26,7 +26,7 @@ from spectral_solver.reference import ReferenceStep
 
 BATCHES = (1, 2, 12, 64)
 SECONDS = 0.25
-"""How long each figure is measured for."""
+"""Measuring time of each figure (s)."""
 KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(2**24), "MALLOC_TRIM_THRESHOLD_": str(2**28)}
 """For the references: glibc may return their temporaries to the system at every step, and the page
 faults then cost up to ten times the arithmetic."""

@@ -405,4 +405,4 @@ LIBRARIES = {
     "ppo": ("stable_baselines3", "rl"),
     "sac": ("stable_baselines3", "rl"),
 }
-"""What a method needs besides the project's own dependencies, and the extra that has it."""
+"""Modules that a method needs besides the project's dependencies, and the extra that has them."""

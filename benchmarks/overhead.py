@@ -58,7 +58,7 @@ COMPANY: dict[str, Callable[[Bench, str, Sequence[int]], list[BenchProcess]]] = 
     "viewer": viewer,
     "monitor": monitor,
 }
-"""What comes and goes, by name: starts it, off the cores of the pair where `pdeloop train` does so."""
+"""Starters of participants that come and go, off the cores of the pair as `pdeloop train` does it."""
 
 
 def run(

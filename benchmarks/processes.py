@@ -71,7 +71,7 @@ class BenchProcess:
         return line
 
     def log(self) -> str:
-        """What the node has logged."""
+        """The node's log so far."""
         return self._log.read_text(errors="replace")
 
     def processor_times(self) -> dict[str, float]:
@@ -188,7 +188,7 @@ def bench() -> Iterator[Bench]:
 
 
 def machine() -> dict[str, Any]:
-    """What a figure was measured on, without names."""
+    """The machine that a figure was measured on, without names."""
     return {
         "cores": os.cpu_count(),
         "architecture": platform.machine(),
@@ -208,7 +208,7 @@ def ended_well(process: BenchProcess) -> bool:
 
 
 def progress(folder: Path) -> list[dict[str, Any]]:
-    """What a run has written to its progress.jsonl so far."""
+    """The rows of a run's progress.jsonl so far."""
     path = folder / "progress.jsonl"
     lines = path.read_text().splitlines() if path.exists() else []
     return [json.loads(line) for line in lines if line.endswith("}")]

@@ -39,11 +39,11 @@ from pdeloop.episode import Law
 from pdeloop.in_process import LocalPair
 
 PENALTY = 100.0
-"""What a diverged episode costs, in stage costs of the mean initial field."""
+"""The cost of a diverged episode, in stage costs of the mean initial field."""
 
 
 class Signals(NamedTuple):
-    """What an agent observes of states (M, state_size), how far it acts, and the unit of its reward.
+    """An agent's observations of states (M, state_size), and the units of its actions and reward.
 
     paid: rollouts that this took to find out.
     """

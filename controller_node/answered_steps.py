@@ -17,7 +17,7 @@ NONE: Ids = (-1, -1, -1)
 
 
 class AnsweredSteps:
-    """How far an episode was answered, and how far it went by its cost."""
+    """The last answered step of an episode, and its last step according to its cost."""
 
     def __init__(self) -> None:
         self._episode = NONE

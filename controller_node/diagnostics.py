@@ -21,12 +21,12 @@ class ControllerDiagnostics:
         self._heard = float("-inf")
         self._waiting = ConditionTimer()
         self.plant_paused = False
-        """What the plant said on `episode/paused`."""
+        """Whether the plant is paused, by its `episode/paused`."""
         self.plants: int | None = None
-        """How many publish `state`; None: not known."""
+        """Number of publishers of `state`; None if not known."""
 
     def waiting(self, now: float) -> list[str]:
-        """What a state has waited for, for longer than WAITING; to be called in every round."""
+        """Inputs that a state has awaited for longer than WAITING; to be called in every round."""
         lacking = self._responder.waits_for()
         return lacking if self._waiting.seconds(bool(lacking), now) > WAITING else []
 

@@ -67,7 +67,7 @@ class ControllerFastPath(FastPath):
         self._actions = np.zeros((0, 0))
         self._law: ProjectedLaw | None = None
         self.last_state: Frame | None = None
-        """What the responder was given last."""
+        """The last state that the responder was given."""
 
     def prepare(self) -> bool:
         """Within an episode that a law with a compiled form answers."""

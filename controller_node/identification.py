@@ -31,7 +31,7 @@ from loop_method.settings import settings_from
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """How to identify, what to design for, and which law it is.
+    """Identification method, design objective and kind of law.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ def examined(
     p: int = 0,
     channels: Channels = NUMBERED,
 ) -> Identifiability:
-    """How well trajectories determine a model of `identify` or `design`; p as given there."""
+    """Examine how well trajectories determine a model of `identify` or `design`; p as given there."""
     # Of a model in innovation form: the directions of the measurements that it sees.
     U = linalg.orth(model.U) if method == "subspace" else model.U
     found = examine(trajectories, U, channels)

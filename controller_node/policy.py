@@ -75,7 +75,7 @@ class ProjectedLaw:
 
     @property
     def plan(self) -> np.void:
-        """What `controller_node.law` is to do, until the next `set`."""
+        """The plan that `controller_node.law` carries out until the next `set`."""
         plan: np.void = self._plan[0]
         return plan
 
@@ -158,7 +158,7 @@ class ProjectedLaw:
 
 
 def checked_index(model_index: ArrayLike | None, count: int, models: int) -> IndexArray:
-    """Which of the models each of `count` policies belongs to: the first one if not given."""
+    """Index of the model that each of `count` policies belongs to: 0 if not given."""
     index = np.zeros(count, dtype=np.int64) if model_index is None else np.array(model_index)
     if index.shape != (count,) or not np.issubdtype(index.dtype, np.integer):
         raise ValueError(

@@ -235,7 +235,7 @@ class Responder:
         self._steps.answered((*self._served, self.episode), furthest)
 
     def answering(self, state: Frame) -> Answering | None:
-        """What answers the states of an episode, like one that was answered before.
+        """The law that answers the states of an episode, the former one if nothing changed.
 
         None while anything has to be looked at first: another state waits, or something has arrived
         that changes the answers.
@@ -297,7 +297,7 @@ class Responder:
         return lacking
 
     def _run(self, number: int, more: int) -> RunState:
-        """What is known of a run, of which `more` bytes come. FrameError if there is no room."""
+        """The record of a run, with room for `more` bytes. FrameError if there is none."""
         run = self._runs.setdefault(number, RunState())
         _forget(self._runs, number, self._served[0])
         if not self._has_room(number, more):
@@ -327,7 +327,7 @@ class Responder:
             )
 
     def _answering(self, frame: Frame) -> Answering | None:
-        """What answers a state; None while something has not arrived yet."""
+        """The law that answers a state; None while an input is missing."""
         run = self._runs.get(frame.run)
         start = run.episode_start(frame) if run else None
         if run is None or start is None:

@@ -17,7 +17,7 @@ MAX_KEPT = 4
 
 @dataclass(frozen=True)
 class Answering:
-    """What answers the states of an episode of a plant: made with its first one.
+    """The law in use in an episode of a plant, made at its first state.
 
     law: None where the controller explores; signature: what the actions carry, see
     loop_interfaces.signature.
@@ -42,7 +42,7 @@ class Models:
 
 
 KnownLaw: TypeAlias = tuple[tuple[int, ...], LawBatch]
-"""What identifies an episode and all that its law is made from, and the law."""
+"""The key of an episode and of all inputs of its law, and the law."""
 EpisodeInputs: TypeAlias = tuple[Frame, Models]
 """Policies and models that answer an episode."""
 

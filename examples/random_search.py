@@ -12,7 +12,7 @@ from loop_method.settings import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class RandomSearchSettings(Settings):
-    """What can be set."""
+    """The constants of the search."""
 
     size: float = setting(0.05, "size of a change, relative to that of the gains", 1e-6, 10.0)
 

@@ -307,7 +307,7 @@ class RclChannel:
             self._held = ()
 
     def answer_with(self, begin: int, length: int) -> None:
-        """Where the answer is that the handler fills in. Only while the channel is not armed."""
+        """Set the address of the answer that the handler fills in, while the channel is not armed."""
         self._answer.buffer, self._answer.length = begin, length
 
     def arm(self) -> bool:
@@ -344,7 +344,7 @@ class RclChannel:
         return raw
 
     def newly_dropped(self) -> int:
-        """How many messages the mailbox could not hold since the last call."""
+        """Number of messages dropped by the full mailbox since the last call."""
         dropped = int(self._channel["dropped"])
         new, self._dropped = dropped - self._dropped, dropped
         return new

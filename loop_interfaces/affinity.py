@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which cores a process runs on. No ROS import."""
+"""The cores that a process runs on. No ROS import."""
 
 import contextlib
 import os

@@ -15,7 +15,7 @@ MAX_ARRAY_BYTES = 2**30
 """Most bytes of all arrays in a file of policies or models."""
 Arrays = Mapping[str, NDArray[Any]]
 _TYPES: Mapping[str, type] = {"f": np.float64, "i": np.int64, "b": np.bool_}
-"""What is written of each NumPy kind; others would give other results, or cannot be written again."""
+"""The type in which each NumPy kind is stored; others would change results or cannot be stored."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Controller(NamedTuple):
-    """How a controller is shown: its name, and its colours on white and on a dark background."""
+    """Display style of a controller: its name, and its colours on white and on a dark background."""
 
     name: str
     colour: str

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a node reports on /diagnostics: a level, a sentence, named values. No ROS import.
+"""A node's report on /diagnostics: a level, a sentence, named values. No ROS import.
 
 Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, needs attention (a message was
 refused, an operator holds the node, a neighbour is missing); ERROR, the node cannot do its work; STALE,
@@ -42,7 +42,7 @@ class Status:
 
 
 class ConditionTimer:
-    """How long a condition has been true, from one check to the next."""
+    """Measures how long a condition has been true, from one check to the next."""
 
     def __init__(self) -> None:
         self._since: float | None = None
@@ -62,7 +62,7 @@ class ConditionTimer:
 
 
 class Rate:
-    """How fast a counter grows, from one check to the next."""
+    """Measures the rate of a counter, from one check to the next."""
 
     def __init__(self) -> None:
         self._count = 0

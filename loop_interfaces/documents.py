@@ -87,7 +87,7 @@ def _check_yaml(text: str | bytes, most: int) -> None:
 
 
 def _yaml_problem(error: yaml.YAMLError) -> str:
-    """What is wrong, in one line, and where."""
+    """The error in one line, with its place."""
     first = (str(error).splitlines() or ["it cannot be parsed"])[0]
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem or first}, in line {error.problem_mark.line + 1}"

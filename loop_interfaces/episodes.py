@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How our tuner numbers episodes, and how a number is written for people.
+"""Episode numbers of our tuner, and their notation for people.
 
 The tuner starts counting at a further multiple of `EPISODES_PER_START` each time that it is started, so
 that a continued run never uses a number twice.
@@ -10,7 +10,7 @@ EPISODES_PER_START = 2**32
 
 
 def episode_name(number: int) -> str:
-    """How an episode's number is written for people: 2.17 is the 17th after the tuner's second start.
+    """The number of an episode as text: 2.17 is the 17th after the tuner's second start.
 
     Another tuner may count from 1 as it likes; such a number is its own name.
 

@@ -97,7 +97,7 @@ class ArrayCodec:
         self._last: _Layout | None = None
 
     def prefix_of(self, shape: tuple[int, ...]) -> bytes | None:
-        """What stands in front of the header in the messages of the peer that was decoded last.
+        """The bytes in front of the header in messages of the peer that was decoded last.
 
         None if their values had another shape, or their numbers another byte order.
         """

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the numbers of a state are: a field on a grid of one or more axes, or a plain vector."""
+"""The meaning of a state's numbers: a field on a grid of one or more axes, or a plain vector."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Axis:
 
     @property
     def points(self) -> Array:
-        """Where the grid points are, (n,)."""
+        """Positions of the grid points, (n,)."""
         i = np.arange(self.size, dtype=np.float64)
         if self.periodic:
             return self.length * i / self.size
@@ -217,7 +217,7 @@ class Grid:
 
     @property
     def line(self) -> Axis:
-        """What a curve of a component is drawn over: its one axis, or the number of a number."""
+        """The axis that a component is plotted over: its own, or the index of each number."""
         if len(self.axes) == 1:
             return self.axes[0]
         return Axis("number", float(self.points), self.points, unit="")
@@ -258,7 +258,7 @@ class Grid:
         return states.reshape(*states.shape[:-1], len(self.components), *self.shape)
 
     def part(self, component: int) -> slice:
-        """Where the numbers of a component are in a state.
+        """The slice of a component in a state.
 
         Parameters
         ----------
@@ -302,7 +302,7 @@ class Grid:
         )
 
     def _counts(self, count: int) -> tuple[int, ...]:
-        """How many points along each axis."""
+        """Numbers of sensors along the axes."""
         if count > self.points:
             raise ValueError(f"sensors must be at most the {self.points} grid points, got {count}")
         lengths = [axis.length for axis in self.axes] or [1.0]

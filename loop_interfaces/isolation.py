@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where a run's messages may go: by default nowhere but the loopback interface."""
+"""Confines a run's messages: by default to the loopback interface."""
 
 import ipaddress
 import os

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a parameter file holds for the nodes of a loop. No ROS import."""
+"""The parameters for a loop's nodes in a parameter file. No ROS import."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,11 +23,11 @@ DECLARED_BY = {
     LAW_SETTINGS: "CT",
     IDENTIFICATION_SETTINGS: "CT",
 }
-"""Who takes the parameters that an equation, a plant or a method declares."""
+"""Letters of the nodes that take the parameters of an equation, a plant or a method."""
 
 
 def read_problem(path: Path) -> dict[str, Any]:
-    """What a parameter file gives the nodes of a loop, each parameter from the nodes that take it.
+    """Read the parameters for a loop's nodes, each from the blocks of the nodes that take it.
 
     They are nodes without a namespace; if the file has nothing for those, of the namespace that it is
     for. ParameterError where that are several, where two nodes are given different values, and where
@@ -67,7 +67,7 @@ def of_ros(name: str) -> bool:
 
 
 def _for_loop(file: ParameterFile, namespace: str) -> dict[str, Any]:
-    """What a file gives the nodes in a namespace, each parameter from the nodes that take it."""
+    """The parameters for the nodes in a namespace, each from the blocks of the nodes that take it."""
     takers = {spec.name: spec.nodes for spec in table()}
     found: dict[str, tuple[str, Any]] = {}
     for letter, node in NODES.items():

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How a reduced model with its gains is laid out as one array of rows with n_s columns.
+"""The layout of a reduced model with its gains as one array of rows with n_s columns.
 
 Every part has n_s columns (or is transposed to have), so the parts stack:
 
@@ -48,7 +48,7 @@ class ModelRows:
 
     @property
     def measurement(self) -> Array:
-        """What a reduced state looks like, z = measurement @ s, (n_z, n_s); U, if orthonormal."""
+        """The map from reduced to full states, z = measurement @ s, (n_z, n_s); U, if orthonormal."""
         if self.L is None:
             return self.U
         return np.asarray(np.linalg.pinv(self.U.T), dtype=np.float64)

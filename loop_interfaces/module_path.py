@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where the processes of this project look for modules: never in the working directory.
+"""The module search path of this project's processes: never the working directory.
 
 Python looks there first when it is started with `-m` or `-c`, as worker processes are, and wherever
 PYTHONPATH has an empty entry. A file `numpy.py` next to a problem's file would then run instead of

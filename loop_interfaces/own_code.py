@@ -66,7 +66,7 @@ class OwnCode:
         return whole
 
     def configured(self, name: str, environment: Mapping[str, str] = os.environ) -> Any:
-        """What a problem's parameters name, if it may be run.
+        """Load what a problem's parameters name, if it may be run.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class OwnCode:
         return found
 
     def _load_entry_point(self, name: str) -> Any:
-        """What an installed package offers under that name."""
+        """Load the entry point of that name."""
         offered: dict[str, list[EntryPoint]] = {}
         for entry in entry_points(group=self.group):
             offered.setdefault(entry.name, []).append(entry)
@@ -165,7 +165,7 @@ def name_of(kind: type) -> str:
 
 
 FAILURES = Exception, SystemExit
-"""What a call of own code may raise that is its failure: also that it calls exit."""
+"""Exceptions that count as a failure of the user's own code, calls of exit among them."""
 
 
 def located(error: BaseException, module: str = "") -> str:
@@ -247,7 +247,7 @@ def _being_executed(path: Path) -> Iterator[None]:
 
 
 def _reduced(thing: Any) -> tuple[Any, ...]:
-    """How an object whose class came from a file is made again: as others, by another constructor."""
+    """Pickle support for objects whose class came from a file, by another constructor."""
     reduced: Any = object.__reduce_ex__(thing, 2)
     _, (kind, *arguments), *rest = reduced
     module = sys.modules[kind.__module__]

@@ -51,7 +51,7 @@ INSTRUMENTS = _section(
         "number d of successive measurements of each sensor in the published state"
     ),
 )
-"""What stands between the field and its controller (docs/robustness.md)."""
+"""Instruments between the field and its controller (docs/robustness.md)."""
 
 ACTUATORS = _section(
     "PT",
@@ -69,7 +69,7 @@ ACTUATORS = _section(
         "equation: the equation's own shape, by default an indicator"
     ),
 )
-"""Where the actuators are and how they act, if not as the equation has it."""
+"""Positions and shapes of the actuators, where they differ from the equation's."""
 
 IDENTIFICATION = Spec(
     "identification",
@@ -157,14 +157,14 @@ PROBLEM = _section(
     ),
     *INSTRUMENTS,
 )
-"""What a problem's YAML file may set, besides `physical.*` (those of the equation or plant itself)."""
+"""Parameters of a problem's YAML file, besides `physical.*` (those of the equation or plant itself)."""
 POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 """The size of the state of an equation."""
 OF_THE_PLANT = (
     *("grid", "cost", "length", "n_z", "n_a", "sample_time", "horizon"),
     *("state_weight", "action_weight", "divergence_bound", "reduced_order"),
 )
-"""What a plant of a user's own says itself where a problem does not."""
+"""Parameters that a user's own plant supplies where the problem does not."""
 
 PLANT = _section(
     "P",
@@ -191,7 +191,7 @@ EXECUTION = _section(
         "core that the node stays on, except for the plant's worker threads; -1: any core"
     ),
 )
-"""How plant and controller use the machine."""
+"""Use of the machine by plant and controller."""
 
 OPTIMIZER = Spec("optimizer", "model_based", nodes="T", group="budget and method").means(
     "method of the adapt phase: a shipped or installed name, or code that the user has to allow, "

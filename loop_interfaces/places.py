@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where the actuators of a plant act, as its node says it and pictures show it. Pure."""
+"""Positions of a plant's actuators, as its node announces and pictures show them. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST = 256
 
 @dataclass(frozen=True)
 class Box:
-    """Where an actuator acts with at least half of its largest magnitude.
+    """The region in which an actuator acts with at least half of its largest magnitude.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where the problems are, and a problem's resolved parameters. No ROS import."""
+"""Problem files, and a problem's resolved parameters. No ROS import."""
 
 import math
 import re
@@ -94,7 +94,7 @@ def load_parameters(
 
 
 def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
-    """What a node is given, on top of the shipped problem it names without an equation or a plant.
+    """The parameters given to a node, on top of the shipped problem that they name.
 
     ParameterError for a problem that nobody knows: of a plant without an equation, and of another node
     without anything else. Their defaults would be another problem's.

@@ -37,7 +37,7 @@ _NEUTRAL = {
     "FASTDDS_ENVIRONMENT_FILE": "",
     "FASTDDS_BUILTIN_TRANSPORTS": "",
 }
-"""What says how nodes find each other and where messages go, with values that say nothing."""
+"""Variables that steer discovery and transport, with their neutral values."""
 _QUIET = {"SKIP_DEFAULT_XML_FILE": "1"}
 """Fast DDS would read a profile that lies in the working directory."""
 _BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"

@@ -30,7 +30,7 @@ CLOCK_KIND = 2
 LIMIT = 512 * 1024
 """Bytes after which a batch is sent: a few milliseconds of a fast loop."""
 NO_TIME = -1.0
-"""Where no simulated time belongs to a sample."""
+"""The time stamp of a sample without simulated time."""
 AGE = 0.1
 """Seconds after which a batch is sent that has not reached LIMIT."""
 MAX_TIME = 2.0**31
@@ -53,7 +53,7 @@ _WINDOW = 10_000_000_000
 
 
 class TokenBucket:
-    """Which episodes go to viewers: whole ones, about RATE samples a second.
+    """Selects the episodes for viewers: whole ones, about RATE samples a second.
 
     A sample of at most COUNTED bytes takes one token, a larger one more; RATE tokens come back a
     second. An episode may take more than there are: the next ones are then left out, for a second at
@@ -124,7 +124,7 @@ class Sample:
 
 
 def unpack(message: bytes) -> tuple[int, Iterator[Sample]]:
-    """When the batch was sent (ns on the plant's clock) and what is in it.
+    """The time the batch was sent (ns on the plant's clock) and its samples.
 
     Raises FrameError, also while the samples are read, for bytes that are not a batch.
     """
@@ -161,7 +161,7 @@ def clock_message(time: float) -> bytes | None:
 
 
 def arrival_time(stamp: int, offset: int) -> int:
-    """When a sample came, in ns since the epoch. FrameError beyond what ROS's time can hold.
+    """Arrival time of a sample, in ns since the epoch. FrameError beyond what ROS's time can hold.
 
     offset: see ClockOffset.
     """

@@ -26,7 +26,7 @@ NOT_SIGNED = 0.0
 DESIGN = (
     "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
 )  # fmt: skip
-"""What a model depends on besides the episode it comes from, and the cost where it is not empty."""
+"""Parameters that a model depends on besides its episode, and the cost where it is not empty."""
 
 
 def digest_of(*arrays: ArrayLike) -> int:

@@ -21,9 +21,9 @@ OPTIMIZER_SETTINGS = "optimizer_settings."
 LAW_SETTINGS = "law_settings."
 IDENTIFICATION_SETTINGS = "identification_settings."
 SETTINGS = (OPTIMIZER_SETTINGS, LAW_SETTINGS, IDENTIFICATION_SETTINGS)
-"""How the names of parameters begin that are constants of a method."""
+"""Prefixes of parameters that are constants of a method."""
 FREE = ("physical.", *SETTINGS)
-"""How the names of parameters begin that an equation, a plant or a method declares."""
+"""Prefixes of parameters that an equation, a plant or a method declares."""
 MAX_YAML_BYTES = 4_000_000
 MAX_PARAMETERS, MAX_NAME = 10_000, 500
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
@@ -194,7 +194,7 @@ def assignment(text: str) -> tuple[str, Value]:
 
 
 def exponent_hint(value: object) -> str:
-    """What to do with a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
+    """Advice on a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
     if isinstance(value, str) and len(value) < 100 and _EXPONENT.fullmatch(value):
         return "; YAML reads a number with an exponent only with point and sign, like 1.0e+12"
     return ""

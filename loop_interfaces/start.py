@@ -79,7 +79,7 @@ def on_signals(handler: Callable[[str], None]) -> dict[signal.Signals, Any]:
 
 
 def what_to_install(error: ModuleNotFoundError) -> str | None:
-    """Which module is not there, and how to install it; None for one that nothing here installs."""
+    """Name the missing module and how to install it; None for one that nothing here installs."""
     module = (error.name or "").split(".")[0]
     if module in _ROS or module.endswith(_MESSAGES):
         return f"needs {module}: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]'"

@@ -28,7 +28,7 @@ class Topic:
     others: tuple[tuple[str, ...], ...] = ()
 
     def codec(self) -> ArrayCodec:
-        """What encodes and decodes its arrays."""
+        """The codec of its arrays."""
         return ArrayCodec(self.labels, *self.others)
 
 
@@ -57,7 +57,7 @@ _WHOLE_NUMBERS = {
     StartColumn.MODEL: ("model indices", 0),
     StartColumn.NOISE: ("noise seeds", 0),
 }
-"""What is in these columns, and its least value."""
+"""Meaning and least value of these columns."""
 
 
 def start_rows(frame: Frame) -> NDArray[np.float64]:
@@ -162,4 +162,4 @@ VIEWS = {
     "view/spacetime": "sensor_msgs/msg/Image",
     **{f"view/{name}": "std_msgs/msg/Float64" for name in VIEW_NUMBERS},
 }
-"""What a viewer publishes for people's tools, with the types."""
+"""Topics that a viewer publishes for other tools, with their types."""

@@ -21,7 +21,7 @@ _FIELD_STREAM = 0x4649454C44  # "FIELD"
 
 
 class Purpose(IntEnum):
-    """What a seed is for; the numbers are part of the results' reproducibility."""
+    """Purposes of seeds; their numbers are part of the results' reproducibility."""
 
     EXPLORATORY_FIELD = 1
     EXCITATION = 2

@@ -55,7 +55,7 @@ class Settings:
 
     @classmethod
     def specs(cls) -> tuple[Spec, ...]:
-        """What can be set, as parameters."""
+        """The settings as parameters."""
         return tuple(
             Spec(item.name, item.default, **item.metadata)  # type: ignore[arg-type]
             for item in fields(cls)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which actuators a plant has: those of its equation, or of a given shape at given places."""
+"""The actuators of a plant: those of its equation, or of a given shape at given places."""
 
 from collections.abc import Sequence
 

@@ -26,7 +26,7 @@ _GRID = (
     "divergence_bound",
 )
 _FIXED = ("n_z", "n_a", "sample_time")
-"""What a plant of a user's own says, and a problem cannot change."""
+"""Parameters that a user's own plant supplies and a problem cannot change."""
 
 
 def build_equation(values: Mapping[str, Any]) -> Equation:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What defines a plant, and the number that stands for it on the network and in results."""
+"""The definition of a plant, and its fingerprint on the network and in results."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def source_of(kind: type) -> str:
 
 
 def code_of(code: CodeType) -> Any:
-    """What a function does, the same in each process."""
+    """A description of a function's code, the same in each process."""
     constants = [code_of(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
     return code.co_code.hex(), code.co_names, constants
 

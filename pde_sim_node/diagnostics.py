@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How the plant is, as its /diagnostics show it. Pure."""
+"""Plant status for /diagnostics. Pure."""
 
 import numpy as np
 

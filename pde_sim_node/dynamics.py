@@ -208,7 +208,7 @@ class Dynamics(ABC):
 
 
 def signature_of(maker: Callable[..., Any]) -> inspect.Signature:
-    """What a function or class is called with; of a class derived from Dynamics, its `__init__`."""
+    """The signature of a function or class; of a class derived from Dynamics, that of `__init__`."""
     if not (isinstance(maker, type) and issubclass(maker, Dynamics)):
         return inspect.signature(maker)
     if maker.__init__ is object.__init__:
@@ -218,7 +218,7 @@ def signature_of(maker: Callable[..., Any]) -> inspect.Signature:
 
 
 def arguments_of(dynamics: Dynamics) -> Mapping[str, Any]:
-    """What an object was made with, by name, the defaults among them."""
+    """The arguments that an object was made with, by name, defaults included."""
     arguments, named = getattr(dynamics, "_given", ((), {}))
     bound = signature_of(type(dynamics)).bind(*arguments, **named)
     bound.apply_defaults()

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What stands between a plant and its controller: noise, actuators that saturate, few sensors.
+"""Instruments between a plant and its controller: noise, actuators that saturate, few sensors.
 
     y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
     z_{k+1} = f(z_k, sat(a_k)) + w_k,       w_k ~ N(0, process_noise^2 dt / dx I)
@@ -49,7 +49,7 @@ from pde_sim_node.plant import MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, P
 
 
 class Noise(IntEnum):
-    """What a draw is for; the numbers are part of the results' reproducibility."""
+    """Purposes of draws; their numbers are part of the results' reproducibility."""
 
     MEASUREMENT = 0
     PROCESS = 1
@@ -242,6 +242,6 @@ class InstrumentedPlant:
 
 
 def field_seeds(seeds: ArrayLike) -> list[int]:
-    """What the noise takes for the seeds of initial fields; given fields have none."""
+    """The seeds of the noise in place of those of initial fields; given fields have none."""
     given = np.asarray(seeds)
     return [MEAN_FIELD] * len(given) if given.ndim == 2 else given.tolist()

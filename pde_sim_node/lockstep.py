@@ -55,7 +55,7 @@ _STALE = (
 
 
 class Phase(Enum):
-    """What the protocol waits for."""
+    """The event that the protocol waits for."""
 
     IDLE = auto()
     """The start of an episode."""
@@ -67,7 +67,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Timing:
-    """When messages are sent, never what is in them; see loop_interfaces.parameters.PLANT."""
+    """Times of messages, never their content; see loop_interfaces.parameters.PLANT."""
 
     action_timeout: float
     max_repeats: int
@@ -104,7 +104,7 @@ class Lockstep:
         self.contradiction = ""
         """Why the last cost that was sent is void, if two different messages came in one place."""
         self.deadline: float | None = 0.0 if paused else None
-        """When `tick` is to be called next; None while nothing is due."""
+        """Time of the next call of `tick`; None while nothing is due."""
         self.paused = paused
         self._fingerprint = fingerprint
         self._stepping = False
@@ -112,7 +112,7 @@ class Lockstep:
         self._phase = Phase.IDLE
         self._actions = TakenActions()
         self._state = np.empty((0, 0))
-        """What was measured last."""
+        """The last measurement."""
         self.signed_run = signed_run
         """The last run whose controller signs."""
         self._repeats = 0
@@ -150,7 +150,7 @@ class Lockstep:
 
     @property
     def signature(self) -> float | None:
-        """What the actions of the episode carry; None before the run's first one."""
+        """The key that the actions of the episode carry; None before the run's first one."""
         return self._actions.signature
 
     def overdue(self) -> bool:

@@ -71,7 +71,7 @@ def declare_parameters(node: Node) -> tuple[Plant, dict[str, Any]]:
 
 
 def actuators_of(plant: Plant) -> str:
-    """Where the actuators act, for pictures; empty if the plant does not know it."""
+    """Positions of the actuators, for pictures; empty if the plant does not know them."""
     if plant.supports is None:
         return ""
     everywhere = np.zeros((plant.n_z, plant.n_a))

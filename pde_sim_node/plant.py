@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a plant is for the loop: M environments side by side, each z_{k+1} = f(z_k, a_k).
+"""The interface of plants: M environments side by side, each z_{k+1} = f(z_k, a_k).
 
 The loop knows nothing else of it. Implementations are in `pde_sim_node.plants`: the compiled
 `SpectralPlant`, and `DynamicsPlant`, which makes one of what a user writes (`pde_sim_node.dynamics`).

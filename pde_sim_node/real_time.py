@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""When each state is due on the wall clock, and how late they were. Pure: no clock.
+"""Due times of states on the wall clock, and their delays. Pure: no clock.
 
 State 0 goes out at once and sets the grid; every further one is due a period after the one before.
 A state that is not ready at its instant is a missed deadline: it goes out as soon as it is ready and
@@ -66,7 +66,7 @@ class RealTimePacer:
         return float(np.quantile(self._lateness, share, method="inverted_cdf"))
 
     def summary(self) -> str:
-        """What was counted, in words, also for `python -m benchmarks realtime`."""
+        """The counts in words, also for `python -m benchmarks realtime`."""
         p50, p99 = (1e6 * self.quantile(share) for share in (0.5, 0.99))
         return (
             f"{self.count} states every {1e3 * self.period:g} ms, {self.missed} missed deadlines, "

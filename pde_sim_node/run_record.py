@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a plant must still know when its process is started again. Pure: a file, no ROS.
+"""The memory of a plant across restarts of its process. Pure: a file, no ROS.
 
 A plant that was paused must not run on, whatever run it is to serve, and one whose controller signs
 must not take actions of that run that are not signed.

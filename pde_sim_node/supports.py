@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where on the grid each actuator acts."""
+"""The support of each actuator on the grid."""
 
 import math
 

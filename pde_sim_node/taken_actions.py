@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which starts and actions a plant has taken in a run, and which further ones contradict them. Pure.
+"""Starts and actions that a plant has taken in a run, and the detection of contradictory ones. Pure.
 
 Answers are deterministic: two different ones to a state come from a second or a faulty controller.
 Which of them was taken is chance, and the episode is void. The same holds for two starts of an
@@ -26,7 +26,7 @@ REMEMBERED = 16
 
 @dataclass
 class Episode:
-    """What is remembered of an episode: the rows of its start, and of its actions what follows.
+    """The record of an episode: the rows of its start, and the following of its actions.
 
     signature: what they carry if the controller signs; taken: a digest of the one that was taken at
     each step; cost: what they came to, once it has ended.
@@ -57,7 +57,7 @@ class TakenActions:
 
     @property
     def signature(self) -> float | None:
-        """What the actions of the episode carry; None before the run's first one."""
+        """The key that the actions of the episode carry; None before the run's first one."""
         if self.signs is None:
             return None
         return self.episode.signature if self.signs else NOT_SIGNED

@@ -24,7 +24,7 @@ MAX_TRAJECTORIES = 100_000
 LARGEST = 1e100
 """Magnitude of a number, so that squares and their sums stay finite."""
 SAME_STEP = 1e-3
-"""By which the sampling times of several files may differ, relatively."""
+"""Relative tolerance between the sampling times of several files."""
 TABLES = (".csv", ".tsv", ".txt", ".dat")
 
 

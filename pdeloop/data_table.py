@@ -29,16 +29,16 @@ __all__ = ["Columns", "Table", "read_table"]
 SEPARATORS = (",", ";", "\t", "|")
 """Tried in this order; without any of them columns are separated by spaces."""
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
-"""What stands, in small letters, where a value is missing."""
+"""Lower-case texts that stand for a missing value."""
 JITTER = 1e-3
-"""By which a step of t may differ from the median one, relative to that."""
+"""Relative tolerance of a step of t to the median one."""
 TARGET = "target"
 """The word in the column of t whose row has z_r."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Which columns are what: names, or patterns such as T*, separated by commas.
+    """The choice of columns: names, or patterns such as T*, separated by commas.
 
     Without any, `t`, those that begin with z, and those that begin with a, and no others.
     """
@@ -55,7 +55,7 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What a table holds.
+    """The contents of a table.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Table:
 
 
 class _Places(NamedTuple):
-    """Where the columns are: time is -1 if there is none."""
+    """Indices of the columns: time is -1 if there is none."""
 
     time: int
     states: list[int]
@@ -220,7 +220,7 @@ def _lines(text: str) -> tuple[str, Iterator[tuple[int, list[str]]]]:
 
 
 def _head(text: str) -> tuple[int, str, str]:
-    """How many lines precede the line of names, that line, and the separator that a line before names.
+    """Number of lines before the line of names, that line, and the separator that one before names.
 
     Lines that begin with # are remarks; the last of them is the line of names if numbers follow it.
     """
@@ -258,7 +258,7 @@ def _rows(source: io.StringIO, skipped: int, separator: str) -> Iterator[tuple[i
 
 
 def _places(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
-    """Where time, states and inputs are. ValueError if a name is missing, or means two things."""
+    """Find time, states and inputs. ValueError if a name is missing, or means two things."""
     shown = ", ".join(head)[:200]
     if twice := sorted({name for name in head if head.count(name) > 1 and name}):
         raise ValueError(f"expected a name for each column, got several named {listed(twice)}")

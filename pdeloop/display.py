@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a person sees of a run, and where it comes from: lines for events, a bar while it adapts."""
+"""Displays a run to a person: lines for events, a bar while it adapts."""
 
 from __future__ import annotations
 

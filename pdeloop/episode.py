@@ -24,7 +24,7 @@ Law: TypeAlias = Callable[[int, Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRecord:
-    """What happened in an episode of T steps of M environments.
+    """The record of an episode of T steps of M environments.
 
     Attributes
     ----------

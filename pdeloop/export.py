@@ -147,7 +147,7 @@ def _archive(**arrays: Any) -> bytes:
 
 
 def curve_csv(run: FinishedRun) -> bytes:
-    """How the cost fell: a line for each step of each seed's optimiser, with a line of names."""
+    """The learning curve as CSV: a line of names, then one for each step of each seed's optimiser."""
     rows: Iterable[Mapping[str, Any]] = (
         row for row in run.result["history"] if row.get("event") == "adapted"
     )

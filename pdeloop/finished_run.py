@@ -180,7 +180,7 @@ def field_means(costs: Array) -> Array:
 
 @dataclass(frozen=True)
 class Reduction:
-    """How far a controller's mean stage cost lies below LQT's, in percent; negative: above.
+    """Reduction of a controller's mean stage cost relative to LQT's, in percent; negative: above.
 
     ratio_of_means: of the means over the seeds, 1 - mean J / mean J_LQT; mean_of_ratios: the mean of
     the seeds' own 1 - J / J_LQT; both from `seeds` seeds, those in which no rollout diverged.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Trajectories = Sequence[tuple[Array, Array]]
 Source = Mapping[str, int | str]
-"""Which trajectory it was."""
+"""The name of the trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Identified:
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be known before the model is used."""
+        """Warnings to read before the model is used."""
         return [*self.remarks, *self.determined.remarks]
 
     def summary(self) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class Identified:
         return "\n".join([*lines, "", *self._law_lines()])
 
     def _law_lines(self) -> list[str]:
-        """What the law does and how it is applied, or why there is none."""
+        """A description of the law and its use, or the reason why there is none."""
         loop = self.closed_loop
         if loop is None:
             return [

@@ -14,8 +14,7 @@ from loop_interfaces.model_rows import ModelRows
 SETTLED = 0.05
 """Share of the way from the first to the last state within which the loop counts as settled."""
 DECAYED = 1e-3
-"""What is left of the slowest mode of the closed loop at the end of the simulation, if that is long
-enough."""
+"""Remaining share of the closed loop's slowest mode at the end of a long enough simulation."""
 LONGEST = 10
 """Times as many steps as the recorded trajectory that are simulated at most."""
 _OVERFLOW = 1e100

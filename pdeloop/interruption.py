@@ -12,7 +12,7 @@ from pdeloop.output import complain
 
 
 class Interruption(BaseException):
-    """Who or what ended the work: SIGINT, SIGTERM, SIGHUP (a terminal that was closed), a request."""
+    """The cause of the end: SIGINT, SIGTERM, SIGHUP (a terminal that was closed), a request."""
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which loops run on this machine: `pdeloop train` registers here, `monitor` looks it up.
+"""A register of the loops on this machine: `pdeloop train` registers here, `monitor` looks it up.
 
 Each puts a file into a folder of this user's under the temporary one and holds a lock on it. The
 lock ends with its process, however that ends, so what is found here does run.

@@ -26,7 +26,7 @@ from tuner_node.run_folder import RunFolder
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
 PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
-"""How many pairs a command or a launch file starts."""
+"""Number of pairs that a command or a launch file starts."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
 
 @dataclass(frozen=True)
 class Transport:
-    """How a training is carried out; nothing of this changes its results.
+    """The execution of a training; nothing of this changes its results.
 
     in_process: without ROS; recorder: as the tuner's parameter says it; record_every: steps from one
     state that is recorded to the next; network: let the messages leave this machine; pairs: of plant

@@ -51,7 +51,7 @@ DRAWN = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found: whether it is good, and one or more sentences.
+    """The finding of one check: whether it is good, and one or more sentences.
 
     note: it is for its reader to judge.
     """
@@ -169,7 +169,7 @@ def linearisation(plant: Plant) -> tuple[Array, Array]:
 
 
 def reach(plant: Plant) -> Reach:
-    """What the actuators reach of the `linearisation`.
+    """Controllability of the `linearisation` by the actuators.
 
     Left invariant subspace of the unstable eigenvalues: W^T A = T W^T with W orthonormal, from an
     ordered real Schur form of A^T; mode by mode the test is then one of small matrices.
@@ -291,7 +291,7 @@ def _actuators(plant: Plant) -> Finding:
 
 
 def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
-    """What the plant as it is measured says about variance, order and the law."""
+    """Findings on exploration variance, order and law, from the plant as it is measured."""
     plant = build_plant(values)
     explored = _explore(plant, values)
     trajectories = [(explored.states[:, 1], explored.actions[:, 1])]  # drawn, as in a training

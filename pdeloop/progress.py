@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How far something is: a live bar with the time left on a terminal, plain lines elsewhere."""
+"""Progress display: a live bar with the time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

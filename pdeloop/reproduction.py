@@ -65,7 +65,7 @@ def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
 
 
 def beside_the_paper(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How LQT-PO relates to the paper's figure: a sentence for each problem that the paper has.
+    """Compare LQT-PO with the paper's figure: a sentence for each problem that the paper has.
 
     rows: of a study's table.
     """

@@ -107,7 +107,7 @@ class BagWriter:
 
     @property
     def messages(self) -> int:
-        """How many were written."""
+        """Number of written messages."""
         return self._counts.total()
 
     def write(self, topic: str, when: int, data: bytes) -> None:

@@ -12,7 +12,7 @@ PATIENCE = 10.0
 
 
 class Matching:
-    """What the loop's nodes answer: that they have discovered us, and with which parameters.
+    """The answers of the loop's nodes: that they have discovered us, and their parameters.
 
     required: full names of topics that somebody must publish; others: whose publishers, if there
     are any, are asked, too.

@@ -152,7 +152,7 @@ class RecorderNode:
         self._recording.pause()
 
     def _report(self, now: float) -> Status:
-        """How the recording is, at time `now` (monotonic s)."""
+        """The status of the recording at time `now` (monotonic s)."""
         recording, matched = self._recording, self._status is not None
         return Status(
             Level.OK if matched else Level.WARN,

@@ -22,7 +22,7 @@ from recorder_node.sources import NOTES, PARAMETERS_TOPIC, Source
 
 PARAMETERS = "parameters.json"
 CDR = bytes.fromhex("00010000")
-"""How the serialisation of a message begins: CDR, little endian."""
+"""The first bytes of a serialised message: CDR, little endian."""
 LARGE_BAG = 2**30
 """Bytes of states that a run is told of before they are recorded."""
 EVERY = "state_every"

@@ -111,7 +111,7 @@ def conjugate_product(c: int, at: int, e: int, value: Any) -> Any:
 
 @jit
 def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Where the transform of g'(u) times the field of the spectrum x stands."""
+    """Address of the transform of g'(u) times the field of the spectrum x."""
     t = plan.fine
     rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)

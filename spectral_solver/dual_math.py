@@ -108,7 +108,7 @@ def _replaced(function: Any, duals: dict[str, Any], done: dict[int, Any]) -> Any
 
 
 def _value(value: Any, duals: dict[str, Any], done: dict[int, Any]) -> Any:
-    """What takes the place of a name's value."""
+    """The substitute for a name's value."""
     if value is math:
         module = ModuleType("math")
         vars(module).update({**vars(math), **duals})

@@ -70,7 +70,7 @@ PLAN = step_plan_type(
 
 @jit
 def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Where the transform of g(u) stands, u being the field of the spectrum x on the fine grid."""
+    """Address of the transform of g(u), u being the field of the spectrum x on the fine grid."""
     t = plan.fine
     rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)

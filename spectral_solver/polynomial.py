@@ -90,7 +90,7 @@ def horner(coefficients: int, terms: int, c: int, u: Any) -> Any:
 
 @jit
 def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Where the sum of m_q F[g_q(u)] stands, u being the field of the spectrum x, kept at `tape`."""
+    """Address of the sum of m_q F[g_q(u)], u being the field of the spectrum x, kept at `tape`."""
     t, clip, modes, terms = plan.fine, splat(plan.clip), plan.modes, plan.degree - 1
     field_to(tape, w, plan.x, d, plan, c, e)
     for k in range(0, modes, 8):
@@ -130,7 +130,7 @@ integrate = internal_step(nonlinear, modes_at)
 
 @jit
 def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Where the transform of sum_q g_q'(u) times the field of m_q* x stands."""
+    """Address of the transform of sum_q g_q'(u) times the field of m_q* x."""
     t, clip, modes, terms = plan.fine, splat(plan.clip), plan.modes, plan.degree - 1
     last = plan.parts - 1
     # The products are gathered in what the next field leaves free: z1, z2 and a third plane.

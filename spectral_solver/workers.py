@@ -139,6 +139,6 @@ solver_threads = SolverThreads()
 
 
 def use_cores(cores: Collection[int]) -> None:
-    """Where the threads of the plants that are made from now on may be."""
+    """Set the cores for the threads of plants that are made from now on."""
     solver_threads.cores = cores
     solver_threads.forget()

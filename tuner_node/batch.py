@@ -79,7 +79,7 @@ class BatchResult:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """What defines a training besides the problem; see loop_interfaces.parameters.TUNER."""
+    """The definition of a training besides the problem; see loop_interfaces.parameters.TUNER."""
 
     n_a: int
     seed: int

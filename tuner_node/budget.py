@@ -49,12 +49,12 @@ class Budget:
 
     @property
     def total(self) -> Counts:
-        """What each seed may pay, where known, (S,)."""
+        """The budget of each seed, where known, (S,)."""
         return self._sum("identify", "check") + self.adaptation
 
     @property
     def adaptation(self) -> Counts:
-        """What is there for the adaptation of each seed, (S,)."""
+        """The budget for the adaptation of each seed, (S,)."""
         if not self._rollouts:
             return np.full(self._counts.shape[1], self._adaptation)
         return self._rollouts - self._sum("identify", "check")
@@ -64,7 +64,7 @@ class Budget:
         return not self._rollouts or bool(self.paid[seed] + rollouts <= self._rollouts)
 
     def by_purpose(self) -> list[dict[str, int]]:
-        """What the rollouts of each seed were for; the evaluation is not in `total`."""
+        """The rollouts of each seed by purpose; the evaluation is not in `total`."""
         return [
             dict(zip(PURPOSES.values(), counts, strict=True)) | {"total": total}
             for counts, total in zip(self._counts.T.tolist(), self.paid.tolist(), strict=True)

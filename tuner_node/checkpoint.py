@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What must survive a crash: arrays in a file that is whole or not there.
+"""Checkpoints: arrays in a file that is complete or absent after a crash.
 
 A checkpoint is one line `pdeloop-checkpoint 1 <sha256>` followed by an npz archive without pickled
 objects. It is written under another name, flushed to the disk and renamed; the one before is kept, so
@@ -24,7 +24,7 @@ MAGIC = b"pdeloop-checkpoint 1 "
 
 
 def previous(path: Path) -> Path:
-    """Where the checkpoint before the one at `path` is kept."""
+    """Path of the checkpoint before the one at `path`."""
     return path.with_name(path.name + ".previous")
 
 

@@ -330,7 +330,7 @@ class Dispatcher:
         )
 
     def missing(self) -> list[str]:
-        """Which nodes are not on the network, in words."""
+        """The nodes that are missing on the network, in words."""
         return [
             f"{node} of pair {pair.number}" if len(self.pairs) > 1 else node
             for pair in self.pairs

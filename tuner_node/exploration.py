@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How strongly to explore a plant whose measurements are noisy."""
+"""The exploration variance for a plant with noisy measurements."""
 
 ACCURACY = 0.045
 """Standard error of an entry of B, relative to the norm of its column, that exploration aims at."""

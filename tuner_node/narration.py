@@ -42,11 +42,11 @@ class Narration:
 
     @property
     def progress(self) -> str:
-        """How far the adaptation is."""
+        """The progress of the adaptation."""
         return f"  {self.done} of {self.budget} rollouts: {self.status}"
 
     def lines(self, row: Row) -> list[str]:
-        """What is to be said when this row has come."""
+        """The lines to print for this row."""
         event = row.get("event")
         if event in _TOGETHER:
             others = self._together and event != self._together[0]["event"]
@@ -102,7 +102,7 @@ class Narration:
 
 
 def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
-    """What came out of a training; summary: the content of result.json."""
+    """The outcome of a training; summary: the content of result.json."""
     reduction, seeds = summary["reduction"], summary["seeds"]
     diverged, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     comparable = any(summary["changed"]) and not (diverged["lqt"] or diverged["adapted"])
@@ -159,7 +159,7 @@ def _reasons(summary: Row) -> list[str]:
 
 
 def against_lqt(reduction: float) -> str:
-    """How far a cost lies below LQT's, or above it, as a share of that.
+    """The distance of a cost from LQT's, as a share of that, in words.
 
     >>> against_lqt(0.317), against_lqt(-1.504)
     ('31.7 % below LQT', '150.4 % above LQT')
@@ -175,7 +175,7 @@ def _worse_than_lqt(summary: Row) -> list[int]:
 
 
 def several_publishers(found: Mapping[str, Sequence[str]]) -> list[str]:
-    """Which topics had more than one publisher, and which these were; found: nodes by topic."""
+    """Topics with more than one publisher, and these publishers; found: nodes by topic."""
     return [
         f"several nodes published {topic}: {', '.join(nodes)}; expected one"
         for topic, nodes in found.items()
@@ -183,7 +183,7 @@ def several_publishers(found: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def warnings(summary: Row) -> list[str]:
-    """What is wrong with the outcome of a training, worst first."""
+    """Warnings about the outcome of a training, worst first."""
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     costs = summary["costs"]
     found = several_publishers(summary.get("several_publishers", {}))
@@ -242,7 +242,7 @@ def _spread(costs: Sequence[float | None]) -> str:
 
 
 def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
-    """How many rollouts a seed took, and what for."""
+    """The rollouts of a seed by purpose."""
     spent = {name: span([seed[name] for seed in rollouts]) for name in rollouts[0]}
     each = " a seed" if len(rollouts) > 1 else ""
     return (

@@ -87,7 +87,7 @@ class TunerNode:
         self._pairs: list[str] = values["pairs"]
         self._failure: DispatchError | None = None
         self._settled: float | None = None
-        """When the results are final, once all rollouts are done."""
+        """The time when results become final, once all rollouts are done."""
         self._several_publishers: dict[str, list[str]] = {}
         self._wire(node, loop)
         log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
@@ -273,7 +273,7 @@ class TunerNode:
             self._log.info(self._narration.progress, throttle_duration_sec=PROGRESS_PERIOD)
 
     def _controller(self) -> dict[str, Any]:
-        """Who answered the states, and by which law if that was seen."""
+        """The controller that answered the states, and its law if that was seen."""
         found = {
             full_name(there)
             for namespace in self._pairs

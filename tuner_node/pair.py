@@ -38,7 +38,7 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """How many rows it has."""
+        """Number of its rows."""
         return int(self.rows.stop - self.rows.start)
 
     def done(self, batch: Batch) -> bool:
@@ -61,7 +61,7 @@ class Pair:
     number: int
     missing: tuple[str, ...] = ("plant", "controller")
     chunk: Chunk | None = None
-    """What it works on; None while it is free."""
+    """The chunk that it works on; None while it is free."""
     run: int = -1
     episode: int = -1
     last_heard: float = 0.0
@@ -77,7 +77,7 @@ class Pair:
     foreign_since: float = math.inf
     """Since when only another plant's costs come."""
     paused_until: float = -math.inf
-    """How long the plant's report that it is paused holds."""
+    """End of the validity of the plant's report that it is paused."""
     answers: dict[tuple[str, int], tuple[int, int]] = field(default_factory=dict)
     """By topic and episode: a digest of the answer that was taken, and its step."""
     signed: dict[int, int] = field(default_factory=dict)
@@ -193,7 +193,7 @@ class Pair:
         return [known for known in (self.samples, self.former_samples) if known.used]
 
     def lost_samples(self, n_z: int) -> int:
-        """How many samples of the episode that has its cost are missing."""
+        """Number of missing samples of the episode that has its cost."""
         cost = self.pending_cost
         return self.samples.lost(cost.plant, cost.step, n_z) if cost is not None else 0
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Who else is on the network, and what follows for a session. Pure."""
+"""Other participants on the network, and their effect on a session. Pure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ SECOND_TUNER_GRACE = 6.0
 
 @dataclass(frozen=True)
 class Publishers:
-    """How many publishers there are of the topics that tell who is there.
+    """Numbers of publishers of the topics that show the participants.
 
     plants, controllers: of `episode/cost` and `model/identified`, by pair; tuners: of each
     `episode/start`, this tuner's own among them; recorders: of `recorder/status`.
@@ -40,7 +40,7 @@ class Participants:
         self._paused: list[int] = []
 
     def update(self, there: Publishers, now: float) -> list[PairPublication]:
-        """What is to be sent, now that these publishers are there (now: monotonic s).
+        """The messages to send now that these publishers are present (now: monotonic s).
 
         DispatchError where a required recorder has gone, or another tuner publishes.
         """
@@ -54,7 +54,7 @@ class Participants:
         return publications + self._session.dispatcher.tick(now)
 
     def newly_paused(self, now: float) -> str:
-        """Which plants were paused or resumed since the last call, in words; may be empty."""
+        """Plants that were paused or resumed since the last call, in words; may be empty."""
         dispatcher = self._session.dispatcher
         paused, before = dispatcher.paused_pairs(now), self._paused
         if paused == before:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a training came to: the contents of `result.json` and `policy.npz`."""
+"""The results of a training: the contents of `result.json` and `policy.npz`."""
 
 import platform
 from collections.abc import Mapping, Sequence
@@ -132,7 +132,7 @@ def summarise(training: Training) -> dict[str, Any]:
 
 
 def verdict(none: float, lqt: float, adapted: float, *, changed: bool) -> str:
-    """What came of a seed, from its mean costs; changed: whether its law is not the first one.
+    """The verdict on a seed, from its mean costs; changed: whether its law is not the first one.
 
     >>> verdict(4.0, 2.0, 1.0, changed=True), verdict(4.0, 5.0, 5.0, changed=False)
     ('better', 'worse than no control')

@@ -58,7 +58,7 @@ class Session:
         return self._end() if self.dispatcher.paused else []
 
     def advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
-        """What is to be sent after an event, which the dispatcher has answered with `publications`.
+        """The messages to send after an event, which the dispatcher has answered with `publications`.
 
         now: monotonic time in s. Raises DispatchError if the training cannot use a batch's result.
         """

@@ -66,7 +66,7 @@ class Training:
     evaluation: Array | None = None
     """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
     ended: Array | None = None
-    """How those rollouts ended (see CostColumn.ENDED), of the same shape."""
+    """The ends of those rollouts (see CostColumn.ENDED), of the same shape."""
     plant: int = UNKNOWN_PLANT
     steps: int = 0
     """Steps of an episode; 0: not known yet."""
@@ -184,7 +184,7 @@ class Training:
         return np.stack([optimizer.policy.reshape(shape) for optimizer in self.optimizers])
 
     def warm_starts(self) -> Array:
-        """Where the laws of the models start, (S, *shape)."""
+        """The initial parameters of the models' laws, (S, *shape)."""
         laws = self.laws()
         return np.stack([law.theta_start.reshape(law.shape) for law in laws])
 
@@ -206,7 +206,7 @@ class Training:
 
     @property
     def computation(self) -> str:
-        """What `finish` computes in this phase, in words."""
+        """The computation of `finish` in this phase, in words."""
         fits = self.phase == "adapt" and self.settings.trajectories
         return "fitting models" if fits else "evaluating rollouts"
 
@@ -368,7 +368,7 @@ class Training:
         return None if cost is None or cost.plain else cost
 
     def _asked(self) -> list[list[Rollout]]:
-        """What each optimiser asks for; its policies may be vectors."""
+        """The rollouts that each optimiser asks for; its policies may be vectors."""
         return [
             [] if optimizer.done else calls.ask(optimizer, law.size)
             for optimizer, law in zip(self.optimizers, self.laws(), strict=True)

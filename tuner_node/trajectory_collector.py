@@ -59,7 +59,7 @@ class TrajectoryCollector:
             )
 
     def lost(self, plant: int, steps: int, n_z: int) -> int:
-        """How many of the samples z_0..z_T, of n_z numbers each, and a_0..a_{T-1} are missing."""
+        """Number of missing samples z_0..z_T, of n_z numbers each, and a_0..a_{T-1}."""
         states: int = sum(
             p == plant and k <= steps and values.shape[1] == n_z
             for (p, k), values in self._samples["states"].items()

@@ -75,7 +75,7 @@ def plane_of(grid: Grid) -> tuple[NDArray[np.intp], tuple[int, int]]:
 
 
 class EpisodeSamples:
-    """What was seen of one environment in one episode.
+    """The samples of one environment in one episode.
 
     Parameters
     ----------

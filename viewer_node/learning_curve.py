@@ -157,7 +157,7 @@ class LearningCurve:
         return None if 0.0 < left <= waited else max(0.0, left - waited)
 
     def message(self) -> dict[str, Any]:
-        """What a page is sent: x, mean, low and high by point, and the cost of every seed."""
+        """The message to a page: x, mean, low and high by point, and the cost of every seed."""
         xs, costs = self.costs()
         several = len(costs) > 1
         if several:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which nodes of a loop are there, and what they report of themselves. Pure.
+"""The nodes of a loop that are present, and their reports. Pure.
 
 `now` is any monotonic time in s.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 ROLES = {"plant": "state", "controller": "action", "tuner": "episode/start"}
-"""Who a node is follows from what it publishes, whatever its name."""
+"""Topics by which a node's role is recognised, whatever its name."""
 REPORTED = 2.5
 """Seconds for which a report of an activity holds: nodes report once a second."""
 MAX_VALUES = 32
@@ -50,7 +50,7 @@ class NodeReport:
 
 
 class LoopNodes:
-    """What is known of the nodes of one loop."""
+    """The known nodes of one loop."""
 
     def __init__(self) -> None:
         self.by_role = {role: RoleState(role) for role in ROLES}
@@ -85,7 +85,7 @@ class LoopNodes:
             self._reports[node] = NodeReport(now, level, message[:200], kept)
 
     def message(self, now: float) -> list[dict[str, Any]]:
-        """What a page is sent."""
+        """The message to a page."""
         rows = []
         for node in self.by_role.values():
             row: dict[str, Any] = {
@@ -103,7 +103,7 @@ class LoopNodes:
         return rows
 
     def activity(self, now: float) -> dict[str, Any] | None:
-        """What a node says that it is computing, and for how many seconds; None if none does."""
+        """The computation that a node reports, and its seconds so far; None if there is none."""
         for role in ("tuner", "controller", "plant"):
             known = self._reports.get(self.by_role[role].name.strip("/"))
             if known is None or not self.by_role[role].present or now - known.when > REPORTED:
@@ -116,6 +116,6 @@ class LoopNodes:
         return None
 
     def value(self, role: str, key: str) -> str | None:
-        """What the node in `role` says under `key` in its newest /diagnostics."""
+        """The value of `key` in the newest /diagnostics of the node in `role`."""
         report = self._reports.get(self.by_role[role].name.strip("/"))
         return None if report is None else dict(report.values).get(key)

@@ -208,7 +208,7 @@ class LoopView:
         return shown.fields[: max(shown.columns, self.horizon // shown.stride + 1)]
 
     def state_of_loop(self, now: float) -> str:
-        """What is happening, in one word."""
+        """The state of the loop in one word."""
         nobody = not any(node.present for node in self.nodes.by_role.values())
         quiet = self.quiet(now)
         # The last message of a tuner that was interrupted may be lost: then everybody is gone. Who
@@ -224,7 +224,7 @@ class LoopView:
         return "running" if quiet < SILENT else "silent"
 
     def controller(self, shown: EpisodeSamples) -> str:
-        """Who acts in the shown environment: see RolloutCosts.controller."""
+        """The controller in the shown environment: see RolloutCosts.controller."""
         return self._costs.controller(shown.key[0], shown.key[1], shown.environment)
 
     def quiet(self, now: float) -> float | None:

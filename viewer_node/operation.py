@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What operators ask of a loop's nodes, and who is paused. Pure.
+"""Requests of operators to a loop's nodes, and the paused ones. Pure.
 
 `now` is any monotonic time in s.
 """
@@ -41,7 +41,7 @@ class Operation:
         self._requests: dict[Call, _Request] = {}
         self._stopping: tuple[str, int] | None = None
         self.plant_paused = False
-        """What the plant says on `episode/paused`."""
+        """Whether the plant is paused, by its `episode/paused`."""
 
     def asked(self, call: Call, now: float) -> None:
         """Note that an operator asks a node for something."""
@@ -57,7 +57,7 @@ class Operation:
             self._stopping = call.node, self._nodes.by_role["tuner"].starts
 
     def requests(self, now: float) -> list[dict[str, Any]]:
-        """What was asked for and is not answered yet, and what has just failed."""
+        """Requests that are not answered yet, and those that have just failed."""
         for call, request in list(self._requests.items()):
             if request.failure and now - request.since > FAILURE:
                 del self._requests[call]

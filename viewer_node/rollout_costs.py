@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which controller caused which cost, by the gains that were published. Pure."""
+"""Assigns costs to controllers, by the gains that were published. Pure."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class RolloutCosts:
         remember(self._models, (frame.run, frame.step), frame, MAX_MODELS)
 
     def cost(self, frame: Frame) -> Rollouts | None:
-        """What the costs of an episode are of; None if its start is not known."""
+        """The controllers behind the costs of an episode; None if its start is not known."""
         ids = frame.run, frame.episode
         start, policy = self._starts.get(ids), self._policies.get(ids)
         if start is None or len(start.values) != len(frame.values):
@@ -105,7 +105,7 @@ class RolloutCosts:
         )
 
     def controller(self, run: int, episode: int, environment: int) -> str:
-        """Who acts in an environment: a key of loop_interfaces.controllers, or 'exploration'.
+        """The controller in an environment: a key of loop_interfaces.controllers, or 'exploration'.
 
         Empty if it is not known.
         """

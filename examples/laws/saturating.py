@@ -11,7 +11,7 @@ from loop_method.settings import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class SaturatingSettings(Settings):
-    """What can be set."""
+    """The constants of the law."""
 
     limit: float = setting(0.5, "magnitude that no action exceeds", 1e-6, 1e6)
 

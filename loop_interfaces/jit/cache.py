@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How functions are compiled, and when a compiled one on disk is out of date.
+"""Compilation of functions, and the detection of outdated ones on disk.
 
 Numba keeps compiled functions next to the source (or in the user's cache folder where that cannot be
 written; `kept_on_disk` knows a third) and takes them for current while the file that holds the function
@@ -35,7 +35,7 @@ class _Part(JITCodeLibrary):  # type: ignore[misc, unused-ignore]
 
     @property
     def codegen(self) -> Any:
-        """What puts Python objects into machine code, where there is none."""
+        """A code generator that embeds no Python objects in machine code."""
         return SimpleNamespace(set_env=lambda name, environment: None)
 
     def get_pointer_to_function(self, name: str) -> int:
@@ -97,7 +97,7 @@ def named_by_sources(function: F, *sources: ModuleType | Callable[..., Any]) -> 
 
 
 def kept_on_disk(compile_with_cache: Callable[[], Any]) -> Any:
-    """What Numba compiles and keeps, in a private temporary folder where it knows no other."""
+    """Let Numba keep compiled code, in a private temporary folder if it knows no other."""
     try:
         return compile_with_cache()
     except RuntimeError:  # neither the sources' folder nor the user's cache folder can be written

@@ -114,7 +114,7 @@ def monotonic_ns(clock: Any) -> int:
 
 
 class MonotonicClock:
-    """What `monotonic_ns` needs. record: an entry of CLOCK, valid as long as this object."""
+    """The arguments of `monotonic_ns`. record: an entry of CLOCK, valid as long as this object."""
 
     def __init__(self, record: Any) -> None:
         self._timespec = np.zeros(2, np.int64)

@@ -1,2 +1,2 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the nodes share of ROS: event loop, endpoints, introspection, parameters."""
+"""ROS infrastructure of all nodes: event loop, endpoints, introspection, parameters."""

@@ -51,7 +51,7 @@ def raw_subscription(node: Node, message_type: Any, name: str, qos: QoSProfile) 
 
 
 def writer_qos(topic: Topic) -> QoSProfile:
-    """What a publisher offers: reliable, so that it serves every kind of reader."""
+    """QoS of a publisher: reliable, so that it serves every kind of reader."""
     return QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
@@ -61,7 +61,7 @@ def writer_qos(topic: Topic) -> QoSProfile:
 
 
 def reader_qos(topic: Topic, depth: int = READER_DEPTH) -> QoSProfile:
-    """What a subscriber asks for: reliable if the topic is latched, else best effort.
+    """QoS of a subscriber: reliable if the topic is latched, else best effort.
 
     In lock-step nothing is gained by acknowledging states and actions: the plant repeats a state
     whose answer is missing long before the middleware would, and the acknowledgements cost as much
@@ -207,7 +207,7 @@ class Sender:
         self._publish: Callable[[bytes | bytearray], None] = self.publisher.handle.publish_raw
 
     def encoded(self, frame: Frame) -> bytes:
-        """What `send` would publish."""
+        """The message that `send` would publish."""
         return self._codec.encode(frame)
 
     def send(self, frame: Frame) -> None:

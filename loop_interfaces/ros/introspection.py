@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What every node offers to ROS tools, and who else is in the graph: /diagnostics, trigger services.
+"""Introspection of a node: /diagnostics, trigger services, and other nodes of its name.
 
 All of it runs in the node's housekeeping, off the hot path: nothing here is called for a message of
 the loop.
@@ -67,10 +67,10 @@ class Introspection:
         self._known: dict[str, int] = {}
         """Publishers of a topic that were looked at."""
         self._doubled: dict[str, ConditionTimer] = {}
-        """How long a topic has had two publishers of one name."""
+        """Timers of topics with two publishers of one name."""
         self._grace = NAMESAKE_GRACE if is_confined() else NAMESAKE_GRACE_OUTSIDE
         self._told: dict[str, float] = {}
-        """When a warning was given."""
+        """Times of the last warnings."""
 
     def supervise(self, name: str, qos: QoSProfile) -> None:
         """Check the publishers of a topic, by its full name: one other node should publish it.
@@ -231,7 +231,7 @@ class Introspection:
         return due
 
     def _namesakes(self, now: float) -> int:
-        """How many other nodes have had this one's full name for a while; reports them.
+        """Count, and report, other nodes that have had this one's full name for a while.
 
         A node is there as long as its services are: the graph's list of names can keep a node that has
         left, for good, when what it said last is read only after it has gone.

@@ -69,7 +69,7 @@ class _Fast(NamedTuple):
 
 
 class _WaitSet:
-    """What ends a wait: a guard condition, subscriptions and services, by their handles."""
+    """The wait set of the loop: a guard condition, subscriptions and services, by their handles."""
 
     def __init__(
         self, node: Node, guard: Any, subscriptions: Sequence[Any], services: Sequence[Any]
@@ -108,7 +108,7 @@ class NodeLoop(EventLoop):
         self._guard = _rclpy.GuardCondition(node.context.handle)
         """Ends a wait: see `_end_long_wait`, and RclChannel."""
         self._takes: dict[Any, Callable[[], int]] = {}
-        """What handles the messages of a subscription, by its handle, and returns how many."""
+        """Handlers of subscriptions by their handles, which return the number of messages."""
         self._handled, self._active, self._idle = 0, 0.0, False
         """Messages since the last round; when something last happened; whether that is long ago."""
 
@@ -270,7 +270,7 @@ class NodeLoop(EventLoop):
             self._guard.trigger_guard_condition()
 
     def _subscriptions(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
-        """What takes from each subscription, by its handle, those of samples first.
+        """Functions that take from each subscription, by its handle, those of samples first.
 
         A cost comes after the samples of its episode, and is to be handled after them.
         """

@@ -90,7 +90,7 @@ def prepare_process(name: str) -> None:
 
 
 class NodeBody(Protocol):
-    """What a node does: made with its parameters and topics, then run."""
+    """The body of a node: made with its parameters and topics, then run."""
 
     def join(self, node: Node, loop: Any) -> None:
         """Wire the topics on another `node`, which has the parameters of the one before."""

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What event loops of nodes have in common, and that of a node that observes.
+"""The base of the nodes' event loops, and the loop of a node that only observes.
 
 The nodes that answer states have one of their own (loop_interfaces.ros.node_loop). An observer's
 serves whatever the node has on rclpy's executor, ordinary timers and subscriptions. Both publish
@@ -36,7 +36,7 @@ PARAMETER_SERVICES = {
     *("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"),
     *("set_parameters", "set_parameters_atomically"),
 }
-"""What rclpy offers itself; a request that it cannot make sense of ends in an exception there."""
+"""Services of rclpy itself, in which a malformed request ends in an exception."""
 
 
 class EventLoop:
@@ -49,7 +49,7 @@ class EventLoop:
         """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._stop_reason: str | None = None
         self._turned = self.now()
-        """When the loop last went round."""
+        """Time of the last round of the loop."""
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
 

@@ -32,7 +32,7 @@ _LARGEST = 1.7976931348623157e308
 
 
 def given_parameters(node: Node, package: str) -> dict[str, Any]:
-    """What the command line and parameter files give a node, on top of the problem they name.
+    """The parameters that command line and files give a node, on top of the problem they name.
 
     ParameterError for unknown names, and for a problem that nobody knows.
     """

@@ -51,7 +51,7 @@ class SerializedSubscription:
         """The time limit of the call that left it."""
 
     def take(self, until: int | None = None) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """What has come in. until: only what arrived by then (ns since the epoch).
+        """Take the received samples. until: only those that arrived by then (ns since the epoch).
 
         The first message that arrived later is kept for a call with a later time; or an earlier one,
         for then the clock has been set back.

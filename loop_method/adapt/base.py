@@ -105,7 +105,7 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What a model-based optimiser knows about the problem.
+    """The problem as a model-based optimiser knows it.
 
     Attributes
     ----------
@@ -244,7 +244,7 @@ class Optimizer(Protocol):
 
     @property
     def tells(self) -> int:
-        """How many times `tell` was called."""
+        """Number of calls of `tell`."""
 
     @property
     def done(self) -> bool:

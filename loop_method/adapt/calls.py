@@ -35,7 +35,7 @@ def ask(optimizer: Optimizer, size: int) -> list[Rollout]:
 
 
 def tell(optimizer: Optimizer, results: list[RolloutResult]) -> Row:
-    """What it reports of the results of the rollouts that it asked for; OwnCodeError."""
+    """Tell it the results of its rollouts, and return its report; OwnCodeError."""
     row = _called(optimizer, "tell", results)
     if not isinstance(row, Mapping):
         raise OwnCodeError(

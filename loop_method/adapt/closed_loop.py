@@ -202,7 +202,7 @@ class ClosedLoop(ClosedLoopProblem):
         return float(weights[counted] @ simulation.costs[counted]), gradient
 
     def _noise_of(self, count: int) -> Array:
-        """What is added to U^T z, whose columns are orthonormal, (T, count, n_s) or (T, 1, 1)."""
+        """The noise added to U^T z, whose columns are orthonormal, (T, count, n_s) or (T, 1, 1)."""
         if not self.noise:
             return np.zeros((self.horizon, 1, 1))
         size = self.horizon, count, self.U.shape[1]

@@ -65,7 +65,7 @@ _STAMPS = ("fields", "incumbents", "trials", "others")
 
 @dataclass(frozen=True, kw_only=True)
 class GaussNewtonSettings(Settings):
-    """What can be set."""
+    """The constants of `gauss_newton`."""
 
     fields: int = setting(
         3,
@@ -77,7 +77,7 @@ class GaussNewtonSettings(Settings):
 
 @dataclass(eq=False)
 class SearchState:
-    """Where an optimisation stands, apart from the rollouts that it remembers.
+    """State of an optimisation, apart from the rollouts that it remembers.
 
     policy, candidate (n_a, 2 n_s): the incumbent, and what is tried if `proposed`; fields (M,):
     numbers of the initial fields that judge; incumbents, trials, others (M,): stamps of the
@@ -206,7 +206,7 @@ class GaussNewton(Optimizer):
 
     @property
     def tells(self) -> int:
-        """How many times `tell` was called."""
+        """Number of calls of `tell`."""
         return self._now.tells
 
     @property

@@ -27,7 +27,7 @@ from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.design.finite_horizon import action_curvature
 
 FAR = 10.0
-"""What a law without a finite cost counts, per cost of the law to begin with."""
+"""The cost of a law without a finite one, per cost of the law to begin with."""
 LARGEST = 512
 """Numbers of a state up to which R + B^T P B is worked out; its work grows with their third power."""
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What `model_based` does where no model of the whole field predicts the rollouts: local steps.
+"""Local steps, with which `model_based` continues if no model of the whole field predicts the rollouts.
 
     stage       rollouts                                      afterwards
     comparing   no control, on fields of the first law        searching, from the better one

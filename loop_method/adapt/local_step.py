@@ -227,7 +227,7 @@ def predict_difference(
     gammas: Array,
     free: Array | None = None,
 ) -> Array:
-    """How far a second trajectory runs from a measured one, to first order.
+    """Predict the difference of a second trajectory from a measured one, to first order.
 
         delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B f_k)
 

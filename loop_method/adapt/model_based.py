@@ -138,7 +138,7 @@ class ModelBased(Optimizer):
 
     @property
     def tells(self) -> int:
-        """How many times `tell` was called."""
+        """Number of calls of `tell`."""
         return self._tells
 
     @property

@@ -45,7 +45,7 @@ class Proposal:
     believed: str = ""
 
     def row(self) -> Row:
-        """What a history row says about it."""
+        """Its entries in a row of the history."""
         return {
             "predicted_fall": self.fall,
             "models": self.models,

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which optimiser a name stands for: an entry point, ours or another package's, or code of one's own.
+"""Optimisers by name: an entry point, ours or another package's, or code of one's own.
 
 Which code may be run: `loop_interfaces.own_code`.
 """
@@ -52,7 +52,7 @@ _DECLARED = ("name", "needs_trajectories", "iteration_rollouts", "preferences")
 
 
 def complete(name: str, found: object) -> type[Optimizer]:
-    """What was found, if it is a whole optimiser."""
+    """Return the class that was found if it is a complete optimiser; else a ValueError."""
     called = getattr(found, "__name__", repr(found))
     if not isinstance(found, type):
         raise ValueError(f"optimizer {name!r}: {called} must be a class")

@@ -133,7 +133,7 @@ def held_out_fraction(
     fields: Array,
     settings: ModelBasedSettings,
 ) -> tuple[float, float, float]:
-    """How far to go from the first law, and `change` and `deviation` of a `Renewal`.
+    """The fraction of the way from the first law, and `change` and `deviation` of a `Renewal`.
 
     parts: for each part of the fields the law that the others made.
     """

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a change of the gains does to a trajectory, along a measured trajectory.
+"""The sensitivity of a trajectory to the gains, along a measured trajectory.
 
 The law a = K s + b has the parameters theta = [K b], of shape (n_a, n_s + 1), in row-major order; s
 is the first n_s entries of x = V^T z. Along a measured trajectory, with Jacobians A_k and input

@@ -10,7 +10,7 @@ from loop_method.settings import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class ModelBasedSettings(Settings):
-    """What can be set.
+    """The constants of `model_based`.
 
     Nothing has a unit: costs and gains are scaled by those of the law that an improvement begins with.
     """

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What is the same in all optimisers whose steps are alike: a base class for one of your own."""
+"""A base class for an optimiser of your own all of whose steps are alike."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which of the laws to return: the first one, unless the others are better by more than chance.
+"""The choice of the law to return: the first one, unless another is better by more than chance.
 
 Costs of different initial fields are compared through the model. A law costs, in the mean over the
 distribution,
@@ -29,7 +29,7 @@ FIRST, ADAPTED, NONE = "first", "adapted", "none"
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known of a law.
+    """Evidence for a law.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def evidence_of(
     fields: Array,
     held_out: tuple[float, float],
 ) -> dict[str, Evidence]:
-    """What the model and the measured rollouts say of laws, the others only where they were measured.
+    """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
 
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
     held_out: change and deviation of the adapted law on fields that did not make it.

@@ -39,7 +39,7 @@ from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 @dataclass(frozen=True, eq=False)
 class FieldLaw:
-    """What came of a model of the whole field.
+    """The outcome of fitting a model of the whole field.
 
     Attributes
     ----------

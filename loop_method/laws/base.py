@@ -72,7 +72,7 @@ class Law(ABC):
     """
 
     name: ClassVar[str] = ""
-    """What it is called; the name of the class if it is not set."""
+    """Its name; that of the class if it is not set."""
     compiled: ClassVar[bool] = False
     """Whether it has a compiled form: `gains`."""
     axes: ClassVar[int] = 1
@@ -96,7 +96,7 @@ class Law(ABC):
 
     @abstractmethod
     def start(self) -> Parts:
-        """Where theta starts, by parts, whose names, shapes and order are those of theta.
+        """The initial theta by parts, whose names, shapes and order are those of theta.
 
         Returns
         -------

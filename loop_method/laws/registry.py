@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which law a name stands for: ours, an entry point of another package, or code of one's own.
+"""Laws by name: ours, an entry point of another package, or code of one's own.
 
 Which code may be run: `loop_interfaces.own_code`.
 """
@@ -67,7 +67,7 @@ def hand_over(kind: type[Law]) -> str:
 
 
 def complete(name: str, found: object) -> type[Law]:
-    """What was found, if it is a whole law."""
+    """Return the class that was found if it is a complete law; else a ValueError."""
     called = getattr(found, "__name__", repr(found))
     if not (isinstance(found, type) and issubclass(found, Law)):
         raise ValueError(f"law {name!r}: {called} must be a class derived from pdeloop.Law")

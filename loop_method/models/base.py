@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a model of the whole field is, and the measured rollouts that it is fitted to."""
+"""Models of the whole field, and the measured rollouts that they are fitted to."""
 
 from __future__ import annotations
 

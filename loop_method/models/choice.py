@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which model of the whole field to believe.
+"""The choice of a model of the whole field.
 
 Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
 from their initial states, in turns. Of a single rollout these are pieces; where all points share their
@@ -106,7 +106,7 @@ def fit_field_model(
 
 
 def _noise_share(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
-    """What the noise has in sum |z - z_r|^2 of the rollouts: the E of a perfect model."""
+    """The share of noise in sum |z - z_r|^2 of the rollouts: the E of a perfect model."""
     states = np.concatenate([finite(rollout).states for rollout in rollouts])
     total = float(np.sum((states - target) ** 2))
     return min(noise**2 * states.size / total, 1.0) if total > 0.0 else 0.0

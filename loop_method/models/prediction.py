@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How well a model predicts measured rollouts from their initial states."""
+"""The errors of a model in predicting measured rollouts from their initial states."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ _DIFFERENCE = 1e-5
 
 
 def grid_points(sensors: int) -> int:
-    """How many the field has, so that the sensors at (j + 1/2) / n_y are among them."""
+    """Number of grid points of the field, so that the sensors at (j + 1/2) / n_y are among them."""
     return 2 * sensors * max(1, -(-_POINTS // (2 * sensors)))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class FieldModelSettings:
-    """How models of the whole field are fitted and chosen.
+    """Constants of fitting and choosing models of the whole field.
 
     None has a unit: fields, inputs and time are scaled by what the data hold.
 

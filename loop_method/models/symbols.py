@@ -25,7 +25,7 @@ Symbols = tuple[Spectrum, Spectrum, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """Which symbols an equation has.
+    """The choice of an equation's symbols.
 
     Attributes
     ----------

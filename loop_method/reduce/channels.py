@@ -16,7 +16,7 @@ SHOWN = 6
 UNITS = 1e-12
 """Numbers of the state smaller than this, relative to another one, are lost in its rounding."""
 _SAME = 1e-12
-"""How far the cosine of two columns that are multiples of each other may be from 1."""
+"""Tolerance of the cosine of two columns that count as multiples of each other."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ NUMBERED = Channels()
 
 
 def constant(columns: Array) -> NDArray[np.int64]:
-    """Which columns have one value throughout, up to its rounding."""
+    """Columns with one value throughout, up to its rounding."""
     eps = float(np.finfo(np.float64).eps)
     still: NDArray[np.int64] = np.flatnonzero(
         np.ptp(columns, axis=0) <= 8.0 * eps * np.abs(columns).max(axis=0)
@@ -124,7 +124,7 @@ def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
 
 
 def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
-    """Which numbers of the state never moved, are multiples of others, or are lost in their rounding.
+    """Numbers of the state that never moved, are multiples of others, or are lost in their rounding.
 
     states : (N, n_z) array
     """
@@ -151,7 +151,7 @@ def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
 
 
 def _copies(states: Array, names: Sequence[str]) -> list[str]:
-    """Which columns are multiples of earlier ones, in words."""
+    """Name the columns that are multiples of earlier ones."""
     first = _first_alike(scaled(states)[0])
     found = []
     for i in np.flatnonzero(first != np.arange(len(first))).tolist():

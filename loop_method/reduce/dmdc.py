@@ -90,7 +90,7 @@ def truncated_dmdc(
 def truncation_remarks(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], p: int, channels: Channels = NUMBERED
 ) -> list[str]:
-    """Which inputs p directions of [Z; Y] hardly keep, in words."""
+    """Name the inputs that p directions of [Z; Y] hardly keep."""
     data = steps_of(trajectories)
     with threadpool_limits(limits=1):
         stacked = np.vstack([data.before.T, data.inputs.T])

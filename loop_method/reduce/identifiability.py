@@ -69,7 +69,7 @@ class IdentifiabilityWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """What data say about the model that is to be identified from them.
+    """How well data determine the model that is to be identified from them.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which order n_s the data support: errors of models on steps that they were not fitted to.
+"""The order n_s that the data support: errors of models on steps that they were not fitted to.
 
 Every trajectory is cut into pieces; each of four times every fourth piece is held out, and the others
 give U, A and B (see `loop_method.reduce.regression`). On a held-out piece z_0 .. z_N the model is away
@@ -49,7 +49,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class OrderStudy:
-    """What trajectories say about the order of a reduced model.
+    """Errors of reduced models by their order, and the suggested order.
 
     Attributes
     ----------

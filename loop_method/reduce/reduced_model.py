@@ -134,7 +134,7 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
 
 
 def repeated(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> dict[int, int]:
-    """Which trajectories are copies of earlier ones, and of which, by number."""
+    """Trajectories that are copies of earlier ones, with the number of the original."""
     first: dict[bytes, int] = {}
     found = {}
     for number, trajectory in enumerate(trajectories):
@@ -194,7 +194,7 @@ def _matrix(name: str, values: ArrayLike) -> Array:
 
 
 def numerical_rank(singular_values: Array, rows: int, columns: int) -> int:
-    """How many singular values of a matrix are above the rounding errors of the largest."""
+    """Number of singular values of a matrix above the rounding errors of the largest."""
     threshold = max(rows, columns) * np.finfo(np.float64).eps * singular_values[0]
     return int(np.count_nonzero(singular_values > threshold))
 

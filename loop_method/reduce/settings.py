@@ -10,7 +10,7 @@ from loop_method.settings import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class IdentificationSettings(Settings):
-    """What can be set of the reduced model and the first law.
+    """Constants of the reduced model and of the first law.
 
     None has a unit: errors are relative to what the data hold.
     """

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What an equation of the plant is: its parameters, its operators, its fields.
+"""The interface of equations: their parameters, operators and initial fields.
 
 Every equation has the form, on the periodic interval [0, L) and in Fourier space,
 
@@ -46,7 +46,7 @@ def parameter(
 
 
 def result_of(method: Callable[..., Any], *arguments: Any) -> Any:
-    """What a method of an equation returns.
+    """The return value of an equation's method.
 
     Raises
     ------

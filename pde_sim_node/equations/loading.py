@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which equation a name stands for: one of the project, or one from elsewhere.
+"""Equations by name: one of the project, or one from elsewhere.
 
 Which code may be run: `loop_interfaces.own_code`.
 """
@@ -47,7 +47,7 @@ def load_equation(name: str) -> type[Equation]:
 
 
 def complete(name: str, found: Any) -> type[Equation]:
-    """What was found, if it is a whole equation."""
+    """Return the class that was found if it is a complete equation; else a ValueError."""
     own = name.rpartition(":")[2]
     if not (isinstance(found, type) and issubclass(found, Equation)):
         raise ValueError(f"equation {shown(name)}: {own} must be a subclass of Equation")

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What all plants have in common: seeds, the counting of steps, costs and divergences."""
+"""The base of all plants: seeds, the counting of steps, costs and divergences."""
 
 from abc import ABC, abstractmethod
 from typing import Any

@@ -22,7 +22,7 @@ from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
 
 SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
-"""What a problem may set in place of the class; weights only where they are numbers."""
+"""Attributes that a problem may override; weights only where they are numbers."""
 WEIGHTS = ("state_weight", "action_weight")
 
 
@@ -85,7 +85,7 @@ class DynamicsPlant(BatchPlant):
         return grid
 
     def _declared_cost(self, grid: Grid, given: Mapping[str, Any]) -> Cost:
-        """What the class says of the cost; a problem may replace weights that are numbers."""
+        """The cost as the class declares it; a problem may replace weights that are numbers."""
         own, weights = self.dynamics, {}
         for name in WEIGHTS:
             declared = getattr(own, name)
@@ -127,7 +127,7 @@ class DynamicsPlant(BatchPlant):
         return Definition({"plant": self.name, **settings, **arguments}, sources)
 
     def adjoint(self) -> Adjoint:
-        """What the object's `pull_back` gives; ValueError if it has none."""
+        """The result of the object's `pull_back`; ValueError if it has none."""
         if type(self.dynamics).pull_back is Dynamics.pull_back:
             raise ValueError(
                 f"{self.name} has no derivatives, which exact gradients need: it has no method "
@@ -152,7 +152,7 @@ class DynamicsPlant(BatchPlant):
         return self._state("initial_state", drawn)
 
     def _state(self, method: str, returned: Any) -> Array:
-        """What a method returned, as an initial state."""
+        """The return value of a method as an initial state."""
         state: Array = self._numbers(method, returned, 1)[0]
         if not np.isfinite(state).all():
             raise OwnCodeError(f"{self.name}.{method} returned NaN or infinity")
@@ -176,7 +176,7 @@ class DynamicsPlant(BatchPlant):
         return costs
 
     def _held(self, actions: Array) -> Array:
-        """What the actuators take, (M, n_a)."""
+        """The actions within the limits of the actuators, (M, n_a)."""
         if type(self.dynamics).actuated is Dynamics.actuated:
             return actions if self.allowed.everything else self.allowed.project(actions)
         taken = [float_array("it", self._call("actuated", a.copy())) for a in actions]
@@ -223,7 +223,7 @@ class DynamicsPlant(BatchPlant):
                 raise OwnCodeError(f"{self.name}.{method} fails: {located(error)}") from error
 
     def _numbers(self, method: str, returned: Any, count: int) -> Array:
-        """What a method returned, as (count, n_z) numbers."""
+        """The return value of a method as (count, n_z) numbers."""
         batch = (count,) if self.dynamics.batched and method == "step" else ()
         grid = self.grid
         shapes = [(*batch, grid.size), (*batch, len(grid.components), *grid.shape)]

@@ -121,7 +121,7 @@ class Interval(Dynamics):
         self._waves = self._initial_waves()
 
     def __getstate__(self) -> dict[str, object]:
-        """How it was made: a factorisation cannot be pickled."""
+        """The arguments it was made with, as a factorisation cannot be pickled."""
         return {"_given": getattr(self, "_given", ((), {}))}
 
     def __setstate__(self, state: dict[str, tuple[tuple[object, ...], dict[str, object]]]) -> None:

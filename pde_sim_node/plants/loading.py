@@ -52,7 +52,7 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
 """Those that are shipped, by name."""
 OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS)
 OBJECT = "object of a Python program:"
-"""How a parameter begins that no file can hold."""
+"""The prefix of parameters that no file can hold."""
 PHYSICAL = "physical."
 
 
@@ -64,7 +64,7 @@ class Made(NamedTuple):
 
 
 _objects: dict[str, Made] = {}
-"""What was handed over in this process, by its name and parameters."""
+"""Objects that were handed over in this process, by their names and parameters."""
 
 
 def physical_of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def physical_of(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make(values: Mapping[str, Any]) -> Made:
-    """What the parameter `plant` names, made with `physical.*`.
+    """Make the object that the parameter `plant` names, with `physical.*`.
 
     Raises
     ------

@@ -177,7 +177,7 @@ class SpectralPlant(BatchPlant):
 
     @property
     def definition(self) -> Definition:
-        """What it is made from, and the source of the equation; see `Definition`."""
+        """Its parameters and the source of its equation; see `Definition`."""
         values = {name: getattr(self, name) for name in _NUMBERS} | {"actuator_width": self.width}
         # Defaults are omitted so that fingerprints from older versions stay valid.
         if self.shape != "equation":

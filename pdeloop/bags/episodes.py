@@ -46,7 +46,7 @@ _ONCE = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "mode
 
 @dataclass
 class RecordedEpisode:
-    """What was recorded of one episode.
+    """The recording of one episode.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class RecordedEpisode:
 
     @property
     def missing(self) -> list[str]:
-        """What the bag lacks of this episode, in words; empty when it is complete."""
+        """The missing parts of this episode in words; empty if it is complete."""
         lacking = [] if self.start is not None else ["its start"]
         if self.start is not None and not self.exploratory and self.policy is None:
             lacking.append("its policies")

@@ -16,7 +16,7 @@ SHOWN = 40
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What is in the bag at `path`: the content of `pdeloop bag info --json`."""
+    """Summarise the bag at `path`: the content of `pdeloop bag info --json`."""
     bag = Bag(path)
     found, findings = bag.survey, bag.findings()
     first, last = found.first, found.last

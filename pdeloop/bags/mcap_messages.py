@@ -39,7 +39,7 @@ RATIO, SLACK = 100, 64 * 2**20
 MAX_TEXT = 100_000_000
 """Bytes of a text next to the bag."""
 CONVERTED = "-mcap"
-"""How the name of a bag ends that was converted as we advise; the rest is that of the bag it was."""
+"""Suffix of the name of a bag that was converted as we advise."""
 MAX_NAME = 256
 """Characters of a topic's name or type, which ROS and DDS allow."""
 
@@ -194,7 +194,7 @@ def files(folder: Path) -> list[Path]:
 
 
 def _conversion(folder: Path, begin: str = "Convert") -> str:
-    """How to make a bag of the one in `folder` that can be read, as a command to be typed."""
+    """The command that converts the bag in `folder` to one that can be read."""
     src, dst = (shlex.quote(str(path)) for path in (folder, f"{folder}{CONVERTED}"))
     return f"{begin} it: rosbags-convert --src {src} --dst {dst} --dst-storage mcap"
 

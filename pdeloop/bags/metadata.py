@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a bag's metadata.yaml says about its files, held against what is in them."""
+"""Compares a bag's metadata.yaml with its files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Extent:
-    """How many messages, and from when on for how long (ns); None: not said."""
+    """Number of messages, start and duration (ns); None if not given."""
 
     messages: int | None = None
     first: int | None = None
@@ -45,7 +45,7 @@ class Metadata:
 
 @dataclass
 class Findings:
-    """What a bag lacks according to its metadata.yaml, and what is otherwise than it says, in words."""
+    """Missing parts of a bag, and contradictions to its metadata.yaml, in words."""
 
     missing: list[str] = field(default_factory=list)
     differences: list[str] = field(default_factory=list)
@@ -108,7 +108,7 @@ def _whole(value: object) -> int | None:
 
 
 def check(folder: Path, told: Metadata, found: Survey) -> Findings:
-    """What of a bag's files is missing, or otherwise than its metadata says."""
+    """Files of a bag that are missing or contradict its metadata."""
     findings, files = Findings(), {file.name: file for file in found.files}
     for name in dict.fromkeys(told.files):
         count = told.by_file.get(name, Extent()).messages

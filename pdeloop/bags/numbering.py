@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which episodes are not there, told by their numbers: our tuner counts from 1 and leaves out none."""
+"""Finds missing episodes by their numbers: our tuner counts from 1 without gaps."""
 
 from __future__ import annotations
 

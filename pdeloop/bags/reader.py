@@ -26,7 +26,7 @@ from recorder_node.sources import source_of
 from tuner_node.run_folder import RunFolder
 
 RUN_FILE = "run.json"
-"""Beside the bags of a run: its id (tuner_node.run_folder)."""
+"""The file with a run's id next to its bags (tuner_node.run_folder)."""
 
 
 class Bag:
@@ -53,7 +53,7 @@ class Bag:
 
     @cached_property
     def survey(self) -> Survey:
-        """What stands in its files."""
+        """The contents of its files."""
         return survey(self.files)
 
     def messages(self) -> Iterator[Message]:
@@ -66,7 +66,7 @@ class Bag:
         return self.survey.target
 
     def findings(self) -> Findings:
-        """What of its files is missing, or otherwise than its metadata says. BagError if unreadable."""
+        """Files that are missing or contradict its metadata. BagError if unreadable."""
         told = read_metadata(self.path)
         found = Findings() if told is None else check(self.path, told, self.survey)
         found.differences += repeated(self.survey)
@@ -92,7 +92,7 @@ class Bag:
         return known
 
     def contradicting_parameters(self) -> list[str]:
-        """Where the parameters next to the bag differ from those in it, in words."""
+        """Differences between the parameters next to the bag and those in it, in words."""
         return [
             f"{PARAMETERS} has other parameters of run {run} than the bag itself: {name}"
             for run, values in _beside(self.path / PARAMETERS).items()

@@ -41,9 +41,9 @@ class RecordedRun:
     ) -> None:
         self._name, self._report = f"run {number}", report
         self._rollouts: dict[bytes, list[str]] = {}
-        """What was recorded, in words, by what identifies a rollout (`_keys`)."""
+        """The recorded rollouts in words, by their keys (`_keys`)."""
         self._answered: Counter[bytes] = Counter()
-        """How many of them have their costs."""
+        """Number of those with costs."""
         self._complete: set[bytes] = set()
         """Those of complete episodes."""
         self._numbers: set[int] = set()
@@ -251,12 +251,12 @@ class _Lost:
             (self._lost if key in self._recorded else self._since)[phase] += 1
 
     def reach_end(self) -> None:
-        """What was asked for so far should have been recorded."""
+        """Count rollouts that should have been recorded by now."""
         self._lost += self._since
         self._since.clear()
 
     def text(self) -> str:
-        """What is missing in words; empty if nothing is."""
+        """The missing rollouts in words; empty if there are none."""
         if not (total := self._lost.total()):
             return ""
         parts = ", ".join(f"{PURPOSES[phase]} {count}" for phase, count in self._lost.items())
@@ -265,7 +265,7 @@ class _Lost:
 
 
 def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
-    """What identifies each rollout, bit by bit: its seeds, and the policy if there is one.
+    """A key of each rollout, bit by bit: its seeds, and the policy if there is one.
 
     A policy stands with the number of the models it is about, as each exploration repeats the
     rollouts without control.

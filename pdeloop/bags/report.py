@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What `pdeloop bag verify` compared, what differs, and what is missing."""
+"""The report of `pdeloop bag verify`: comparisons, differences and gaps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHOWN = 5
 
 @dataclass
 class Report:
-    """What was compared, what differs, and what is missing.
+    """Comparisons, differences and gaps.
 
     incomplete: episodes that lack something, which a training may have repeated; missing: what the bag,
     its metadata or its run says there is, and is not there; count: of the differences, of which the

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the folder of a run says about its training, for its bags to be held against."""
+"""The claims of a run's folder about its training, to compare its bags with."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RESULT, RUN, PROGRESS = "result.json", "run.json", "progress.jsonl"
 
 @dataclass
 class RunClaims:
-    """What a run's folder says.
+    """The claims of a run's folder.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class RunClaims:
 
 
 def claims_of(folder: Path) -> RunClaims | None:
-    """What the run in `folder` says; None if no run is there."""
+    """The claims of the run in `folder`; None if no run is there."""
     if not any((folder / name).exists() for name in (RUN, RESULT, "parameters.yaml")):
         return None
     claims = RunClaims(folder)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What stands in the files of a bag, in one pass over them: counts, times, parameters, the target."""
+"""A survey of a bag's files in one pass: counts, times, parameters, the target."""
 
 from __future__ import annotations
 

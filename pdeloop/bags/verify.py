@@ -122,7 +122,7 @@ def _whole_runs(bags: Sequence[Bag]) -> list[Path]:
 def _claims_about(
     number: int, runs: Mapping[int, RecordedRun], claims: Sequence[RunClaims]
 ) -> RunClaims | None:
-    """What is said of a run; a folder that does not say which run it is of is about an only one."""
+    """The claims about a run; a folder that names no run is about the only one in the bag."""
     found = (c for c in claims if c.run == number or (c.run is None and len(runs) == 1))
     return next(found, None)
 

@@ -117,7 +117,7 @@ def _mark(finding: Finding) -> str:
 
 
 def _number(kind: type[int] | type[float], least: float, most: float) -> Callable[[str], float]:
-    """What reads a number in a range, for argparse."""
+    """A function that reads a number in a range, for argparse."""
 
     def read(text: str) -> float:
         try:

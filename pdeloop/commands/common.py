@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the commands share: how they are declared."""
+"""Declaration of commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-"""Where a command adds its parser."""
+"""The collection to which a command adds its parser."""
 DEFAULTS = {spec.name: spec for spec in TUNER}
 """The tuner's parameters by name: their defaults, ranges and meanings."""
 _METAVAR = {int: "N", list: "X,X,..."}

@@ -150,7 +150,7 @@ class ControllerCheck(Check):
         return Explored(start, plant, np.array(states), np.array(actions))
 
     def outcome(self, cost: Frame, ask: Ask | None = None) -> Message:
-        """What is published about an exploration: its models, or a ModelFailure."""
+        """The outcome of an exploration: its models, or a ModelFailure."""
         what = f"`model/identified` or `model/failed` of episode {cost.episode}"
         ask = ask or partial(self.wire.send, COST, cost)
         return self.expect(what, partial(_of, cost), MODEL_IDENTIFIED, FAILED, ask=ask)[1]

@@ -106,7 +106,7 @@ class RosWire:
 def check_node(
     kind: str, *, namespace: str = "", network: bool = False, **options: Any
 ) -> Iterator[Finding]:
-    """What is found of the plant, controller or tuner in this ROS domain. options: see Check."""
+    """Check the plant, controller or tuner in this ROS domain. options: see Check."""
     if not network:
         keep_on_this_machine()
     make = CHECKS[kind]

@@ -357,7 +357,7 @@ def _check_cost(steps: int, mean: float, total: float, ended: float) -> None:
 
 
 def _sums(trace: Trace, z_r: Array) -> dict[str, tuple[float, float]]:
-    """What q and r may be the factors of in a total: the stage costs, and common mistakes."""
+    """Candidate sums whose factors are q and r: the stage costs, and common mistakes."""
     e = ((trace.states - z_r) ** 2).sum(axis=1)
     z, a = (trace.states**2).sum(axis=1), (trace.actions**2).sum(axis=1)
     return {

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the three checks share: messages that are waited for, and a list of probes. Pure.
+"""The base of the three checks: messages that are awaited, and a list of probes. Pure.
 
 A probe is a method whose name and docstring are printed: what docs/protocol.md promises there. It
 raises UnexpectedError where the node does otherwise. Each can be run alone: what several need is made
@@ -43,7 +43,7 @@ class NoAnswerError(UnexpectedError):
 
 
 class NoteError(Exception):
-    """What only somebody can judge who knows the node."""
+    """A remark that only a person who knows the node can judge."""
 
 
 class Wire(Protocol):
@@ -71,7 +71,7 @@ class Check(ABC):
     """
 
     published: ClassVar[tuple[Topic, ...]]
-    """What the checked node publishes; the check publishes the other topics."""
+    """Topics of the checked node; the check publishes the others."""
     probes: ClassVar[tuple[Callable[[Any], None], ...]]
 
     def __init__(
@@ -89,7 +89,7 @@ class Check(ABC):
         self._numbers = count(1)
 
     def findings(self) -> Iterator[Finding]:
-        """What each probe finds, as it comes; the node is left free on every way out."""
+        """Yield the finding of each probe; the node is left free on every way out."""
         try:
             for probe in self.probes:
                 name, promise = probe.__name__.replace("_", " "), str(probe.__doc__).rstrip(".")

@@ -54,7 +54,7 @@ class TunerCheck(Check):
         super().__init__(*arguments, **options)
         self.run = 0  # it is the tuner's
         self.start = self.cost = self.models = self.frame([])
-        """What is under way, without rows before and after the run; the last of the others."""
+        """The start under way, without rows before and after the run; the last of the others."""
         self.policies: Array | None = None
         """Policies of the episode under way; None if it explores."""
         self.rollouts, self.knows_gains = 0, False

@@ -29,7 +29,7 @@ OTHERS = {
     "num_envs": "gymnasium.make_vec, which makes several environments",
     "seed": "reset(seed=...), which begins with the initial field of that seed",
 }
-"""What keywords of other environments are called here."""
+"""Names of other environments' keywords here."""
 
 
 def plant_of(source: Source, parameters: Mapping[str, Any], num_envs: int) -> Plant:
@@ -67,7 +67,7 @@ def penalty(given: float) -> float:
 
 
 def render_mode(given: str | None) -> str | None:
-    """How the environment is drawn. ValueError unless it is "rgb_array" or None."""
+    """Check the render mode. ValueError unless it is "rgb_array" or None."""
     if given not in (None, "rgb_array"):
         raise ValueError(f"render_mode is {given!r}; expected 'rgb_array' or None")
     return given

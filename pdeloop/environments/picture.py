@@ -30,7 +30,7 @@ class Picture:
         return Picture, ()
 
     def frame(self, plant: Plant, environment: int) -> NDArray[np.uint8]:
-        """What environment m of the plant looks like, (height, width, 3)."""
+        """A picture of the plant's environment m, (height, width, 3)."""
         if self._frames is None:
             try:
                 from pdeloop.frames import Frames

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What an episode of an environment begins with: seeds, or fields that are given."""
+"""Initial fields of an environment's episodes: by seeds, or as given."""
 
 from __future__ import annotations
 

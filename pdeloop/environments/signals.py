@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What an environment and its agent exchange: the spaces, and what `info` says."""
+"""Signals between an environment and its agent: the spaces, and `info`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def mean_field_error(plant: Plant) -> float:
 
 
 def told(plant: Plant, costs: Array) -> dict[str, Array]:
-    """What `info` says of each environment.
+    """The `info` of each environment.
 
     cost (M,): the stage cost of the step that ended; distance (M,): root mean square over the grid of
     z - z_r, of the field itself; target (M, state_size), read-only: z_r as it is observed.

@@ -153,7 +153,7 @@ class VecEnvironment(VecEnv):  # type: ignore[misc, unused-ignore]  # untyped wh
 
 
 def one_of(info: Mapping[str, Any], m: int) -> dict[str, Any]:
-    """What a vector environment's info says of environment m."""
+    """The entries of environment m in a vector environment's info."""
     numbers = {name: info[name] for name in ("cost", "distance", "target")}
     return one(numbers, m)
 

@@ -177,7 +177,7 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         terminated: Flags,
         truncated: Flags,
     ) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
-        """What `step` returns where some environments begin again in the same step."""
+        """The result of `step` where some environments begin again in the same step."""
         ended = self._ended.copy()
         states = self._begin(ended, [None] * self.num_envs, None)
         first = self._told_at_first()
@@ -251,7 +251,7 @@ def mode_of(given: AutoresetMode | str) -> AutoresetMode:
 
 
 def reset_mask(given: Any, num_envs: int) -> Flags:
-    """Which environments a reset is of; all if not given. ValueError for another mask."""
+    """The mask of environments to reset; all if not given. ValueError for another mask."""
     if given is None:
         return np.ones(num_envs, dtype=np.bool_)
     mask = np.asarray(given)

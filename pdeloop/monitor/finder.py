@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Which loop the monitor shows: the given one, or the training that runs."""
+"""Finds the loop that the monitor shows: the given one, or the training that runs."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ class MonitorNode:
         return sorted(found)
 
     def _controls(self, by_role: dict[str, list[Endpoint]]) -> list[dict[str, Any]]:
-        """Which services the nodes of the loop offer."""
+        """Services that the nodes of the loop offer."""
         offered: dict[str, set[str]] = {}
         for name, types in self._node.get_service_names_and_types():
             node, _, verb = name.rpartition("/")

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How the monitor calls the services of the loop's nodes, never waiting."""
+"""Calls of the services of the loop's nodes without waiting."""
 
 from __future__ import annotations
 

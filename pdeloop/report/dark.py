@@ -20,7 +20,7 @@ from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.report.style import FIELD_MAP, GAIN_MAP
 
 BACK, INK = "#14171c", "#e8eaee"
-"""What stands for white and for black; the page has the same."""
+"""Substitutes for white and black; the page has the same."""
 GREY = 0.03
 """Differences of red, green and blue up to which a colour counts as a grey."""
 MAPS = {

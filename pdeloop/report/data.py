@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a report shows, gathered from the folder of a run or of a reproduction."""
+"""The data of a report, gathered from the folder of a run or of a reproduction."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class ReportData:
 
     @property
     def missing(self) -> list[str]:
-        """What cannot be shown, with the problem where there are several."""
+        """Data that cannot be shown, with the problem where there are several."""
         several = len(self.problems) > 1
         return [
             f"{problem.name}: {sentence}" if several else sentence

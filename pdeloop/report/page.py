@@ -233,7 +233,7 @@ def _page(
 
 
 def _outcome(problem: ProblemData) -> tuple[str, str, str]:
-    """What a problem came to, of its best adapted controller: name, cost and what that says."""
+    """The outcome of a problem with its best adapted controller: name, cost and a remark."""
     means = {name: float(field_means(costs).mean()) for name, costs in problem.costs.items()}
     adapted = {name: cost for name, cost in means.items() if name in problem.runs}
     best = min(adapted, key=lambda name: adapted[name] if isfinite(adapted[name]) else inf)
@@ -259,7 +259,7 @@ Table = tuple[Sequence[str], list[tuple[str, ...]]]
 
 
 def _facts(data: ReportData) -> list[tuple[str, str]]:
-    """What the report is about."""
+    """The facts about the reported runs."""
     first = data.problems[0]
     seeds, values = first.first.seeds, first.first.values
     if data.study is not None:
@@ -320,7 +320,7 @@ def _results(problems: Sequence[ProblemData], table: Sequence[dict[str, dict[str
 
 
 def _budget(problems: Sequence[ProblemData]) -> Table:
-    """What the rollouts of a seed were for."""
+    """The rollouts of a seed by purpose."""
     rows = []
     for problem in problems:
         for name, run in problem.runs.items():

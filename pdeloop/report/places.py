@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What stands beside a field in a figure: where actuators act and sensors measure, and its target."""
+"""Marks beside a field in a figure: actuators, sensors and the target."""
 
 from __future__ import annotations
 

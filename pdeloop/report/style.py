@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What all figures of a report share. A controller's colour: loop_interfaces.controllers.
+"""The common style of a report's figures. A controller's colour: loop_interfaces.controllers.
 
 Fields are drawn in the colours of loop_interfaces.colour_scale and gains with PuOr, which any colour
 vision can read.

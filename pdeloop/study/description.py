@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a study consists of. Pure but for the problems' files."""
+"""The description of a study. Pure but for the problems' files."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class Study:
         return replace(self, settings={**self.settings, **settings})
 
     def content(self) -> dict[str, Any]:
-        """What `of` makes this study of."""
+        """The content that `of` makes this study from."""
         return {
             "problems": list(self.problems.values()),
             "seeds": list(self.seeds),

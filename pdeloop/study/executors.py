@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Where the trainings of a study run: processes of this machine, or a Dask cluster."""
+"""Executors for the trainings of a study: processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from spectral_solver.workers import use_cores
 CONNECTING = 10.0
 """Seconds in which a scheduler has to answer."""
 RETRIES = 3
-"""How often a cluster may begin a training again whose worker has gone."""
+"""Number of times that a cluster may restart a training whose worker has gone."""
 WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
-"""How a user starts a worker, which must not run modules of its working directory, either."""
+"""The command that starts a worker, which must not run modules of its working directory either."""
 
 
 @contextlib.contextmanager

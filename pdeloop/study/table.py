@@ -126,7 +126,7 @@ def above(found: Mapping[str, Any] | None) -> bool:
 
 
 def beside_no_control(table: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What costs no less than no control, which a share of LQT's cost does not show.
+    """Controllers that cost no less than no control, which a share of LQT's cost does not show.
 
     A sentence for each LQT law and each adapted controller, or for its worst seed.
     """

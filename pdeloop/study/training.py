@@ -34,7 +34,7 @@ class EnvironmentMismatchError(ValueError):
 
 
 def environment() -> dict[str, str]:
-    """What the last bits of a result depend on: versions and the processor's type."""
+    """The environment that the last bits of a result depend on: versions and the processor's type."""
     known = versions()
     known.pop("ros-jazzy-rclpy", None)
     return {**known, "processor": str(llvmlite.binding.get_host_cpu_name())}
@@ -49,7 +49,7 @@ def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def differences(there: Mapping[str, str], expected: Mapping[str, str]) -> str:
-    """What another environment has instead of the expected one, in words; empty if nothing."""
+    """Differences of another environment from the expected one, in words; empty if there are none."""
     return ", ".join(
         f"{name} {there.get(name, 'missing')} instead of {expected.get(name, 'none')}"
         for name in sorted({*there, *expected})

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a web page is sent: the status, the learning curve, the target and the shown episode. Pure.
+"""The messages to a web page: the status, the learning curve, the target and the shown episode. Pure.
 
 A message is JSON text. One with numbers is binary, little-endian: the length of the header (uint32),
 the header as JSON padded to 4 bytes, then float32 numbers.
@@ -84,7 +84,7 @@ def _numbers(label: str) -> dict[str, Any]:
 
 
 def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Where the actuators act and the sensors measure, from a plant's parameters."""
+    """Positions of actuators and sensors, from a plant's parameters."""
     try:
         grid = Grid.parse(str(values["grid"]))
         boxes = parse(str(values.get("actuators") or "[]"))

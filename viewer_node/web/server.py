@@ -81,7 +81,7 @@ class Server:
         self._sockets: dict[object, web.WebSocketResponse] = {}
         """The WebSockets of pages, by their connections."""
         self.token = secrets.token_urlsafe(24)
-        """What a page has to know to ask for anything."""
+        """The token that a page must send with every request."""
         self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
 
     @property
@@ -229,7 +229,7 @@ class _ToldInALine(logging.Handler):
 
 
 def _log() -> logging.Logger:
-    """Where the server's library writes, which by itself prints tracebacks."""
+    """The log of the server's library, which by itself prints tracebacks."""
     log = logging.getLogger("pdeloop.page")
     log.propagate, log.handlers = False, [_ToldInALine()]
     return log
