@@ -50,7 +50,7 @@ def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
         raise FileError(f"holds no arrays ({type(error).__name__}: {error})") from error
 
 
-def taken(
+def checked_array(
     arrays: Arrays,
     name: str,
     kind: str,

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.array_files import read_arrays, taken
+from loop_interfaces.array_files import checked_array, read_arrays
 from loop_interfaces.files import (
     FileError,
     make_folder,
@@ -297,15 +297,15 @@ class RunFolder:
         n_a, seeds = values["n_a"], values["seeds"]
         try:
             arrays = read_arrays(path)
-            model = taken(arrays, "model", "f", (seeds, None, None))
+            model = checked_array(arrays, "model", "f", (seeds, None, None))
             law: tuple[int | None, ...] = (seeds, n_a, 2 * model.shape[2])
             if values["law"] != "affine":  # whose parameters only the law itself can read
                 law = (seeds, *[None] * (arrays["policy"].ndim - 1)) if "policy" in arrays else law
             for rows in model:
                 model_rows.unpack(rows, n_a, values["law"])
             return {
-                "policy": taken(arrays, "policy", "f", law),
-                "lqt": taken(arrays, "lqt", "f", law),
+                "policy": checked_array(arrays, "policy", "f", law),
+                "lqt": checked_array(arrays, "lqt", "f", law),
                 "model": model,
             }
         except ValueError as error:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.files import FileError
 from loop_interfaces.frames import MAX_ID
 from tuner_node import checkpoint, training_state
@@ -99,7 +99,7 @@ class RunWriter:
         """Go on from the newest usable checkpoint, or begin again: both lead to the same result."""
 
         def take(arrays: dict[str, NDArray[Any]]) -> None:
-            if int(taken(arrays, "run", "i", ())) != self.identity.run:
+            if int(checked_array(arrays, "run", "i", ())) != self.identity.run:
                 raise ValueError("belongs to another run")
             training_state.restore(self._training, arrays)
 

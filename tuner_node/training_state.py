@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.documents import parse_json
 from loop_interfaces.text import shown
 from loop_method.adapt import calls
@@ -72,24 +72,24 @@ def restore(training: Training, arrays: Arrays) -> None:
 def _fill(training: Training, arrays: Arrays) -> None:
     """Bring a new training to that state; an error of any of these kinds if the arrays do not fit."""
     seeds, n_a = training.settings.seeds, training.settings.n_a
-    training.phase = str(taken(arrays, "phase", "U", ()))
-    training.budget.restore(taken(arrays, "budget", "i", training.budget.state().shape))
-    training.law_seen = bool(taken(arrays, "law_seen", "b", ()))
-    training.plant = int(taken(arrays, "plant", "i", ()))
-    training.steps = int(taken(arrays, "steps", "i", ()))
-    training.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
-    training.pending = taken(arrays, "pending", "i", (None,)).tolist()
-    training.history = parse_json(str(taken(arrays, "history", "U", ())))
-    training.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
+    training.phase = str(checked_array(arrays, "phase", "U", ()))
+    training.budget.restore(checked_array(arrays, "budget", "i", training.budget.state().shape))
+    training.law_seen = bool(checked_array(arrays, "law_seen", "b", ()))
+    training.plant = int(checked_array(arrays, "plant", "i", ()))
+    training.steps = int(checked_array(arrays, "steps", "i", ()))
+    training.attempts = checked_array(arrays, "attempts", "i", (seeds,)).tolist()
+    training.pending = checked_array(arrays, "pending", "i", (None,)).tolist()
+    training.history = parse_json(str(checked_array(arrays, "history", "U", ())))
+    training.worse = checked_array(arrays, "worse", "b", (seeds,)).tolist()
     n_z = None
     if "models" in arrays:
-        training.models = taken(arrays, "models", "f", (seeds, None, None))
+        training.models = checked_array(arrays, "models", "f", (seeds, None, None))
         n_z = len(model_rows.unpack(training.models[0], n_a, training.settings.law.name).U)
     if "target" in arrays:
-        training.target = taken(arrays, "target", "f", (n_z,))
+        training.target = checked_array(arrays, "target", "f", (n_z,))
     if "evaluation" in arrays:
-        training.evaluation = taken(arrays, "evaluation", "f", training.evaluation_shape)
-        training.ended = taken(arrays, "ended", "f", training.evaluation_shape)
+        training.evaluation = checked_array(arrays, "evaluation", "f", training.evaluation_shape)
+        training.ended = checked_array(arrays, "ended", "f", training.evaluation_shape)
     for m in range(seeds):
         if is_kept(arrays, f"exploration{m}"):
             training.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_z, n_a)

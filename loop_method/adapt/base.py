@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.laws.base import Law
@@ -278,7 +278,7 @@ def taken_theta(state: Mapping[str, NDArray[np.generic]], like: Array) -> Array:
     known = state.get("policy")
     if known is not None and known.size == like.size:
         state = {"policy": known.reshape(like.shape)}
-    return taken(state, "policy", "f", like.shape).copy()
+    return checked_array(state, "policy", "f", like.shape).copy()
 
 
 def checked_policy(policy: ArrayLike) -> Array:

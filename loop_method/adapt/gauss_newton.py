@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import Arrays, taken
+from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -118,7 +118,7 @@ class SearchState:
         given: dict[str, Any] = {}
         for name, own in self.arrays().items():
             shape = (None,) if name in _STAMPS else own.shape
-            array = taken(arrays, name, own.dtype.kind, shape)
+            array = checked_array(arrays, name, own.dtype.kind, shape)
             given[name] = array.copy() if shape else array.item()
         if len({given[name].size for name in _STAMPS}) > 1:
             raise ValueError("the fields of the checkpoint do not add up.")
@@ -231,7 +231,7 @@ class GaussNewton(Optimizer):
         now = self._now
         require_results(results, len(self.ask()))
         for result in results:
-            self._records.sound(result)
+            self._records.validated_samples(result)
         now.tells += 1
         row: Row = {"diverged": sum(not r.usable for r in results)}
         missing = now.missing
@@ -275,7 +275,7 @@ class GaussNewton(Optimizer):
             raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
         self._now = now
         if sensed:
-            sensed.equation = taken(state, "equation", "f", sensed.equation.shape).copy()
+            sensed.equation = checked_array(state, "equation", "f", sensed.equation.shape).copy()
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, int(self._now.fields[slot])))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.adapt.base import (
@@ -105,7 +105,7 @@ class InCoordinates(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         n_z = self.basis.rows.shape[1]
-        rows = taken(state, _ROWS, "f", (None, n_z))
+        rows = checked_array(state, _ROWS, "f", (None, n_z))
         if len(rows) > CAPACITY:
             raise ValueError(f"'{_ROWS}' has {len(rows)} rows; expected at most {CAPACITY}")
         self.basis.rows = rows

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State
 from loop_method.adapt.gauss_newton import GaussNewton, GaussNewtonSettings
@@ -133,12 +133,12 @@ class LocalSearch:
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a `state`; a ValueError if it is none."""
-        stage = str(taken(state, "stage", "U", ()))
+        stage = str(checked_array(state, "stage", "U", ()))
         if stage not in _STAGES:
             raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
-        policy = taken(state, "policy", "f", self._first.shape).copy()
-        self._from_none = bool(taken(state, "from_none", "b", ()))
-        self._none_costs = taken(state, "none_costs", "f", (None,), finite=False).copy()
+        policy = checked_array(state, "policy", "f", self._first.shape).copy()
+        self._from_none = bool(checked_array(state, "from_none", "b", ()))
+        self._none_costs = checked_array(state, "none_costs", "f", (None,), finite=False).copy()
         self._search = None
         if own := part_of(state, _SEARCH):
             self._begin_search()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -166,7 +166,7 @@ class ModelBased(Optimizer):
         asked = self.ask()
         require_results(results, len(asked))
         for result in results:
-            self._records.sound(result)
+            self._records.validated_samples(result)
         self._tells += 1
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         with threadpool_limits(limits=1):
@@ -387,27 +387,27 @@ class ModelBased(Optimizer):
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
         n_z, shape = len(self._context.U), self._first.shape
-        stage = str(taken(state, "stage", "U", ()))
+        stage = str(checked_array(state, "stage", "U", ()))
         if stage not in _STAGES:
             raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
         self._records.restore(state, n_z, shape)
-        self._stage, self._tells = stage, int(taken(state, "tells", "i", ()))
-        self._policy = taken(state, "policy", "f", shape).copy()
-        self._held_out = taken(state, "held_out", "f", (3,), finite=False).copy()
-        self._begun = int(taken(state, "begun", "i", ()))
-        self._none_is_close = bool(taken(state, "none_is_close", "b", ()))
-        self._safe = bool(taken(state, "safe", "b", ()))
+        self._stage, self._tells = stage, int(checked_array(state, "tells", "i", ()))
+        self._policy = checked_array(state, "policy", "f", shape).copy()
+        self._held_out = checked_array(state, "held_out", "f", (3,), finite=False).copy()
+        self._begun = int(checked_array(state, "begun", "i", ()))
+        self._none_is_close = bool(checked_array(state, "none_is_close", "b", ()))
+        self._safe = bool(checked_array(state, "safe", "b", ()))
         self._improved, self._parts = None, []
         if "laws" in state:
             theta = (shape[0], shape[1] // 2 + 1)
             self._improved, *self._parts = (
-                a.copy() for a in taken(state, "laws", "f", (None, *theta))
+                a.copy() for a in checked_array(state, "laws", "f", (None, *theta))
             )
         self._belief = None
         if "error" in state:
             model = model_of(part_of(state, _MODEL))
-            error = float(taken(state, "error", "f", ()))
-            self._belief = Belief(model, error, int(taken(state, "components", "i", ())))
+            error = float(checked_array(state, "error", "f", ()))
+            self._belief = Belief(model, error, int(checked_array(state, "components", "i", ())))
         self._local = None
         if local := part_of(state, _LOCAL):
             self._local = self._search_from(self._begun)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -128,8 +128,11 @@ class StepOptimizer(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         policy = taken_theta(state, self._policy)
-        tells = int(taken(state, "tells", "i", ()))
-        own = {name: taken(state, name, "f", np.shape(getattr(self, name))) for name in self.kept}
+        tells = int(checked_array(state, "tells", "i", ()))
+        own = {
+            name: checked_array(state, name, "f", np.shape(getattr(self, name)))
+            for name in self.kept
+        }
         self._policy, self._tells = policy, tells
         for name, value in own.items():
             setattr(self, name, value.copy())

@@ -5,7 +5,7 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import Arrays, taken
+from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
 from loop_method.reduce.snapshots import LARGE, factored
@@ -47,13 +47,13 @@ def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:
 
 def taken_trajectory(arrays: Arrays, name: str, n_z: int | None, n_a: int) -> Trajectory:
     """The trajectory of that name, or a ValueError. n_z: None if it is not known."""
-    actions = taken(arrays, f"{name}.actions", "f", (None, n_a))
+    actions = checked_array(arrays, f"{name}.actions", "f", (None, n_a))
     if f"{name}.modes" in arrays:
-        modes = taken(arrays, f"{name}.modes", "f", (None, n_z))
-        states = taken(arrays, f"{name}.coordinates", "f", (None, len(modes)))
+        modes = checked_array(arrays, f"{name}.modes", "f", (None, n_z))
+        states = checked_array(arrays, f"{name}.coordinates", "f", (None, len(modes)))
         found: Trajectory = LowRankTrajectory(states, modes, actions)
     else:
-        states = taken(arrays, f"{name}.states", "f", (None, n_z))
+        states = checked_array(arrays, f"{name}.states", "f", (None, n_z))
         found = Trajectory(states, actions)
     if len(states) - len(actions) not in (0, 1):
         raise ValueError(f"'{name}' has {len(states)} states and {len(actions)} actions")
@@ -80,8 +80,8 @@ def taken_record(
     stamp: int = -1,
 ) -> Record:
     """The rollout of that name with a policy of this shape, or a ValueError."""
-    policy = taken(arrays, f"{name}.policy", "f", shape)
-    cost = float(taken(arrays, f"{name}.cost", "f", (), finite=False))
+    policy = checked_array(arrays, f"{name}.policy", "f", shape)
+    cost = float(checked_array(arrays, f"{name}.cost", "f", (), finite=False))
     known = taken_trajectory(arrays, name, n_z, n_a)
     return Record(policy, cost, known.states, known.actions, stamp)
 
@@ -116,7 +116,7 @@ class Records:
 
     def add(self, policy: Array, result: RolloutResult, keep: set[int]) -> Record:
         """Remember a rollout; `keep` are the stamps that must not be forgotten."""
-        states, actions = self.sound(result)
+        states, actions = self.validated_samples(result)
         cost = float(result.cost) if result.usable else float("inf")
         record = Record(np.array(policy), cost, states, actions, self.count)
         self._records[record.stamp] = record
@@ -139,14 +139,17 @@ class Records:
 
     def restore(self, arrays: Arrays, n_z: int, shape: tuple[int, int]) -> None:
         """Remember what a `state` does; a ValueError if it is none. shape: of the policies."""
-        count, limit = taken(arrays, "count", "i", ()), taken(arrays, "limit", "f", ())
-        stamps = taken(arrays, "stamps", "i", (None,)).tolist()
+        count, limit = (
+            checked_array(arrays, "count", "i", ()),
+            checked_array(arrays, "limit", "f", ()),
+        )
+        stamps = checked_array(arrays, "stamps", "i", (None,)).tolist()
         self._records = {
             s: taken_record(arrays, f"record{s}", n_z, shape[0], shape, s) for s in stamps
         }
         self.count, self._limit = int(count), float(limit)
 
-    def sound(self, result: RolloutResult) -> tuple[Array, Array]:
+    def validated_samples(self, result: RolloutResult) -> tuple[Array, Array]:
         """The states and actions that can be learned from, or a ValueError."""
         trajectory, usable = result.trajectory, result.usable
         if trajectory is None:

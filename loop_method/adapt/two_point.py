@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.array_files import taken
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -176,8 +176,8 @@ class TwoPoint(Optimizer):
         """Continue from a checkpoint of an optimiser with the same arguments."""
         policy = taken_theta(state, self._policy)
         tells, learning_rate = (
-            taken(state, "tells", "i", ()),
-            taken(state, "learning_rate", "f", ()),
+            checked_array(state, "tells", "i", ()),
+            checked_array(state, "learning_rate", "f", ()),
         )
         self._policy, self._tells = policy, int(tells)
         self._learning_rate = float(learning_rate)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.law_batch import LawBatch
-from loop_interfaces.array_files import read_arrays, taken
+from loop_interfaces.array_files import checked_array, read_arrays
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, unpack
 from loop_method.laws import Affine
@@ -165,8 +165,8 @@ def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
             path = folder / name / controller / str(seed) / CURVE
             try:
                 arrays = read_arrays(path)
-                used = taken(arrays, "rollouts", "f", (None,)) - before
-                costs = field_means(taken(arrays, "costs", "f", (len(used), None)))
+                used = checked_array(arrays, "rollouts", "f", (None,)) - before
+                costs = field_means(checked_array(arrays, "costs", "f", (len(used), None)))
             except ValueError as error:
                 raise RunFolderError(f"{path} cannot be read: {error}") from error
             seeds.append((used, costs / base))
