@@ -9,6 +9,9 @@ import sys
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, command
 
+LAWS = ("adapted", "lqt")
+"""The laws of a run, the first being the default."""
+
 
 def add(commands: Commands) -> None:
     """The command `export`."""
@@ -26,7 +29,10 @@ def add(commands: Commands) -> None:
     add_argument = export.add_argument
     add_argument("folder", type=a_path, metavar="RUN", help="folder of a finished run")
     add_argument("--out", type=a_path, metavar="FILE", help="write the law to this .npz or .c")
-    add_argument("--law", choices=("adapted", "lqt"), help="which law [adapted]")
+    add_argument(
+        "--controller", choices=LAWS, help="the adapted law, or the first one (lqt) [adapted]"
+    )
+    add_argument("--law", choices=LAWS, help=argparse.SUPPRESS)  # its name before
     add_argument("--seed", type=int, metavar="S", help="training seed of the law [the first]")
     add_argument(
         "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
@@ -41,8 +47,11 @@ def _export(options: argparse.Namespace) -> int:
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
     if options.out is None and options.curve is None:
         options.refuse("expected --out FILE for the law, --curve FILE for the curve, or both")
-    if options.out is None and not (options.law is None and options.seed is None):
-        options.refuse("--law and --seed choose a law: give --out FILE, or leave them out")
+    if options.law is not None:
+        print("WARNING: --law of export is called --controller now", file=sys.stderr)
+    which = options.controller or options.law
+    if options.out is None and not (which is None and options.seed is None):
+        options.refuse("--controller and --seed choose a law: give --out FILE, or leave them out")
     for flag, (path, suffixes) in files.items():
         if path is not None and path.suffix.lower() not in suffixes:
             raise ParameterError(
@@ -51,7 +60,7 @@ def _export(options: argparse.Namespace) -> int:
     run = load_run(options.folder)
     contents = {}
     if options.out is not None:
-        law = law_of(run, options.law or "adapted", options.seed)
+        law = law_of(run, which or LAWS[0], options.seed)
         contents[options.out] = law.c() if options.out.suffix.lower() == ".c" else law.npz()
         if run.result.get("controller", {}).get("law") == "not seen":
             print("WARNING: the run's controller was not seen to use this law", file=sys.stderr)

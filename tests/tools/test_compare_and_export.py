@@ -92,7 +92,7 @@ def test_the_law_in_c_is_the_law_of_the_loop(
     runs: dict[str, Path], tmp_path: Path, name: str, law: str, seed: int
 ) -> None:
     run, source, library = load_run(runs[name]), tmp_path / "law.c", tmp_path / "law.so"
-    words = ["--out", str(source), "--law", law, "--seed", str(seed)]
+    words = ["--out", str(source), "--controller", law, "--seed", str(seed)]
     assert main(["export", str(runs[name]), *words]) == 0
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
     built = subprocess.run(
@@ -130,6 +130,19 @@ def test_the_law_in_an_npz_begins_a_training(runs: dict[str, Path], tmp_path: Pa
     assert np.array_equal(load_run(again).warm[0], run.policies[0])
 
 
+def test_the_former_name_of_a_flag_is_understood(
+    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--law is the kind of a law elsewhere."""
+    files = {}
+    for flag in ("--controller", "--law"):
+        files[flag] = tmp_path / f"{flag[2:]}.npz"
+        assert main(["export", str(runs["plain"]), "--out", str(files[flag]), flag, "lqt"]) == 0
+        assert ("called --controller now" in capsys.readouterr().err) == (flag == "--law")
+    old, new = (np.load(path) for path in files.values())
+    assert np.array_equal(old["K_a"], new["K_a"])
+
+
 def test_the_curve_is_that_of_the_history(
     runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,7 +167,7 @@ def test_the_curve_is_that_of_the_history(
         (["--out", "law.npz", "--seed", "9"], FAILED, "no seed 9; expected one from 5 to 6"),
         (["--out", "none/law.c"], FAILED, "cannot write none/law.c: No such file"),
         ([], 2, "expected --out FILE"),
-        (["--curve", "c.csv", "--seed", "5"], 2, "--law and --seed choose a law"),
+        (["--curve", "c.csv", "--seed", "5"], 2, "--controller and --seed choose a law"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(
