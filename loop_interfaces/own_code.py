@@ -168,6 +168,22 @@ FAILURES = Exception, SystemExit
 """Exceptions that count as a failure of the user's own code, calls of exit among them."""
 
 
+def called(name: str, function: Callable[..., Any], *given: Any, module: str = "") -> Any:
+    """What a call of own code returns.
+
+    name: as the sentence has it, Class.method; module: see `located`.
+
+    Raises
+    ------
+    OwnCodeError
+        It fails; one sentence with the line.
+    """
+    try:
+        return function(*given)
+    except FAILURES as error:
+        raise OwnCodeError(f"{name} fails: {located(error, module)}") from error
+
+
 def located(error: BaseException, module: str = "") -> str:
     """An exception in one line, with the last line that ran in one file.
 

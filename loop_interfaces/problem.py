@@ -77,10 +77,10 @@ def load_parameters(
     check_names(given, [spec.name for spec in table()])
     folder = path.resolve().parent if path else Path.cwd()
     for code in ("equation", "plant"):
-        given[code] = _from(folder, str(given.get(code, "")))
+        given[code] = code_from(folder, str(given.get(code, "")))
     for code in ("optimizer", "law"):
         if code in given:
-            given[code] = _from(folder, str(given[code]))
+            given[code] = code_from(folder, str(given[code]))
     given = dict(preferred(given))
     if given["plant"]:
         given.setdefault("problem", _words(given["plant"]))
@@ -146,7 +146,7 @@ def _physical(given: Mapping[str, Any]) -> dict[str, Any]:
     return physical
 
 
-def _from(folder: Path, code: str) -> str:
+def code_from(folder: Path, code: str) -> str:
     """The name of code, with a relative file taken from there."""
     file, colon, name = code.rpartition(":")
     if colon and file.endswith(".py") and not Path(file).is_absolute():

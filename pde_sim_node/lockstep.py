@@ -28,7 +28,6 @@ wait for the plant.
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum, auto
 
 import numpy as np
@@ -39,7 +38,7 @@ from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import signature
 from loop_interfaces.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 from pde_sim_node.plant import Plant
-from pde_sim_node.real_time import RealTimePacer
+from pde_sim_node.real_time import RealTimePacer, Timing
 from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_starts
 
 PAUSED_REPORT = 1.0
@@ -63,16 +62,6 @@ class Phase(Enum):
     """The action that answers the state that was sent."""
     READY = auto()
     """The instant at which the next state, already computed, is to be sent, or the end of a pause."""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Times of messages, never their content; see loop_interfaces.parameters.PLANT."""
-
-    action_timeout: float
-    max_repeats: int
-    run_hold: float
-    real_time_factor: float = 0.0
 
 
 class Lockstep:

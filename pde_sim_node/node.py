@@ -36,9 +36,10 @@ from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import complete
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
-from pde_sim_node.lockstep import Lockstep, Timing
+from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import PHYSICAL, physical_of
+from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord
 
 FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("fast_path") else None

@@ -7,11 +7,22 @@ moves the grid, so that the plant never hurries to make up for lost time.
 """
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
 REMEMBERED = 10_000
 """States whose lateness `quantile` is about, the last ones."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of messages, never their content; see loop_interfaces.parameters.PLANT."""
+
+    action_timeout: float
+    max_repeats: int
+    run_hold: float
+    real_time_factor: float = 0.0
 
 
 class RealTimePacer:

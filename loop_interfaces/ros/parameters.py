@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from loop_interfaces.loop_parameters import nothing_for, of_ros
 from loop_interfaces.parameter_file import ParameterFile
 from loop_interfaces.parameters import table, with_names
-from loop_interfaces.problem import completed
+from loop_interfaces.problem import code_from, completed
 from loop_interfaces.spec import ParameterError, Spec, check_names
 
 UNANSWERED = 1.0
@@ -31,10 +31,17 @@ TOLD = ("actuators",)
 _LARGEST = 1.7976931348623157e308
 
 
+CODE = ("equation", "plant", "optimizer", "law")
+"""Parameters that may name code in a file, which is relative to the parameter file that names it."""
+_FILES = "_pdeloop_parameter_files"
+"""The attribute of a node with the parameter files that it was started with."""
+
+
 def given_parameters(node: Node, package: str) -> dict[str, Any]:
     """The parameters that command line and files give a node, on top of the problem they name.
 
-    ParameterError for unknown names, and for a problem that nobody knows.
+    ParameterError for unknown names, and for a problem that nobody knows. A relative file of user code
+    is that from the folder of the parameter file, as for the commands.
     """
     given = {
         # rcl knows no type of an empty list, and gives it no value.
@@ -42,6 +49,12 @@ def given_parameters(node: Node, package: str) -> dict[str, Any]:
         for name, parameter in node._parameter_overrides.items()
         if not of_ros(name) and name not in TOLD
     }
+    files: Sequence[ParameterFile] = getattr(node, _FILES, ())
+    for file in reversed(files):
+        own = file.of(node.get_fully_qualified_name())
+        for code in CODE:
+            if given.get(code) and own.get(code) == given[code]:
+                given[code] = code_from(file.path.resolve().parent, given[code])
     given = with_names(given)
     check_names(given, [spec.name for spec in table()])
     return completed(given, package)
@@ -50,8 +63,10 @@ def given_parameters(node: Node, package: str) -> dict[str, Any]:
 def require_parameters(node: Node, files: Sequence[ParameterFile]) -> None:
     """ParameterError where parameter files were given that have nothing for this node.
 
-    It would run with its defaults, which are another problem's.
+    It would run with its defaults, which are another problem's. The files are remembered for
+    `given_parameters`.
     """
+    setattr(node, _FILES, files)
     name = node.get_fully_qualified_name()
     if files and all(of_ros(parameter) for file in files for parameter in file.of(name)):
         raise ParameterError(nothing_for(name, files))

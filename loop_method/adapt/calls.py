@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.arrays import float_array
-from loop_interfaces.own_code import FAILURES, OwnCodeError, located
+from loop_interfaces.own_code import OwnCodeError, called
 from loop_method.adapt.base import Optimizer, Rollout, RolloutResult, Row, State
 
 
@@ -59,13 +59,8 @@ def _called(optimizer: Optimizer, method: str, *given: Any) -> Any:
     function: Callable[..., Any] = getattr(optimizer, method)
     if type(optimizer).__module__.startswith("loop_method."):
         return function(*given)
-    try:
-        return function(*given)
-    except FAILURES as error:
-        kind = type(optimizer)
-        raise OwnCodeError(
-            f"{kind.__name__}.{method} fails: {located(error, kind.__module__)}"
-        ) from error
+    kind = type(optimizer)
+    return called(f"{kind.__name__}.{method}", function, *given, module=kind.__module__)
 
 
 def _kinds(asked: Any) -> str:

@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.own_code import FAILURES, OwnCodeError, located
+from loop_interfaces.own_code import OwnCodeError, called
 from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law, Parts
 
@@ -143,7 +143,4 @@ def _numbers(law: Law, method: str, size: int, function: Callable[..., Any], *gi
 
 
 def _called(name: str, method: str, function: Callable[..., Any], *given: Any) -> Any:
-    try:
-        return function(*given)
-    except FAILURES as error:
-        raise OwnCodeError(f"{name}.{method} fails: {located(error)}") from error
+    return called(f"{name}.{method}", function, *given)

@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
-from loop_interfaces.own_code import FAILURES, OwnCodeError, located
+from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
@@ -217,10 +217,7 @@ class DynamicsPlant(BatchPlant):
             self._blas, self._modules = ThreadpoolController(), len(sys.modules)
         function = getattr(self.dynamics, method)
         with self._blas.limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
-            try:
-                return function(*arguments)
-            except FAILURES as error:
-                raise OwnCodeError(f"{self.name}.{method} fails: {located(error)}") from error
+            return called(f"{self.name}.{method}", function, *arguments)
 
     def _numbers(self, method: str, returned: Any, count: int) -> Array:
         """The return value of a method as (count, n_z) numbers."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
-from loop_interfaces.own_code import FAILURES, OwnCodeError, located
+from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.definition import Definition, described, source_of
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.batch import BatchPlant
@@ -142,10 +143,8 @@ class GymnasiumPlant(BatchPlant):
         return self._begin(self._first, seed)
 
     def _begin(self, env: Env[Any, Any], seed: int) -> Array:
-        try:
-            observation, _ = env.reset(seed=0 if seed == MEAN_FIELD else seed)
-        except FAILURES as error:
-            raise OwnCodeError(f"{self._first}.reset fails: {located(error)}") from error
+        own = partial(env.reset, seed=0 if seed == MEAN_FIELD else seed)
+        observation, _ = called(f"{self._first}.reset", own)
         state = self._numbers("reset", observation)
         if not np.isfinite(state).all():
             raise OwnCodeError(f"{self._first}.reset returned NaN or infinity")
@@ -165,10 +164,9 @@ class GymnasiumPlant(BatchPlant):
         np.clip(self.actions, low, high, out=self.actions)
         for m in np.flatnonzero(self.diverged_step < 0):
             action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
-            try:
-                observation, reward, terminated, truncated, _ = self._envs[m].step(action)
-            except FAILURES as error:
-                raise OwnCodeError(f"{self._first}.step fails: {located(error)}") from error
+            observation, reward, terminated, truncated, _ = called(
+                f"{self._first}.step", self._envs[m].step, action
+            )
             if truncated and self.step_index + 1 < self.horizon:
                 raise OwnCodeError(
                     f"{self._first} ends an episode after {self.step_index + 1} steps, and its horizon "

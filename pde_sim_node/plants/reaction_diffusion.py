@@ -216,3 +216,25 @@ class ReactionDiffusion(Dynamics):
     def refined(self) -> Self:
         """With half the internal time step."""
         return type(self)(**{**arguments_of(self), "step_time": self._dt / 2})
+
+
+class OnInterval(ReactionDiffusion):
+    """On an interval; see `ReactionDiffusion`."""
+
+    def __init__(
+        self,
+        points: int,
+        length: float,
+        walls: str,
+        actuators: int,
+        spread: float,
+        step_time: float,
+    ) -> None:
+        super().__init__(
+            points=(points,),
+            lengths=(length,),
+            walls=walls,
+            actuators=(actuators,),
+            spread=spread,
+            step_time=step_time,
+        )

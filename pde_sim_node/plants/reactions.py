@@ -15,12 +15,13 @@ Ginzburg-Landau equation", Rev. Mod. Phys. 74, 2002.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from pde_sim_node.arguments import positive
-from pde_sim_node.plants.reaction_diffusion import ReactionDiffusion
+from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion
 
 
 class Plate(ReactionDiffusion):
@@ -72,13 +73,28 @@ class Plate(ReactionDiffusion):
         return self._r * w - self._b * w**3
 
 
-class GrayScott(ReactionDiffusion):
+class TwoComponents(OnInterval):
+    """Two components u and v on an interval, each with a diffusivity of its own."""
+
+    components = ("u", "v")
+
+    def __init__(self, diffusivities: tuple[float, float], *interval: Any) -> None:
+        named = zip(("diffusivity_u", "diffusivity_v"), diffusivities, strict=True)
+        self._D = [positive(name, value) for name, value in named]
+        super().__init__(*interval)
+
+    @property
+    def diffusion(self) -> Array:
+        """diag(D_u, D_v)."""
+        return np.diag(self._D)
+
+
+class GrayScott(TwoComponents):
     """u_t = D_u u_xx - u v^2 + F (1 - u) + a,  v_t = D_v v_xx + u v^2 - (F + k) v.
 
     Rest is the state (u, v) of the larger v that does not change without diffusion.
     """
 
-    components = ("u", "v")
     horizon, sample_time = 100, 1.0
     state_weight, action_weight = 1.0, 100.0
 
@@ -96,19 +112,13 @@ class GrayScott(ReactionDiffusion):
         step_time: float = 0.5,
     ) -> None:
         self._F, self._k = positive("feed", feed), positive("kill", kill)
-        self._D = positive("diffusivity_u", diffusivity_u), positive("diffusivity_v", diffusivity_v)
         if 4.0 * (feed + kill) ** 2 > feed:
             raise ValueError(
                 f"feed {feed:g} and kill {kill:g} allow no state but u = 1, v = 0: 4 (feed + kill)^2 "
                 "must be at most feed"
             )
         super().__init__(
-            points=(points,),
-            lengths=(length,),
-            walls=walls,
-            actuators=(actuators,),
-            spread=spread,
-            step_time=step_time,
+            (diffusivity_u, diffusivity_v), points, length, walls, actuators, spread, step_time
         )
 
     @property
@@ -118,11 +128,6 @@ class GrayScott(ReactionDiffusion):
         u = 0.5 * (1.0 - float(np.sqrt(1.0 - 4.0 * lost**2 / self._F)))
         return (u, lost / u)
 
-    @property
-    def diffusion(self) -> Array:
-        """diag(D_u, D_v)."""
-        return np.diag(self._D)
-
     def reaction(self, w: Array) -> Array:
         """See the class."""
         u, v = w[:, 0], w[:, 1]
@@ -130,13 +135,12 @@ class GrayScott(ReactionDiffusion):
         return np.stack([self._F * (1.0 - u) - made, made - (self._F + self._k) * v], axis=1)
 
 
-class Brusselator(ReactionDiffusion):
+class Brusselator(TwoComponents):
     """u_t = D_u u_xx + A - (B + 1) u + u^2 v + a,  v_t = D_v v_xx + B u - u^2 v; rest is (A, B/A).
 
     It oscillates for B > 1 + A^2, and has patterns for B > (1 + A sqrt(D_u/D_v))^2.
     """
 
-    components = ("u", "v")
     horizon, sample_time = 100, 0.1
     state_weight, action_weight = 0.1, 0.1
 
@@ -154,25 +158,14 @@ class Brusselator(ReactionDiffusion):
         step_time: float = 0.05,
     ) -> None:
         self._A, self._B = positive("A", A), positive("B", B)
-        self._D = positive("diffusivity_u", diffusivity_u), positive("diffusivity_v", diffusivity_v)
         super().__init__(
-            points=(points,),
-            lengths=(length,),
-            walls=walls,
-            actuators=(actuators,),
-            spread=spread,
-            step_time=step_time,
+            (diffusivity_u, diffusivity_v), points, length, walls, actuators, spread, step_time
         )
 
     @property
     def rest(self) -> Sequence[float]:
         """(A, B/A)."""
         return (self._A, self._B / self._A)
-
-    @property
-    def diffusion(self) -> Array:
-        """diag(D_u, D_v)."""
-        return np.diag(self._D)
 
     def reaction(self, w: Array) -> Array:
         """See the class."""
@@ -181,13 +174,12 @@ class Brusselator(ReactionDiffusion):
         return np.stack([self._A - (self._B + 1.0) * u + made, self._B * u - made], axis=1)
 
 
-class FitzHughNagumo(ReactionDiffusion):
+class FitzHughNagumo(TwoComponents):
     """u_t = D_u u_xx + u - u^3 - v + a,  v_t = D_v v_xx + eps (u - g v).
 
     Rest is 0; it is unstable for g eps < 1.
     """
 
-    components = ("u", "v")
     horizon, sample_time = 100, 0.2
     state_weight, action_weight = 0.1, 0.1
 
@@ -205,14 +197,8 @@ class FitzHughNagumo(ReactionDiffusion):
         step_time: float = 0.05,
     ) -> None:
         self._eps, self._g = positive("epsilon", epsilon), positive("recovery", recovery)
-        self._D = positive("diffusivity_u", diffusivity_u), positive("diffusivity_v", diffusivity_v)
         super().__init__(
-            points=(points,),
-            lengths=(length,),
-            walls=walls,
-            actuators=(actuators,),
-            spread=spread,
-            step_time=step_time,
+            (diffusivity_u, diffusivity_v), points, length, walls, actuators, spread, step_time
         )
 
     @property
@@ -220,18 +206,13 @@ class FitzHughNagumo(ReactionDiffusion):
         """0."""
         return (0.0, 0.0)
 
-    @property
-    def diffusion(self) -> Array:
-        """diag(D_u, D_v)."""
-        return np.diag(self._D)
-
     def reaction(self, w: Array) -> Array:
         """See the class."""
         u, v = w[:, 0], w[:, 1]
         return np.stack([u - u**3 - v, self._eps * (u - self._g * v)], axis=1)
 
 
-class ComplexGinzburgLandau(ReactionDiffusion):
+class ComplexGinzburgLandau(OnInterval):
     """A_t = A + (1 + i alpha) A_xx - (1 + i beta) |A|^2 A + a; the state is Re A, Im A, rest is 0.
 
     Actuators force the real part, and as many the imaginary one, without which not all waves of one
@@ -256,14 +237,7 @@ class ComplexGinzburgLandau(ReactionDiffusion):
         step_time: float = 0.02,
     ) -> None:
         self._alpha, self._beta = alpha, beta
-        super().__init__(
-            points=(points,),
-            lengths=(length,),
-            walls=walls,
-            actuators=(actuators,),
-            spread=spread,
-            step_time=step_time,
-        )
+        super().__init__(points, length, walls, actuators, spread, step_time)
 
     @property
     def rest(self) -> Sequence[float]:

@@ -318,3 +318,34 @@ def test_what_a_plant_tells_of_itself_is_not_taken_from_a_file_of_all_its_parame
     )
     given = given_parameters(node, "pde_sim_node")
     assert "actuators" not in given and given["n_a"] == 3
+
+
+@pytest.mark.parametrize("code", ["equation", "plant"])
+def test_code_of_a_relative_file_is_the_same_for_a_command_and_a_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
+) -> None:
+    """It is next to the file that names it, wherever the command or the node is started."""
+    from loop_interfaces.parameter_file import read_parameter_file
+    from loop_interfaces.ros.parameters import given_parameters, require_parameters
+
+    folder, elsewhere = tmp_path / "lab", tmp_path / "elsewhere"
+    folder.mkdir(), elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    file = folder / "mine.yaml"
+    file.write_text(f"/**:\n  ros__parameters: {{problem: mine, {code}: o.py:Mine, law: l.py:L}}\n")
+    known = read_parameter_file(file)
+
+    def taken(**more: str) -> dict[str, Any]:
+        values = {**known.of("/pde_sim_node"), **more}
+        node: Any = SimpleNamespace(
+            get_fully_qualified_name=lambda: "/pde_sim_node",
+            _parameter_overrides={n: SimpleNamespace(value=v) for n, v in values.items()},
+        )
+        require_parameters(node, [known])
+        return given_parameters(node, "pde_sim_node")
+
+    command, node = load_parameters(str(file), {}), taken()
+    for name, own in ((code, "o.py:Mine"), ("law", "l.py:L")):
+        assert node[name] == command[name] == f"{folder}/{own}"
+    # What the command line of a node says is relative to where that is.
+    assert taken(law="k.py:L")["law"] == "k.py:L"

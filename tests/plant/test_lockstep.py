@@ -12,7 +12,8 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Publication
 from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
-from pde_sim_node.lockstep import Lockstep, Timing
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord, forget
 from pde_sim_node.taken_actions import REMEMBERED
 from tests.support.small import parameters

@@ -20,9 +20,10 @@ from pde_sim_node.instruments import (
     Noise,
     standard_normal,
 )
-from pde_sim_node.lockstep import Lockstep, Timing
+from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Instruments, Plant
 from pde_sim_node.plants import SpectralPlant
+from pde_sim_node.real_time import Timing
 from pdeloop.in_process import LocalPair, train
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training

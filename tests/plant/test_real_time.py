@@ -9,8 +9,8 @@ import pytest
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import STATE
 from pde_sim_node.build import build_plant
-from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.real_time import RealTimePacer
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.real_time import RealTimePacer, Timing
 from tests.support.small import parameters, same_bits
 
 

@@ -35,9 +35,10 @@ from loop_interfaces.topics import (
 )
 from loop_method.adapt.proposer import Proposer
 from pde_sim_node.build import build_plant, complete
-from pde_sim_node.lockstep import Lockstep, Timing
+from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import hand_over
+from pde_sim_node.real_time import Timing
 from tests.simulation.disk import Disk
 from tests.support.plants import Rods
 from tests.support.small import parameters
