@@ -16,7 +16,8 @@ from controller_node.policy import ProjectedLaw
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import FILTERED, ModelRows, pack
 from loop_interfaces.parameters import model_order
-from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
+from loop_interfaces.signature import CONSTANTS
+from loop_interfaces.spec import IDENTIFICATION_SETTINGS
 from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
 from loop_method.reduce import dmdc, regression
@@ -76,10 +77,9 @@ class DesignSettings:
     def of(values: Mapping[str, Any]) -> DesignSettings:
         """Those among the parameters."""
         names = {item.name for item in fields(DesignSettings)} - {"constants"}
-        constants = (IDENTIFICATION_SETTINGS, LAW_SETTINGS)
         return DesignSettings(
             **{name: values[name] for name in names},
-            constants={name: value for name, value in values.items() if name.startswith(constants)},
+            constants={name: value for name, value in values.items() if name.startswith(CONSTANTS)},
         )
 
     @property

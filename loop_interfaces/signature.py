@@ -21,12 +21,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
+
 NOT_SIGNED = 0.0
 """In place of D: the tuner asks for no signature. In place of s: the message carries none."""
 DESIGN = (
     "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
 )  # fmt: skip
 """Parameters that a model depends on besides its episode, and the cost where it is not empty."""
+
+
+CONSTANTS = (IDENTIFICATION_SETTINGS, LAW_SETTINGS)
+"""How the names of parameters begin that are constants of the identification or of a law."""
 
 
 def digest_of(*arrays: ArrayLike) -> int:
@@ -45,12 +51,15 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes.
 
     The name of a law other than the affine one follows, without the file or module that it is in, and
-    the horizon.
+    the horizon; then the constants of the identification and of the law, by their names.
     """
     values = [parameters[name] for name in DESIGN]
     values += ["".join(parameters["cost"])] if parameters.get("cost") else []
     law = parameters.get("law", "affine").rpartition(":")[2]
     values += [law, parameters["horizon"]] if law != "affine" else []
+    constants = parameters.get("constants", parameters)
+    names = sorted(name for name in constants if name.startswith(CONSTANTS))
+    values += [f"{name}={constants[name]}" for name in names]
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
 
 

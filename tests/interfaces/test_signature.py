@@ -321,10 +321,19 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
     other = "dmdc" if name == "identification" else known[name] + 1
     assert design_digest(known | {name: other}) != design_digest(known)
-    # An action has the first of these, D the second, the third counts where it is not empty, and the
-    # last two with another law than the affine one.
-    assert {*DESIGN, "n_a", "action_limit", "cost", "law", "horizon"} == {*known}
+    # An action has the first of these, D the second, the third and the fourth count where they are not
+    # empty, and the last two with another law than the affine one.
+    assert {*DESIGN, "n_a", "action_limit", "cost", "constants", "law", "horizon"} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
+
+
+@pytest.mark.parametrize("name", ["identification_settings.energy", "law_settings.gain"])
+def test_a_model_that_is_identified_with_other_constants_has_another_signature(name):
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    digests = {design_digest(known | {"constants": {name: value}}) for value in (0.25, 0.5)}
+    assert len(digests | {design_digest(known)}) == 3
+    values = {n: v for n, v in known.items() if n != "constants"}  # as the tuner has them
+    assert design_digest(values | {name: 0.25, "run": 7}) in digests
 
 
 def test_a_model_for_another_law_has_another_signature_and_the_affine_one_that_without_a_name():
