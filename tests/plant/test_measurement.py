@@ -349,6 +349,7 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
         "sensor_delays": 3,
         "optimizer": optimizer,
         "rollouts": 13,
+        "horizon": 10,
     }
     both = train_here(parameters(seeds=2, **options), max_batch=3)
     alone = train_here(parameters(seed=1, **options))
