@@ -37,6 +37,7 @@ PROGRAMS = {
     "published": "tasks that others have published figures for, side by side",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
+    "estimator": "what an estimator with the true plant reaches with few sensors and noise",
     "linearised": "what the LQR law of the exact linearisation at the target costs",
     "environments": "steps a second of the Gymnasium environments",
     "participants": "memory and processor time of many idle nodes that know each other",

@@ -107,7 +107,7 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
         law = law_kind(values["law"], values)
     except ValueError as error:
         raise ParameterError(str(error)) from error
-    if kind.needs_affine_law and law is not Affine:
+    if kind.needs_affine_law and law is not Affine and law.name not in kind.also_improves:
         raise ParameterError(
             f"the optimizer '{values['optimizer']}' improves the gains of the law 'affine' alone, and "
             f"the law is '{values['law']}'; take an optimizer that knows no law, such as two_point"
@@ -132,7 +132,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     chosen = settings_of(kind, values)
     # One at every point measures the whole state.
     sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
-    if sensors and kind.with_sensors:
+    if sensors and kind.with_sensors and values["law"] not in kind.also_improves:
         kind = kind_of({"optimizer": kind.with_sensors})
         chosen = kind.Settings()
 
@@ -141,7 +141,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
-        if not kind.needs_affine_law:  # for which theta is a vector, whatever the law is
+        if not kind.needs_affine_law or law is not Affine:  # theta is a vector
             policy = policy.ravel()
             if context is not None:
                 measured = [replace(r, policy=r.policy.ravel()) for r in context.measured]
@@ -154,7 +154,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
             return InCoordinates(made, context)
         return made(context)
 
-    explorations = 1 if sensors else kind.explorations
+    explorations = 1 if sensors and law is Affine else kind.explorations
     if kind.judges_first_law or (sensors and kind.compares_first_law):
         values = {**values, "identification_attempts": 1}
     step = kind.first_step(chosen)

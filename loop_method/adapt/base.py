@@ -199,6 +199,8 @@ class Optimizer(Protocol):
     """Whether results have to come with their trajectories."""
     needs_affine_law: ClassVar[bool] = False
     """Whether it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
+    also_improves: ClassVar[tuple[str, ...]] = ()
+    """Names of other laws that it improves, whose theta it is given as a vector."""
     compares_first_law: ClassVar[bool] = False
     """Whether it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.observed_loop import ObservedLoop
+from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.prediction import pieces
 
@@ -22,17 +25,18 @@ class Belief:
 
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""
-        return ClosedLoop(
+        problem = (
             context.U,
             context.target,
             context.state_weight,
             context.action_weight,
             context.horizon,
             context.action_limit,
-            model=self.model,
-            noise=context.noise,
-            cost=context.cost,
         )
+        on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
+        if isinstance(context.law, Observer):
+            return ObservedLoop(*problem, **on, law=context.law)
+        return ClosedLoop(*problem, **on)
 
 
 def believe(
@@ -68,9 +72,9 @@ def believe(
 
 
 def _measured(context: Context, record: Record) -> Measured:
-    """With the law, where the rollout was under one whose states are known without noise."""
+    """With the law, where the rollout was under one without memory and noise."""
     explored = not record.policy.any()  # of no control too the actions say everything
-    if explored or context.noise:
+    if explored or context.noise or isinstance(context.law, Observer):
         return Measured(record.states, record.actions)
     n_s = context.U.shape[1]
     K = record.policy[:, :n_s] @ context.U.T

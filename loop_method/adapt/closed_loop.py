@@ -162,6 +162,20 @@ class ClosedLoop(ClosedLoopProblem):
         costs[~finite] = np.inf
         return Simulation(states, actions, costs)
 
+    @property
+    def no_control(self) -> Array:
+        """Theta of a = 0."""
+        return np.zeros((self.model.n_a, self.U.shape[1] + 1))
+
+    def features(self, simulation: Simulation) -> Array:
+        """What the law was of in a simulation, [s_k; 1], (T, F, n_s + 1)."""
+        s = simulation.states[:-1] @ self.U
+        return np.concatenate([s, np.full((*s.shape[:2], 1), self.constant_feature)], axis=2)
+
+    def curvature(self, own: Array) -> Array:
+        """What a change of the law's outputs costs, from that of an action, (n_a, n_a)."""
+        return own
+
     def costs(self, theta: Array, fields: Array) -> Array:
         """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
         return self.simulate(theta, fields).costs

@@ -114,8 +114,7 @@ def improve(
     else:
         return None
     fields, weights = fields[finite], weights[finite] / weights[finite].sum()
-    s = simulation.states[:-1, finite] @ loop.U
-    features = np.concatenate([s, np.full((*s.shape[:2], 1), loop.constant_feature)], axis=2)
+    features = loop.features(simulation)[:, finite]
     moment = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
     size = float(np.trace(moment[:-1, :-1])) / (len(moment) - 1)
     if not (size > 0.0 and np.isfinite(moment).all()):
@@ -200,5 +199,5 @@ def curvature_of(loop: ClosedLoop) -> Array:
                 found = np.full((n_a, n_a), np.nan)
             found = 0.5 * (found + found.T)
             if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
-                return found
-    return r * np.eye(n_a)
+                return loop.curvature(found)
+    return loop.curvature(r * np.eye(n_a))

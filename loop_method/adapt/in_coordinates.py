@@ -31,6 +31,8 @@ from loop_method.adapt.base import (
     Trajectory,
 )
 from loop_method.adapt.trajectories import LowRankTrajectory
+from loop_method.laws.base import Law
+from loop_method.laws.observer import Observer
 from loop_method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
 
 _ROWS, _OWN = "basis", "own."
@@ -65,9 +67,16 @@ class InCoordinates(Optimizer):
             periodic=False,
             line=False,
             cost=context.cost and CostInCoordinates(context.cost, self.basis),
-            law=None,
+            law=self._observer(context),
         )
         self._own = make(own)
+
+    def _observer(self, context: Context) -> Law | None:
+        """The law of the coordinates, where it is the observer."""
+        if not isinstance(context.law, Observer):
+            return None
+        U = self.basis.coordinates(context.U.T).T
+        return Observer(replace(context.law.model, U=U), context.law.horizon)
 
     @classmethod
     def first_step(cls, settings: Any) -> int:

@@ -63,7 +63,7 @@ def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
     """Whether the plant is chaotic, as far as a model of it says: whether small changes grow."""
     if len(fields) < 2:
         return False
-    none = np.zeros((loop.model.n_a, loop.U.shape[1] + 1))
+    none = loop.no_control
     still = replace(loop, noise=0.0)
     before = still.costs(none, fields)
     after = still.costs(none, fields + _MOVED * (np.roll(fields, 1, axis=0) - fields))

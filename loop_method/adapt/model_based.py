@@ -32,6 +32,7 @@ from loop_method.adapt.base import (
     Row,
     State,
     checked_policy,
+    checked_theta,
     require_positive,
     require_results,
 )
@@ -44,6 +45,7 @@ from loop_method.adapt.renewal import renew
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, denoised
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
+from loop_method.laws.observer import Observer
 from loop_method.models.files import model_of
 from loop_method.seeds import field_seed
 
@@ -62,8 +64,8 @@ class ModelBased(Optimizer):
 
     Parameters
     ----------
-    policy0 : (n_a, 2 n_s) array
-        Where to start, [K_a K_b]; the first law.
+    policy0 : (n_a, 2 n_s) or (size,) array
+        Where to start, [K_a K_b] or the vector of a law with an observer; the first law.
     seed : int
         Determines the initial fields.
     rollouts : int
@@ -79,6 +81,7 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
+    also_improves = ("observer",)
     in_coordinates = True
     judges_first_law = True
     explorations = 2
@@ -99,7 +102,8 @@ class ModelBased(Optimizer):
             raise ValueError("this optimiser needs the context: trajectories were not asked for")
         self._settings = settings or ModelBasedSettings()
         self._context, self._seed, self._budget = context, seed, rollouts
-        self._first = checked_policy(policy0)
+        observed = isinstance(context.law, Observer)
+        self._first = checked_theta(policy0) if observed else checked_policy(policy0)
         self._none = np.zeros_like(self._first)
         self._before = [
             *(
@@ -258,9 +262,11 @@ class ModelBased(Optimizer):
             row["model"], row["mismatch"] = belief.model.kind, belief.error
         if belief is None or not belief.error <= most:
             reason = "no model of the whole field predicts the rollouts"
-            if self._belief is None and self._context.cost is not None:
+            unknown = "its cost" if self._context.cost is not None else ""
+            unknown = "its law" if isinstance(self._context.law, Observer) else unknown
+            if self._belief is None and unknown:
                 self._end(
-                    row, f"{reason}, and local steps do not know its cost: the first law stays"
+                    row, f"{reason}, and local steps do not know {unknown}: the first law stays"
                 )
                 return
             if self._belief is None:
@@ -390,7 +396,7 @@ class ModelBased(Optimizer):
         stage = str(checked_array(state, "stage", "U", ()))
         if stage not in _STAGES:
             raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
-        self._records.restore(state, n_z, shape)
+        self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
         self._stage, self._tells = stage, int(checked_array(state, "tells", "i", ()))
         self._policy = checked_array(state, "policy", "f", shape).copy()
         self._held_out = checked_array(state, "held_out", "f", (3,), finite=False).copy()
@@ -399,9 +405,8 @@ class ModelBased(Optimizer):
         self._safe = bool(checked_array(state, "safe", "b", ()))
         self._improved, self._parts = None, []
         if "laws" in state:
-            theta = (shape[0], shape[1] // 2 + 1)
             self._improved, *self._parts = (
-                a.copy() for a in checked_array(state, "laws", "f", (None, *theta))
+                a.copy() for a in checked_array(state, "laws", "f", (None, None, None))
             )
         self._belief = None
         if "error" in state:

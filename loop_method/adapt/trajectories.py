@@ -137,16 +137,20 @@ class Records:
             arrays |= record_arrays(f"record{record.stamp}", record)
         return arrays
 
-    def restore(self, arrays: Arrays, n_z: int, shape: tuple[int, int]) -> None:
-        """Remember what a `state` does; a ValueError if it is none. shape: of the policies."""
+    def restore(
+        self, arrays: Arrays, n_z: int, shape: tuple[int, ...], n_a: int | None = None
+    ) -> None:
+        """Remember what a `state` does; a ValueError if it is none.
+
+        shape: of the policies, whose rows are as many as actuators if n_a does not say how many.
+        """
+        n_a = shape[0] if n_a is None else n_a
         count, limit = (
             checked_array(arrays, "count", "i", ()),
             checked_array(arrays, "limit", "f", ()),
         )
         stamps = checked_array(arrays, "stamps", "i", (None,)).tolist()
-        self._records = {
-            s: taken_record(arrays, f"record{s}", n_z, shape[0], shape, s) for s in stamps
-        }
+        self._records = {s: taken_record(arrays, f"record{s}", n_z, n_a, shape, s) for s in stamps}
         self.count, self._limit = int(count), float(limit)
 
     def validated_samples(self, result: RolloutResult) -> tuple[Array, Array]:

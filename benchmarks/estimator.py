@@ -1,0 +1,222 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks estimator`: what an estimator that knows the plant reaches with few readings.
+
+A law of the whole field acts on the estimate of an extended Kalman filter that has the true plant and
+the distribution of initial fields. What is lost against the law on the field itself is the price of the
+sensors and of their noise, and no model's. Costs are those of a closing evaluation.
+
+The law is the best affine one by exact gradients: without noise (`benchmarks.optimum`), whose gains in
+directions that no field takes are anything, or with some noise on what it sees; of these the one that
+costs least with the estimator on other fields.
+
+As the plant has no process noise, errors stay in the directions that the initial ones have: the filter
+carries x and S with the covariance S S^T, and
+
+    S <- S D^{-1/2},  x <- x + S S^T H^T (y - H x) / sigma^2,   D = I + S^T H^T H S / sigma^2
+
+at a reading y = H x + noise, and x <- f(x, a), S <- (df/dx) S, by differences, at a step.
+
+References
+----------
+Anderson, Moore, "Optimal Filtering", 1979, section 8.2 (extended Kalman filter). Pham, Verron, Roubaud,
+"A singular evolutive extended Kalman filter for data assimilation in oceanography", J. Marine Systems
+16, 1998 (a covariance of low rank).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+from threadpoolctl import threadpool_limits
+
+from benchmarks.optimum import TRAINING_SEED, evaluation_seeds, optimise_law
+from loop_interfaces.arrays import Array
+from loop_interfaces.problem import load_parameters
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.models.base import linearised
+from pde_sim_node.build import build_plant
+from pde_sim_node.instruments import InstrumentedPlant
+from pde_sim_node.plant import Plant
+from pdeloop.episode import Law, rollout
+
+__all__ = ["run", "text"]
+
+SAMPLES = 400
+"""Initial fields that their mean and covariance are taken from."""
+KEPT = 1.0 - 1e-6
+"""Share of their variance whose directions the filter carries."""
+LEAST_NOISE = 1e-3
+"""Standard deviation of a reading that the filter assumes at least."""
+INFLATION = 1.01
+"""Factor of S in a step: what the linearisation forgets."""
+FIELDS = 10
+"""Held-out fields, and as many on which the law is chosen."""
+SEEN_NOISE = (0.0, 0.05, 0.2)
+"""Standard deviations of the noise on each number of U^T z under which a law is optimised."""
+DIFFERENCE = 1e-4
+"""Step of the differences along the columns of S, relative to them."""
+
+
+class ExtendedKalmanLaw:
+    """A law of the whole field on the estimate of the extended Kalman filter above.
+
+    sensed: the plant that is controlled; true: the same without instruments; law: a_k of fields
+    (M, n_z); initial: fields of the distribution, (n, n_z).
+    """
+
+    def __init__(self, sensed: InstrumentedPlant, true: Plant, law: Law, initial: Array) -> None:
+        self._true, self._law = true, law
+        self._positions = sensed.positions
+        self._scale = np.sqrt(true.n_z / sensed.state_size)
+        self._sigma = max(sensed.instruments.measurement_noise, LEAST_NOISE)
+        self._mean = initial.mean(axis=0)
+        deviations = (initial - self._mean) / np.sqrt(len(initial) - 1)
+        _, values, rows = linalg.svd(deviations, full_matrices=False)
+        share = np.cumsum(values**2) / np.sum(values**2)
+        kept = int(np.searchsorted(share, KEPT)) + 1
+        self._factor = rows[:kept] * values[:kept, None]
+
+    def __call__(self, k: int, states: Array) -> Array:
+        count, positions = len(states), self._positions
+        if k == 0:
+            self._x = np.tile(self._mean, (count, 1))
+            self._S = np.tile(self._factor, (count, 1, 1))  # columns of S as rows
+        y = states[:, : positions.size] / self._scale
+        for m in range(count):
+            H = self._S[m][:, positions] / self._sigma
+            values, vectors = linalg.eigh(np.eye(len(H)) + H @ H.T)
+            missed = H @ (y[m] - self._x[m, positions]) / self._sigma
+            self._x[m] += (vectors @ ((vectors.T @ missed) / values)) @ self._S[m]
+            self._S[m] = (vectors / np.sqrt(values)) @ vectors.T @ self._S[m]
+        actions = self._law(k, self._x)
+        r = self._S.shape[1]
+        moved = self._x[:, None] + DIFFERENCE * self._S
+        every = np.concatenate([self._x, moved.reshape(count * r, -1)])
+        held = np.concatenate([actions, np.repeat(actions, r, axis=0)])
+        after, _ = self._true.evaluate(every, held)
+        self._x = after[:count].copy()
+        self._S = INFLATION * (after[count:].reshape(self._S.shape) - self._x[:, None]) / DIFFERENCE
+        return actions
+
+
+def run(
+    problems: Sequence[str] = ("burgers", "allen-cahn", "kdv"),
+    *,
+    sensors: Sequence[int] = (8, 16),
+    noise: Sequence[float] = (0.0, 0.03, 0.1),
+    seed: int = 0,
+    fields: int = 24,
+    evaluation: int = 0,
+) -> list[dict[str, Any]]:
+    """What the estimator with the true plant reaches.
+
+    Parameters
+    ----------
+    problems
+        Names, or files.
+    sensors
+        How many there are.
+    noise
+        Standard deviations of a reading.
+    seed
+        Of the training whose modes the law of the whole field has.
+    fields
+        Initial fields that this law is optimised on.
+    evaluation
+        Seed of the ten held-out fields.
+    """
+    rows = []
+    seeds, others = evaluation_seeds(evaluation, FIELDS), evaluation_seeds(TRAINING_SEED, FIELDS)
+    # Laws on the way to a better one may overflow.
+    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+        for problem in problems:
+            true, candidates, known = _whole(problem, seed, fields, seeds)
+            drawn = evaluation_seeds(TRAINING_SEED, SAMPLES)
+            initial = true.reset(np.array(drawn)).copy()
+            for count in sensors:
+                for sigma in noise:
+                    given = {"sensors": count, "measurement_noise": sigma}
+                    sensed = build_plant(load_parameters(problem, given))
+                    assert isinstance(sensed, InstrumentedPlant)
+                    laws = [ExtendedKalmanLaw(sensed, true, law, initial) for law in candidates]
+                    tuned = [_cost(sensed, law, others) for law in laws]
+                    cost = _cost(sensed, laws[int(np.argmin(tuned))], seeds)
+                    rows.append({**known, "sensors": count, "noise": sigma, "estimator": cost})
+    return rows
+
+
+class TrueModel:
+    """The plant itself as a model of the field (`loop_method.models.FieldModel`)."""
+
+    kind = "true"
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant, self._adjoint = plant, plant.adjoint()
+        self.n_z, self.n_a = plant.n_z, plant.n_a
+
+    def step(self, states: Array, actions: Array) -> Array:
+        return self._plant.evaluate(states, actions)[0]
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        return self._adjoint.pull_back(states, actions, covectors)
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        return linearised(self, state, action)
+
+    def arrays(self) -> dict[str, Any]:
+        return {}
+
+
+def _whole(
+    problem: str, seed: int, fields: int, seeds: Sequence[int]
+) -> tuple[Plant, list[Law], dict[str, Any]]:
+    """The plant, laws of the whole field, and their costs on held-out fields."""
+    found = optimise_law(problem, seed, fields=fields, evaluations={0: seeds}, tolerance=1e-3)
+    _, (U, theta), costs = found
+    true = build_plant(load_parameters(problem, {}))
+    initial = true.reset(np.array(evaluation_seeds(TRAINING_SEED, fields))).copy()
+    laws: list[Law] = []
+    for noise in SEEN_NOISE:
+        loop = ClosedLoop(
+            U,
+            true.target,
+            true.state_weight,
+            true.action_weight,
+            true.horizon,
+            model=TrueModel(true),
+            noise=noise,
+        )
+        if noise:
+            every = np.full(fields, 1.0 / fields)
+            better = improve(loop, theta, initial, every, curvature_of(loop), ModelBasedSettings())
+            theta = theta if better is None else better.theta
+        laws.append(partial(_affine, K=theta[:, :-1] @ U.T, b=loop.constant_feature * theta[:, -1]))
+    none = partial(_affine, K=np.zeros((true.n_a, true.n_z)), b=np.zeros(true.n_a))
+    whole = float(np.mean(costs["optimum"][0]))
+    return true, laws, {"problem": problem, "none": _cost(true, none, seeds), "whole": whole}
+
+
+def _affine(k: int, z: Array, *, K: Array, b: Array) -> Array:
+    a: Array = z @ K.T + b
+    return a
+
+
+def _cost(plant: Plant, law: Law, seeds: Sequence[int]) -> float:
+    return float(rollout(plant, law, seeds, keep=False).costs.mean.mean())
+
+
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A line for each case."""
+    lines = ["problem               sensors  noise  no control  whole field  estimator"]
+    lines += [
+        f"{row['problem']:20}  {row['sensors']:7}  {row['noise']:5.2f}  {row['none']:10.4g}  "
+        f"{row['whole']:11.4g}  {row['estimator']:9.4g}"
+        for row in rows
+    ]
+    return "\n".join(lines)
