@@ -122,17 +122,17 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
         seeds = max(len(problem.first.seeds) for problem in learned)
         over_lqt = all(curve.over_lqt for problem in learned for curve in problem.curves)
         what = (
-            "divided by the cost of LQT, of both on the fields of the closing evaluation"
+            "Mean stage cost divided by that of LQT, both on the fields of the closing evaluation."
             if over_lqt
-            else "on the training's own fields, which change during the training, so no cost on other "
-            "fields, LQT's among them, compares with it; the table compares all on the same fields"
+            else "Mean stage cost of the training's own rollouts. Their initial fields change on the "
+            "way: compare controllers in the table, where all meet the same fields."
         )
         over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)
         yield (
             "training-curves",
             "Cost while learning",
-            "Mean stage cost against the rollouts of the adaptation, which exploration and check "
-            f"precede, {what}.{over} Lower is better.",
+            f"{what} Exploration and check of the first law come before these rollouts.{over} Lower is "
+            "better.",
             learning.training_curves(learned),
         )
     yield (
