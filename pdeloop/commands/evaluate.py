@@ -41,7 +41,11 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the mean of the initial distribution instead of sampled fields",
     )
-    add_set(evaluate, "evaluate under another value of a parameter of the plant or the cost")
+    add_set(
+        evaluate,
+        "evaluate under another value of a parameter of the plant or the cost",
+        trains=False,
+    )
     add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 

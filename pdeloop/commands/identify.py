@@ -26,8 +26,8 @@ def add(commands: Commands) -> None:
         help="reduced model from recorded episodes or your own measurements",
         description="Identify a reduced model by least squares in reduced coordinates, design "
         "LQ-tracking gains, and show which order the data support: singular values, and errors on "
-        "held-out steps. From the exploratory episodes of a bag (all episodes if none is), of this "
-        "plant or a foreign one, or from measurements in a file.",
+        "held-out steps. The data are the exploratory episodes of a bag (all of its episodes if "
+        "none explores), whatever plant it is of, or measurements in a file.",
         example="pdeloop identify --data examples/measurements.csv --out model.npz",
     )
     source = identify.add_mutually_exclusive_group(required=True)

@@ -25,16 +25,20 @@ OWN_FLAGS = {
 """Parameters that follow from a flag of the command, or are not a training's."""
 
 
-def add_set(parser: argparse._ActionsContainer, what: str = "any parameter") -> None:
-    """The flag --set, which may be given several times."""
+def add_set(
+    parser: argparse._ActionsContainer, what: str = "any parameter", *, trains: bool = True
+) -> None:
+    """The flag --set, which may be given several times. trains: whether methods have a say."""
+    methods = (
+        "; optimizer_settings.NAME, law_settings.NAME and identification_settings.NAME of a method"
+    )
     action = parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME of the equation, and "
-        "optimizer_settings.NAME, law_settings.NAME and identification_settings.NAME of the methods; "
-        "may be repeated",
+        help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME of the equation"
+        f"{methods if trains else ''}; may be repeated",
     )
 
     def complete(prefix: str, **_: object) -> list[str]:
