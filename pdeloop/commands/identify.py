@@ -67,8 +67,9 @@ def add(commands: Commands) -> None:
     add(
         "--identification",
         choices=IDENTIFICATION.choices,
-        help="a model of the whole field where its law is better, least squares with the inputs whole, "
-        "or truncated DMDc [that of the run, or regression]",
+        help="field: a model of the whole field where its law is better; regression: least squares "
+        "with the inputs whole; subspace: a model with its filter, from measurements alone; dmdc: "
+        "truncated DMDc [that of the run, or regression]",
     )
     add(
         "--law",

@@ -29,9 +29,7 @@ def add_set(
     parser: argparse._ActionsContainer, what: str = "any parameter", *, trains: bool = True
 ) -> None:
     """The flag --set, which may be given several times. trains: whether methods have a say."""
-    methods = (
-        "; optimizer_settings.NAME, law_settings.NAME and identification_settings.NAME of a method"
-    )
+    methods = "; {}NAME, {}NAME and {}NAME of a method".format(*SETTINGS)
     action = parser.add_argument(
         "--set",
         action="append",
