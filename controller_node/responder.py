@@ -9,9 +9,8 @@ if it missed some, it says so and the episode is run again.
 """
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -20,11 +19,15 @@ from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.run_state import (
+    MAX_RUNS,
     Answering,
     EpisodeInputs,
     Models,
     RunState,
+    contradict,
+    differ,
     digest_of_start,
+    forget,
 )
 from loop_interfaces import model_rows
 from loop_interfaces.episodes import episode_name
@@ -42,9 +45,6 @@ from loop_interfaces.topics import (
 from loop_method.laws.calls import laws_of
 from loop_method.laws.registry import law_kind
 
-MAX_RUNS = 8
-"""Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
-that was answered last, whatever else comes in."""
 MAX_BYTES = 2**29
 """Bytes that are kept of all runs together, and half as many of targets. Less recently used ones are
 dropped for a newer one; a run that has no room alone is refused, and an exploratory episode without
@@ -100,7 +100,7 @@ class Responder:
         """Take the target z_r of a plant, (n_z,)."""
         targets = self._targets
         targets[frame.plant] = frame.values.copy()
-        _forget(
+        forget(
             targets,
             frame.plant,
             self._served[1],
@@ -132,7 +132,7 @@ class Responder:
             explores = rows[0, StartColumn.EXCITATION] >= 0
             run.exploration = Exploration(run.start, self._settings) if explores else None
             self.failure = ""
-        elif _differ(known, frame):
+        elif differ(known, frame):
             reason = f"two different starts came for episode {episode_name(frame.episode)}"
             return [ModelFailure(frame.run, frame.episode, True, f"{reason}; expected one tuner")]
         elif run.exploration and run.exploration.outcomes:
@@ -204,7 +204,7 @@ class Responder:
         taken_back: list[ModelFailure] = []
         if answering is None:
             waiting, self._pending = self._pending, None
-            if waiting is not None and _contradict(waiting, frame):  # the plant repeats its own
+            if waiting is not None and contradict(waiting, frame):  # the plant repeats its own
                 self.counters["different states of one step"] += 1
                 return []
             self._pending = replace(frame, values=frame.values.copy())
@@ -299,7 +299,7 @@ class Responder:
     def _run(self, number: int, more: int) -> RunState:
         """The record of a run, with room for `more` bytes. FrameError if there is none."""
         run = self._runs.setdefault(number, RunState())
-        _forget(self._runs, number, self._served[0])
+        forget(self._runs, number, self._served[0])
         if not self._has_room(number, more):
             raise FrameError(f"expected less than {MAX_BYTES} bytes of all runs together")
         return run
@@ -381,27 +381,3 @@ class Responder:
 
     def _answer_pending(self) -> list[Publication | ModelFailure]:
         return self.state(self._pending) if self._pending is not None else []
-
-
-def _forget(
-    known: OrderedDict[int, Any],
-    newest: int,
-    protected: int,
-    full: Callable[[], bool] = lambda: False,
-) -> None:
-    """Keep `newest`, `protected`, and the most recently used others: MAX_RUNS, or less while full."""
-    known.move_to_end(newest)
-    others = [key for key in known if key not in (newest, protected)]
-    while others and (len(known) > MAX_RUNS or full()):
-        del known[others.pop(0)]
-
-
-def _differ(a: Frame, b: Frame) -> bool:
-    """Whether two starts of an episode say different things."""
-    return (a.plant, a.step) != (b.plant, b.step) or not np.array_equal(a.values, b.values)
-
-
-def _contradict(a: Frame, b: Frame) -> bool:
-    """Whether two states of one step are not the same."""
-    same = (a.run, a.plant, a.episode, a.step) == (b.run, b.plant, b.episode, b.step)
-    return same and not np.array_equal(a.values, b.values)

@@ -1,9 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Per-run state of the controller: messages received, and the law in use. Pure."""
 
-from collections import deque
+from collections import OrderedDict, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
+
+import numpy as np
 
 from controller_node.exploration import Exploration
 from controller_node.law_batch import LawBatch
@@ -11,6 +14,9 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.signature import digest_of
 from loop_method.laws.base import Law
 
+MAX_RUNS = 8
+"""Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
+that was answered last, whatever else comes in."""
 MAX_KEPT = 4
 """Policies, sets of reduced models, and laws kept per run: room for a stranger's besides its own."""
 
@@ -123,3 +129,27 @@ def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_limit: fl
         policy, models = inputs
         published += [policy.values, models.digest]
     return digest_of(*published)
+
+
+def forget(
+    known: OrderedDict[int, Any],
+    newest: int,
+    protected: int,
+    full: Callable[[], bool] = lambda: False,
+) -> None:
+    """Keep `newest`, `protected`, and the most recently used others: MAX_RUNS, or less while full."""
+    known.move_to_end(newest)
+    others = [key for key in known if key not in (newest, protected)]
+    while others and (len(known) > MAX_RUNS or full()):
+        del known[others.pop(0)]
+
+
+def differ(a: Frame, b: Frame) -> bool:
+    """Whether two starts of an episode contradict each other."""
+    return (a.plant, a.step) != (b.plant, b.step) or not np.array_equal(a.values, b.values)
+
+
+def contradict(a: Frame, b: Frame) -> bool:
+    """Whether two states of one step differ."""
+    same = (a.run, a.plant, a.episode, a.step) == (b.run, b.plant, b.episode, b.step)
+    return same and not np.array_equal(a.values, b.values)
