@@ -115,7 +115,7 @@ class Responder:
 
         A repeated one is answered with the result of an exploration; one of an earlier episode is
         ignored. Another one for the same episode asks for a new one, as the plant may have taken
-        either. FrameError for rows that are none of a start, and where there is no room for another
+        either. FrameError for rows that do not fit a start, and where there is no room for another
         run.
         """
         rows = start_rows(frame)

@@ -95,7 +95,7 @@ def _yaml_problem(error: yaml.YAMLError) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. ValueError if it is none, too deep or too large.
+    """The content of a JSON text. ValueError if it is malformed, too deep or too large.
 
     Too large: a number of more than 64 bits, or more than MAX_JSON_CONTAINERS objects and lists.
 

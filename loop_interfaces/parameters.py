@@ -260,7 +260,7 @@ RECORDER = _section(
     "R",
     Spec("bag", "").means("new folder for the bag; empty: bags/TIME"),
     Spec("state_every", 1, 1, 65536).means(
-        "every so many steps of an episode its states are recorded, from the first on; 1: always"
+        "interval in steps at which an episode's states are recorded, from the first; 1: every step"
     ),
 )
 

@@ -29,7 +29,7 @@ from loop_interfaces.text import shown
 def config_folder() -> Path:
     """The folder of the shipped configuration.
 
-    Beside the sources, or PREFIX/share/pdeloop/config of an installation under PREFIX: a virtual
+    Next to the sources, or PREFIX/share/pdeloop/config of an installation under PREFIX: a virtual
     environment, or the install folder of a colcon workspace, which Python does not know as a prefix.
     """
     here = Path(__file__).resolve()

@@ -299,7 +299,7 @@ class Lockstep:
     def tick(self, now: float) -> list[Publication]:
         """Do what is due: send the state that is ready, or again; give the episode up.
 
-        With a pace, call it once right after `action`, too, so that a state which is ready too late is
+        With a pace, also call it once right after `action`, so that a state which is ready too late is
         distinguished from one that is sent too late.
         """
         if self._phase is Phase.READY and self.pacer and not self.paused and self.pacer.ready(now):

@@ -152,7 +152,7 @@ def problem(
     parameters
         Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
         one's own ('file.py:Class') is run if it is named here as `equation`, `optimizer` or `law`,
-        which may be a class derived from `Law`, too.
+        which may also be a class derived from `Law`.
 
     Returns
     -------

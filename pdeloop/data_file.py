@@ -279,6 +279,6 @@ def _numbered(count: int) -> list[dict[str, int | str]]:
 
 
 def _check_count(trajectories: int) -> None:
-    """ValueError for so many trajectories that their overhead exceeds their data."""
+    """ValueError for more trajectories than MAX_TRAJECTORIES."""
     if trajectories > MAX_TRAJECTORIES:
         raise ValueError(f"expected at most {MAX_TRAJECTORIES} trajectories, got {trajectories}")

@@ -19,7 +19,7 @@ class Interruption(BaseException):
 def interruptible(continue_with: str, *, at_once: bool = True) -> Iterator[Callable[[], None]]:
     """SIGINT, SIGTERM and SIGHUP raise Interruption within the block, once.
 
-    Yields a function to be called now and then, which raises it, too: an exception that comes in the
+    Yields a function to be called now and then, which also raises it: an exception that comes in the
     middle of a finalizer or a callback of some library is lost. at_once: without it only that function
     raises it, so that nothing else is left half done. What leaves the block says which command
     continues the work.

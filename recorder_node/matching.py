@@ -15,7 +15,7 @@ class Matching:
     """The answers of the loop's nodes: that they have discovered us, and their parameters.
 
     required: full names of topics that somebody must publish; others: whose publishers, if there
-    are any, are asked, too.
+    are any, are also asked.
     """
 
     def __init__(self, peers: Peers, required: list[str], others: list[str]) -> None:

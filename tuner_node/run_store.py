@@ -118,7 +118,7 @@ def open_run(
     """Begin the run in the folder `out` of the tuner's parameters, or continue it (`resume`).
 
     locks: the folder is locked until it is closed, before anything in it is looked at or written, as
-    somebody else may begin a run in it, too. Without a folder nothing is written.
+    somebody else may also begin a run in it. Without a folder nothing is written.
     """
     if not values["out"]:
         return None, RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)

@@ -212,7 +212,7 @@ class LoopView:
         nobody = not any(node.present for node in self.nodes.by_role.values())
         quiet = self.quiet(now)
         # The last message of a tuner that was interrupted may be lost: then everybody is gone. Who
-        # was starved for seconds sees nobody for a moment, too, but hears them again.
+        # was starved for seconds also sees nobody for a moment, but hears them again.
         if self._ended or (nobody and quiet is not None and quiet >= SILENT):
             return "ended"
         if nobody and quiet is None:

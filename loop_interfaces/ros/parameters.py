@@ -27,7 +27,7 @@ from loop_interfaces.spec import ParameterError, Spec, check_names
 UNANSWERED = 1.0
 """Seconds after which a request that got no answer is made again."""
 TOLD = ("actuators",)
-"""Parameters that a node sets itself; a file with all its parameters has them, too."""
+"""Parameters that a node sets itself; a file with all its parameters also has them."""
 _LARGEST = 1.7976931348623157e308
 
 

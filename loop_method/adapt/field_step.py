@@ -31,7 +31,7 @@ EXTRAPOLATION = 1.5
 # Chaos: the error of a rollout is more than this many times that of its pieces; noise adds up more
 # slowly.
 _GROWTH, _PIECES = 20.0, 8
-# One of so many measured states is a field to begin with, the others judge.
+# One of three measured states is an initial field, the other two judge.
 _HELD_OUT = 3
 
 

@@ -53,14 +53,14 @@ def initial_fields(records: Sequence[Record]) -> Array:
 
 
 def measured_states(records: Sequence[Record], count: int) -> Array:
-    """So many of the measured states, at equal distances; all where there are fewer."""
+    """`count` of the measured states, at equal distances; all where there are fewer."""
     states = np.concatenate([record.states for record in records])
     chosen: Array = states[np.linspace(0, len(states) - 1, min(count, len(states))).astype(int)]
     return chosen
 
 
 def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
-    """Whether the plant is chaotic, as far as a model of it says: whether small changes grow."""
+    """Whether small changes grow on a model of the plant, so that it counts as chaotic."""
     if len(fields) < 2:
         return False
     none = loop.no_control

@@ -57,7 +57,7 @@ class Law(ABC):
     model : ModelRows
         What is known of the plant: A, B, U, the LQ-tracking gains K_a and K_b, and s_r = U^T z_r.
     horizon : int
-        Steps T of an episode, as the parameters have it. An action is asked for at k = T, too.
+        Steps T of an episode, as the parameters have it. An action is also asked for at k = T.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ def fit_field_model(
         Fields that stand one after the other in a state.
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown. Its share
-        of E is no fault of a model.
+        of E is not the fault of a model.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
     first : str, optional

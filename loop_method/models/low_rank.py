@@ -12,7 +12,7 @@ from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 from loop_method.models.linear import add_products
 
 SNAPSHOTS = 400
-"""At most so many states are decomposed; the work grows with their square and the size of a state."""
+"""Most states that are decomposed; the work grows with their square and the size of a state."""
 ENERGY = 1e-12
 """Share of the sum of squares below which a mode is left out."""
 SAMPLES_A_MODE = 4

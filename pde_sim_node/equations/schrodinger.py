@@ -16,7 +16,7 @@ class Schrodinger(LinearEquation):
     With w(k) = hbar k^2/(2 m) + V/hbar it is (u, v)_t = (w v, -w u + a), so L = [[0, w], [-w, 0]].
     Initial field u = A sech((x - L/2)/b), v = 0; target u = A_r cos(2 pi x/L), v = 0. Without
     forcing the norm of psi is conserved in each wavenumber. The forcing is that of controlgym: an
-    additive input to v, which is no potential that a laboratory could switch on.
+    additive input to v, not a potential that a laboratory could switch on.
 
     Source: arXiv:2311.18736.
     """

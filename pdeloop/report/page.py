@@ -55,7 +55,7 @@ class Picture(NamedTuple):
 def report(data: ReportData, out: Path | None, *, animate: bool = False) -> Path:
     """Write a report to `out`, DIR/report if not given; returns the path of the page.
 
-    animate: with a moving picture of each problem, where its behaviour is shown, too.
+    animate: with a moving picture of each problem, where its behaviour is shown.
 
     RunFolderError where it cannot be written.
     """
