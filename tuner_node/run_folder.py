@@ -118,7 +118,9 @@ class RunFolder:
         if not there.is_dir():
             raise RunFolderError(f"cannot write to {self.path}: {there} is not a folder")
         if not os.access(there, os.W_OK | os.X_OK):
-            raise RunFolderError(f"cannot write to {self.path}: {os.strerror(errno.EACCES)}")
+            read_only = os.statvfs(there).f_flag & os.ST_RDONLY
+            why = os.strerror(errno.EROFS if read_only else errno.EACCES)
+            raise RunFolderError(f"cannot write to {self.path}: {why}")
 
     def create(self, parameters: Mapping[str, Any]) -> None:
         """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from pdeloop.cli import main
 from pdeloop.domain import DomainError, given_domain
 from tests.support.small import SMALL, parameters, same_bits, train_here
+from tests.support.small_disk import read_only_folder
 from tuner_node import checkpoint
 from tuner_node.run_folder import RunFolder
 
@@ -139,6 +141,11 @@ def test_an_unwritable_folder_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     line = error_of(capsys, "train", str(SMALL), "--out", str(tmp_path / "file" / "run"))
     assert "cannot write to" in line
+    with read_only_folder(tmp_path / "disk") as folder:
+        line = error_of(capsys, "train", str(SMALL), "--out", str(folder / "run"))
+    # What refuses root is the disk.
+    why = os.strerror(errno.EACCES if os.getuid() else errno.EROFS)
+    assert line.strip().endswith(f"cannot write to {folder / 'run'}: {why}")
 
 
 def test_the_result_folder_reproduces_the_run(tmp_path, capsys):

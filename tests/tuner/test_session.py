@@ -103,6 +103,19 @@ def test_a_paused_session_begins_no_episode_and_goes_on_with_the_same_bits():
     assert not [row for row in loop.rows if row["event"] == "repeated"]
 
 
+def test_what_a_tuner_reports_of_a_session_begins_with_nothing_and_has_the_measured_baselines():
+    loop = Loop(build_training(values()))
+    assert not loop.session.established and loop.session.baseline("lqt") is None
+    loop.episode()
+    assert loop.session.established
+    while not any(row["event"] == "adapted" for row in loop.rows):
+        loop.episode()
+    for name in ("none", "lqt"):
+        measured = [row[name] for row in loop.rows if row["event"] == "checked"]
+        assert len(measured) == 2
+        assert loop.session.baseline(name) == pytest.approx(sum(measured) / 2)
+
+
 @pytest.mark.parametrize("after", range(1, 30, 4))
 def test_a_session_that_was_asked_to_stop_ends_with_its_iteration_and_can_be_continued(after):
     loop = Loop(build_training(values()))

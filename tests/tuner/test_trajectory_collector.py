@@ -14,7 +14,7 @@ from loop_interfaces.topics import COMPLETED
 from tests.tuner.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
 from tuner_node.errors import DispatchError
-from tuner_node.trajectory_collector import TrajectoryCollector
+from tuner_node.trajectory_collector import TrajectoryCollector, cut
 
 STEPS = 30
 
@@ -53,6 +53,13 @@ def test_trajectories_come_with_the_costs_in_the_batchs_order_over_several_episo
     assert [t.actions.shape for t in result.trajectories] == [(STEPS, 2)] * 3
     assert result.trajectories[0].states[:, 0].tolist() == list(range(STEPS + 1))
     assert result.target is not None
+
+
+def test_an_episode_of_one_step_and_one_that_diverged_in_it_are_trajectories():
+    states, actions = np.arange(8.0).reshape(2, 2, 2), np.ones((1, 2, 3))
+    whole, diverged = cut(states, actions, np.array([COMPLETED, 0.0]))
+    assert np.array_equal(whole.states, states[:, 0]) and whole.actions.shape == (1, 3)
+    assert np.array_equal(diverged.states, states[:1, 1]) and diverged.actions.shape == (0, 3)
 
 
 def test_a_stranger_with_the_right_ids_fills_no_memory(monkeypatch):

@@ -1,0 +1,23 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""How many environments an episode may have: what a message and a process hold."""
+
+from __future__ import annotations
+
+import pytest
+
+from tuner_node.batch import EPISODE_BYTES, MESSAGE_BYTES, most_environments
+
+
+@pytest.mark.parametrize("n_z", [1, 256, 65_536, 2_000_000])
+@pytest.mark.parametrize("horizon", [1, 30, 1000])
+def test_an_episode_has_as_many_environments_as_fit_and_at_least_one(
+    n_z: int, horizon: int
+) -> None:
+    def fits(count: int) -> bool:
+        states = 8 * n_z * count
+        return states <= MESSAGE_BYTES and states * (horizon + 1) <= EPISODE_BYTES
+
+    found = most_environments(1024, n_z, horizon)
+    assert fits(found) or found == 1
+    assert found == 1024 or not fits(found + 1)
+    assert most_environments(1, n_z, horizon) == 1
