@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.observed_loop import ObservedLoop
+from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.prediction import pieces
+from loop_method.models.readings import ReadingsModel, fit_readings
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +38,11 @@ class Belief:
             context.action_limit,
         )
         on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
+        if isinstance(self.model, ReadingsModel):
+            assert isinstance(context.law, Observer)
+            seen = self.model.U.T
+            of_readings = (seen @ context.U, seen @ context.target, *problem[2:])
+            return ReplayedLoop(*of_readings, model=self.model, law=context.law)
         if isinstance(context.law, Observer):
             return ObservedLoop(*problem, **on, law=context.law)
         return ClosedLoop(*problem, **on)
@@ -55,6 +64,8 @@ def believe(
     parts : int
         Pieces of equal length that are predicted in place of a rollout.
     """
+    if context.sensors and isinstance(context.law, Observer):
+        return _of_readings(context, records)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
     if parts > 1:
         rollouts = [part for rollout in rollouts for part in pieces(rollout, parts)]
@@ -69,6 +80,20 @@ def believe(
     if found is None:
         return None
     return Belief(found.model, found.error, 2 if found.model.kind.startswith("two-") else 1)
+
+
+def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:
+    """The belief in a model in innovation form, with as many states as the law's filter has."""
+    rollouts = []
+    for record in records:
+        steps = min(len(record.actions), len(record.states) - 1)
+        if steps > 1 and np.isfinite(record.states).all():
+            rollouts.append((record.states[: steps + 1], record.actions[:steps]))
+    try:
+        model, error = fit_readings(rollouts, context.target, context.U.shape[1])
+    except ValueError:
+        return None
+    return Belief(model, error, 1)
 
 
 def _measured(context: Context, record: Record) -> Measured:

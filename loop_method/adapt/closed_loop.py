@@ -25,6 +25,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -161,6 +162,13 @@ class ClosedLoop(ClosedLoopProblem):
         costs /= self.horizon
         costs[~finite] = np.inf
         return Simulation(states, actions, costs)
+
+    replays: ClassVar[bool] = False
+    """Whether initial fields are measured rollouts, with what in them was not foreseen."""
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """The initial field of each rollout, (n, n_z)."""
+        return np.stack([record.states[0] for record in records])
 
     @property
     def no_control(self) -> Array:

@@ -221,7 +221,7 @@ class ModelBased(Optimizer):
         row: Row = {"role": self._stage}
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
-        if self._belief is not None:
+        if self._belief is not None and not self._of_readings:
             loop = self._belief.loop(self._context)
             predicted = [self._model_cost(loop, record) for record in added]
             if np.isfinite(predicted).all():
@@ -232,10 +232,12 @@ class ModelBased(Optimizer):
         """All rollouts, without what of their noise can be told from the fields."""
         every = [r for r in (*self._before, *self._records.all()) if len(r.states)]
         noise = self._context.noise
-        return [replace(r, states=denoised(r.states, noise)) for r in every] if noise else every
+        if not noise or self._of_readings:
+            return every
+        return [replace(r, states=denoised(r.states, noise)) for r in every]
 
     def _model_cost(self, loop: ClosedLoop, record: Record) -> float:
-        return float(loop.costs(loop.theta(record.policy), record.states[:1])[0])
+        return float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
 
     def _begin_judging(self) -> None:
         """Also without control, if that may be as good as the law."""
@@ -248,7 +250,14 @@ class ModelBased(Optimizer):
             self._none_is_close = bool(none <= (1.0 + self._settings.close) * own)
 
     def _fields(self) -> Array:
+        if self._belief is not None and self._of_readings:
+            return self._belief.loop(self._context).beginnings(self._data())
         return initial_fields(self._data())
+
+    @property
+    def _of_readings(self) -> bool:
+        """Whether the model is one of few readings, for a law that estimates from them."""
+        return bool(self._context.sensors) and isinstance(self._context.law, Observer)
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or search for one without."""
@@ -258,6 +267,8 @@ class ModelBased(Optimizer):
         most = settings.believed_noisy if noisy else settings.believed
         last = self._belief.model.kind if self._belief else ""
         belief = believe(self._context, data, last)
+        if self._of_readings:
+            most = settings.believed_readings
         if belief is not None:
             row["model"], row["mismatch"] = belief.model.kind, belief.error
         if belief is None or not belief.error <= most:
@@ -287,7 +298,9 @@ class ModelBased(Optimizer):
         self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
         base, near = (first, self._first) if self._safe else (none, self._none)
         settings, parts = self._settings, self._parts
-        if is_chaotic(loop, fields):
+        if loop.replays:
+            settings = replace(settings, mixtures=0)
+        elif is_chaotic(loop, fields):
             row["chaotic"] = True
             fields = measured_states(self._data(), settings.chaotic_fields)
             # Others than last time, so that the laws of the parts may know those of their own part.

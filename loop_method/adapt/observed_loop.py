@@ -97,20 +97,37 @@ class ObservedLoop(ClosedLoop):
         R = linalg.qr(self.U, mode="r")[0][: min(self.U.shape)]
         return np.asarray(drawn[..., : len(R)] @ R, dtype=np.float64)
 
+    def _start(self, fields: Array) -> Array:
+        """z_0."""
+        return fields
+
+    def _outputs(self, k: int, z: Array, fields: Array) -> Array:
+        """What U^T is applied to, and the target is of."""
+        return z
+
+    def _pull_outputs(self, by_outputs: Array) -> Array:
+        """The derivative by z of that by the outputs."""
+        return by_outputs
+
+    def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
+        return self.model.step(z, a)
+
     def simulate(self, theta: Array, fields: Array) -> ObservedSimulation:
         """Roll Theta out from the fields (F, n_z)."""
         n_a, B = self.law.n_a, self.law.model.B
         count, T = len(fields), self.horizon
-        states = np.empty((T + 1, *fields.shape))
+        begin = self._start(fields)
+        states = np.empty((T + 1, *begin.shape))
         actions, features = np.empty((T, count, n_a)), np.ones((T, count, theta.shape[1]))
         n_s = B.shape[0]
         costs, finite = np.zeros(count), np.ones(count, dtype=bool)
         noise = self._noise_of(count)
-        states[0] = fields
+        states[0] = begin
         memory = np.zeros((count, n_s))
         with np.errstate(all="ignore"):
             for k in range(T):
-                s = states[k] @ self.U + noise[k]
+                outputs = self._outputs(k, states[k], fields)
+                s = outputs @ self.U + noise[k]
                 features[k, :, :n_s] = s
                 features[k, :, n_s:-1] = memory if k else s
                 out = features[k] @ theta.T
@@ -120,7 +137,7 @@ class ObservedLoop(ClosedLoop):
                 if self.cost is not None:
                     self.cost.add(costs, states[k], a, k)
                 else:
-                    error = states[k] - self.target
+                    error = outputs - self.target
                     costs += self.state_weight * np.einsum("fi,fi->f", error, error)
                     costs += self.action_weight * np.einsum("fi,fi->f", a, a)
                 memory = out[:, n_a:] + a @ B.T
@@ -129,7 +146,7 @@ class ObservedLoop(ClosedLoop):
                 memory[~finite] = 0.0
                 features[k, ~finite] = 0.0
                 actions[k] = a
-                after = self.model.step(states[k], a)
+                after = self._step(k, states[k], a, fields)
                 finite &= np.isfinite(after).all(axis=1)
                 after[~finite] = 0.0
                 states[k + 1] = after
@@ -149,7 +166,7 @@ class ObservedLoop(ClosedLoop):
         states, actions, features = simulation.states, simulation.actions, simulation.features
         B = self.law.model.B
         n_s = len(B)
-        eta, mu = np.zeros_like(fields), np.zeros((len(fields), n_s))
+        eta, mu = np.zeros_like(states[0]), np.zeros((len(fields), n_s))
         weight = weights[:, None] / self.horizon
         if self.cost is not None:
             eta = weight * self.cost.terminal_slope(states[-1])
@@ -157,7 +174,8 @@ class ObservedLoop(ClosedLoop):
             z, a = states[k], actions[k]
             eta, g = self.model.pull_back(z, a, eta)
             if self.cost is None:
-                on_z = 2.0 * self.state_weight * weight * (z - self.target)
+                error = self._outputs(k, z, fields) - self.target
+                on_z = self._pull_outputs(2.0 * self.state_weight * weight * error)
                 on_a = 2.0 * self.action_weight * weight * a
             else:
                 on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
@@ -168,6 +186,6 @@ class ObservedLoop(ClosedLoop):
             gradient += out.T @ features[k]
             by_features = out @ theta
             by_s, mu = by_features[:, :n_s], by_features[:, n_s:-1]
-            eta = eta + on_z + (by_s if k else by_s + mu) @ self.U.T
+            eta = eta + on_z + self._pull_outputs((by_s if k else by_s + mu) @ self.U.T)
         counted = weights > 0.0
         return float(weights[counted] @ simulation.costs[counted]), gradient

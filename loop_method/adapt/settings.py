@@ -38,6 +38,13 @@ class ModelBasedSettings(Settings):
         0.0,
         1.0,
     )
+    believed_readings: float = setting(
+        1.0,
+        "the same of readings that are foreseen over a whole rollout, where a law with an observer "
+        "has few of them",
+        0.0,
+        10.0,
+    )
     mixtures: int = setting(
         24,
         "most initial fields drawn around the measured ones; half as many before the final law",

@@ -96,6 +96,17 @@ def evidence_of(
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
     held_out: change and deviation of the adapted law on fields that did not make it.
     """
+    if loop.replays:  # a rollout replayed is itself, so that measurements alone decide
+        measured = {
+            name: np.array([r.cost for r in records if np.array_equal(r.policy, law)])
+            for name, law in laws.items()
+            if name == base or not np.array_equal(law, laws[base])
+        }
+        return {
+            name: Evidence(0.0, 0.0, costs)
+            for name, costs in measured.items()
+            if len(costs) or name == base
+        }
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}
     for name, law in laws.items():
@@ -117,7 +128,7 @@ def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
     """Measured less model cost of the rollouts of a law; infinite where one diverged."""
     excess = []
     for record in own:
-        model = loop.costs(loop.theta(law), record.states[:1])[0]
+        model = loop.costs(loop.theta(law), loop.beginnings([record]))[0]
         if not record.usable:
             excess.append(np.inf)
         elif np.isfinite(model):  # where the model overflows, it says nothing of the rollout

@@ -9,6 +9,7 @@ from loop_method.models.base import Arrays, FieldModel, text_of
 from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
+from loop_method.models.readings import ReadingsModel
 from loop_method.models.spectral import SpectralModel
 
 FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
@@ -16,6 +17,7 @@ FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
     "finite-difference": FiniteDifferenceModel.from_arrays,
     "linear": LinearModel.from_arrays,
     "low-rank": LowRankModel.from_arrays,
+    "readings": ReadingsModel.from_arrays,
 }
 
 

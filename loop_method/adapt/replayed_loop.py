@@ -1,0 +1,81 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law with an observer on a model of the readings, which replays measured innovations.
+
+An initial field is a row [x_0, e_0, .., e_{T-1}] (`loop_method.models.readings`): where a rollout
+began, and what in it no model foresaw. Under its own law it is the rollout again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
+from loop_method.adapt.base import Record
+from loop_method.adapt.observed_loop import ObservedLoop
+from loop_method.design.lqt import DesignError, track_outputs
+from loop_method.models.readings import ReadingsModel
+from loop_method.reduce.reduced_model import ReducedModel
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedLoop(ObservedLoop):
+    """Laws with an observer on a `ReadingsModel`; U and target are those of U^T y."""
+
+    replays: ClassVar[bool] = True
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """[x_0, e] of each rollout; a shorter one goes on without innovations."""
+        model, found = self._readings, []
+        for record in records:
+            first, e = model.replay(record.states, record.actions)
+            whole = np.zeros((self.horizon, e.shape[1]))
+            whole[: len(e)] = e[: self.horizon]
+            found.append(np.concatenate([first, whole.ravel()]))
+        return np.stack(found)
+
+    def curvature(self, own: Array) -> Array:
+        """With R + B^T P B of the cost of the readings."""
+        model = self._readings
+        cost = Cost(
+            len(model.C),
+            model.n_a,
+            1,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+        )
+        try:
+            P = track_outputs(ReducedModel(model.A, model.B, model.C), cost).P
+            own = self.action_weight * np.eye(model.n_a) + model.B.T @ P @ model.B
+        except DesignError:
+            pass
+        return super().curvature(own)
+
+    @property
+    def _readings(self) -> ReadingsModel:
+        assert isinstance(self.model, ReadingsModel)
+        return self.model
+
+    def _start(self, fields: Array) -> Array:
+        return fields[:, : self.model.n_z]
+
+    def _innovations(self, k: int, fields: Array) -> Array:
+        r = len(self._readings.C)
+        begin = self.model.n_z + k * r
+        return fields[:, begin : begin + r]
+
+    def _outputs(self, k: int, z: Array, fields: Array) -> Array:
+        v: Array = z @ self._readings.C.T + self._innovations(k, fields)
+        return v
+
+    def _pull_outputs(self, by_outputs: Array) -> Array:
+        by_z: Array = by_outputs @ self._readings.C
+        return by_z
+
+    def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
+        moved: Array = self._innovations(k, fields) @ self._readings.G.T
+        return self.model.step(z, a) + moved
