@@ -87,14 +87,14 @@ class ControllerCheck(Check):
         self.publish(MODEL, models)
         return models
 
-    def remind(self) -> None:
+    def resend(self) -> None:
         for (topic, _), frame in self._sent.items():
-            self.wire.send(topic, frame)
+            self.transport.send(topic, frame)
 
     def publish(self, topic: Topic, frame: Frame) -> None:
-        """Send what `remind` sends again."""
+        """Send what `resend` sends again."""
         self._sent[topic, frame.plant if topic is TARGET else 0] = frame
-        self.wire.send(topic, frame)
+        self.transport.send(topic, frame)
 
     def state(self, start: Frame, step: int, *rows: Array, plant: int = 0) -> Frame:
         """A state of an episode, not sent yet. plant: a number, if not that of the check's."""
@@ -104,7 +104,7 @@ class ControllerCheck(Check):
     def answer(self, state: Frame, patience: float = 0.0) -> Array:
         """The actions that answer a state."""
         what = f"an `action` with the ids of state {state.step} of episode {state.episode}"
-        ask = partial(self.wire.send, STATE, state)
+        ask = partial(self.transport.send, STATE, state)
         wanted = partial(_answers, state)
         found = self.expect(what, wanted, ACTION, ask=ask, patience=patience)[1]
         expected = (len(state.values), self.n_a), state.time
@@ -119,7 +119,7 @@ class ControllerCheck(Check):
         with suppress(NoAnswerError):
             early = self.answer(state, patience=SILENT)
         self.publish(topic, frame)
-        self.wire.settle()
+        self.transport.wait_delivered()
         self.drain(ACTION)
         answer = self.answer(state)
         if early is not None:
@@ -152,7 +152,7 @@ class ControllerCheck(Check):
     def outcome(self, cost: Frame, ask: Ask | None = None) -> Message:
         """The outcome of an exploration: its models, or a ModelFailure."""
         what = f"`model/identified` or `model/failed` of episode {cost.episode}"
-        ask = ask or partial(self.wire.send, COST, cost)
+        ask = ask or partial(self.transport.send, COST, cost)
         return self.expect(what, partial(_of, cost), MODEL_IDENTIFIED, FAILED, ask=ask)[1]
 
     def identified(self, explored: Explored) -> Frame:
@@ -234,7 +234,7 @@ class ControllerCheck(Check):
         cost = explored.cost()
         for topic, frame in ((COST, cost), (COST, cost), (START, explored.start)):
             self.drain(MODEL_IDENTIFIED, FAILED)
-            found = self.outcome(cost, ask=partial(self.wire.send, topic, frame))
+            found = self.outcome(cost, ask=partial(self.transport.send, topic, frame))
             require(isinstance(found, Frame), "a model", self.described(FAILED, found))
             require_same(found.values, self.first[1].values, f"the model, asked by `{topic.name}`")
 
@@ -314,8 +314,8 @@ class ControllerCheck(Check):
         start, policy, state = self.under_policies((self.gains, 0, self.z))
         self.publish(START, start)
         other = replace(policy, values=2.0 * policy.values)
-        self.wire.send(POLICY, replace(other, run=self.run + 1))
-        self.wire.send(POLICY, replace(other, episode=self.new_start([]).episode))
+        self.transport.send(POLICY, replace(other, run=self.run + 1))
+        self.transport.send(POLICY, replace(other, episode=self.new_start([]).episode))
         answer = self.held_back(state, POLICY, policy)
         require_same(answer, self.law((self.gains, 0, self.z)), "the same policy later")
 
@@ -326,7 +326,7 @@ class ControllerCheck(Check):
         start, policy, state = self.under_policies((self.gains, 0, self.z))
         self.publish(POLICY, policy)
         self.publish(START, start)
-        self.wire.send(MODEL, replace(new, run=self.run + 1, values=2.0 * new.values))
+        self.transport.send(MODEL, replace(new, run=self.run + 1, values=2.0 * new.values))
         require_same(self.held_back(state, MODEL, new), known, "the same model before")
 
     def no_control(self) -> None:

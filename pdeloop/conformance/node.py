@@ -40,11 +40,11 @@ WAIT = 0.1
 """Seconds of one wait at most: a wait does not end by a signal."""
 
 
-class RosWire:
+class RosTransport:
     """The topics of a namespace in this ROS domain; `published` are those of the checked node."""
 
     def __init__(self, published: tuple[Topic, ...], namespace: str, node: Node) -> None:
-        self._stopped, self.heard, self.refused = "", False, ""
+        self._stopped, self.received_any, self.refused = "", False, ""
         self._inbox: deque[tuple[Topic, Message]] = deque(maxlen=KEPT)
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
@@ -87,7 +87,7 @@ class RosWire:
                 return None
             self._executor.spin_once(timeout_sec=min(left, WAIT))
 
-    def settle(self) -> None:
+    def wait_delivered(self) -> None:
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=1))
 
@@ -96,7 +96,7 @@ class RosWire:
         self._stopped = reason
 
     def _take(self, topic: Topic, decode: Callable[[Any], Message], raw: Any) -> None:
-        self.heard = True
+        self.received_any = True
         try:
             self._inbox.append((topic, decode(raw)))
         except ValueError as error:
@@ -110,5 +110,8 @@ def check_node(
     if not network:
         keep_on_this_machine()
     make = CHECKS[kind]
-    with ros_node("pdeloop_check", [], partial(RosWire, make.published, namespace)) as (_, wire):
-        yield from make(wire, run=1 + secrets.randbelow(MAX_ID - 1000), **options).findings()
+    with ros_node("pdeloop_check", [], partial(RosTransport, make.published, namespace)) as (
+        _,
+        transport,
+    ):
+        yield from make(transport, run=1 + secrets.randbelow(MAX_ID - 1000), **options).findings()

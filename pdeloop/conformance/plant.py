@@ -93,8 +93,8 @@ class PlantCheck(Check):
             return False
         return True
 
-    def remind(self) -> None:
-        self.wire.send(START, self.start)
+    def resend(self) -> None:
+        self.transport.send(START, self.start)
 
     def drawn(self, step: int, *rows: Row) -> Array:
         """The actions of a step."""
@@ -105,7 +105,7 @@ class PlantCheck(Check):
     def begin(self, *rows: Row, columns: Sequence[float] = PLAIN, patience: float = 0.0) -> Frame:
         """Start an episode; its state 0."""
         self.start = self.new_start([(seed, *columns) for seed, _ in rows])
-        topic, state = self.reply(0, self.remind, patience=patience)
+        topic, state = self.reply(0, self.resend, patience=patience)
         require(topic is STATE, "state 0", "a cost")
         return state
 
@@ -157,7 +157,7 @@ class PlantCheck(Check):
             if before is not None:
                 before(state)
             actions.append((draw or self.drawn)(step, *rows))
-            act = partial(self.wire.send, ACTION, replace(state, values=actions[-1]))
+            act = partial(self.transport.send, ACTION, replace(state, values=actions[-1]))
             topic, state = self.reply(step + 1, act, answers=state)
         what = f"the cost, of step {state.step}, after state {state.step}"
         require(state.step == step > 0, what, f"it after state {step}")
@@ -200,10 +200,10 @@ class PlantCheck(Check):
 
         def again(state: Frame) -> None:
             if state.step < BEGINNING:
-                self.remind()
+                self.resend()
 
         self.episode((1, 1), like=[self.reference], before=again)
-        topic, _ = self.reply(0, self.remind)
+        topic, _ = self.reply(0, self.resend)
         require(topic is COST, "the cost again", "state 0")
 
     def other_starts(self) -> None:
@@ -213,8 +213,8 @@ class PlantCheck(Check):
         end = replace(earlier, run=self.run + 1, values=np.empty((0, 4)))
 
         def disturb(state: Frame) -> None:
-            self.wire.send(START, earlier)
-            self.wire.send(START, end)
+            self.transport.send(START, earlier)
+            self.transport.send(START, end)
 
         self.beginning(before=disturb)
 
@@ -223,13 +223,13 @@ class PlantCheck(Check):
 
         def disturb(state: Frame) -> None:
             wrong = replace(state, values=self.drawn(state.step, (9, 9)))
-            self.wire.send(ACTION, replace(wrong, run=state.run + 1))
-            self.wire.send(ACTION, replace(wrong, episode=state.episode + 1))
-            self.wire.send(ACTION, replace(wrong, step=state.step + 1))
-            self.wire.send(ACTION, replace(wrong, plant=state.plant ^ 1))
+            self.transport.send(ACTION, replace(wrong, run=state.run + 1))
+            self.transport.send(ACTION, replace(wrong, episode=state.episode + 1))
+            self.transport.send(ACTION, replace(wrong, step=state.step + 1))
+            self.transport.send(ACTION, replace(wrong, plant=state.plant ^ 1))
             if state.step:  # that of the step before, again
                 taken = self.drawn(state.step - 1, (1, 1))
-                self.wire.send(ACTION, replace(state, step=state.step - 1, values=taken))
+                self.transport.send(ACTION, replace(state, step=state.step - 1, values=taken))
 
         self.beginning(before=disturb)
 
@@ -319,8 +319,8 @@ class PlantCheck(Check):
         self.start = self.new_start([(1, *PLAIN)])
 
         def ask() -> None:
-            self.wire.send(START, end)
-            self.remind()
+            self.transport.send(START, end)
+            self.resend()
 
         self.reply(0, ask, patience=AT_ONCE)
 
@@ -335,7 +335,7 @@ class PlantCheck(Check):
         what = f"the cost of an episode that had no answer for {seconds:g} s"
         with suppress(NoAnswerError):
             self.expect(what, wanted, STATE, COST, patience=seconds)
-        _, void = self.expect(what, wanted, STATE, COST, ask=self.remind)
+        _, void = self.expect(what, wanted, STATE, COST, ask=self.resend)
         require((void.values[:, -1] == VOID).all(), f"{VOID:g} in its rows", void.values.tolist())
         self.beginning()
 

@@ -46,10 +46,10 @@ class NoteError(Exception):
     """A remark that only a person who knows the node can judge."""
 
 
-class Wire(Protocol):
-    """The loop's topics. heard: whether any message came; refused: why the last one was, if any."""
+class Transport(Protocol):
+    """The loop's topics. received_any: whether one came; refused: why the last one was, if any."""
 
-    heard: bool
+    received_any: bool
     refused: str
 
     def now(self) -> float:
@@ -60,7 +60,7 @@ class Wire(Protocol):
     def next(self, *topics: Topic, seconds: float) -> tuple[Topic, Message] | None:
         """The next message of these topics; None if none comes in time."""
 
-    def settle(self) -> None:
+    def wait_delivered(self) -> None:
         """Wait until what was sent has arrived, a second at the most."""
 
 
@@ -76,7 +76,7 @@ class Check(ABC):
 
     def __init__(
         self,
-        wire: Wire,
+        transport: Transport,
         n_a: int = 1,
         *,
         n_z: int | None = None,
@@ -84,8 +84,8 @@ class Check(ABC):
         limit: float = 600.0,
         run: int = 1,
     ) -> None:
-        self.wire, self.n_a, self.n_z, self.run = wire, n_a, n_z, run
-        self.patience, self._limit, self._end = patience, limit, wire.now() + limit
+        self.transport, self.n_a, self.n_z, self.run = transport, n_a, n_z, run
+        self.patience, self._limit, self._end = patience, limit, transport.now() + limit
         self._numbers = count(1)
 
     def findings(self) -> Iterator[Finding]:
@@ -103,19 +103,19 @@ class Check(ABC):
                     break
                 except UnexpectedError as error:
                     yield Finding(name, False, f"{promise}: {error}")
-            if self.wire.heard:
-                refused = self.wire.refused
+            if self.transport.received_any:
+                refused = self.transport.refused
                 yield Finding("messages", not refused, refused or "all of them are well formed")
         finally:
             self.release()
 
     def release(self) -> None:
         """Publish that the run is over, which leaves the node free for the next check."""
-        self.wire.send(START, self.new_start([]))
-        self.wire.settle()
+        self.transport.send(START, self.new_start([]))
+        self.transport.wait_delivered()
 
     @abstractmethod
-    def remind(self) -> None:
+    def resend(self) -> None:
         """Send again what the node needs for its answer, as it may have been lost."""
 
     def expect(
@@ -133,15 +133,15 @@ class Check(ABC):
         `answers`; patience (s): if not that of the check.
         """
         patience = patience or self.patience
-        end = min(self.wire.now() + patience, self._end)
+        end = min(self.transport.now() + patience, self._end)
         due, others = None, Counter[str]()
-        while (now := self.wire.now()) < end:
+        while (now := self.transport.now()) < end:
             if ask is not None and (due is None or now >= due):
                 if due is not None:
-                    self.remind()
+                    self.resend()
                 ask()
                 due = now + ASK_AGAIN
-            found = self.wire.next(*on, seconds=(end if due is None else min(due, end)) - now)
+            found = self.transport.next(*on, seconds=(end if due is None else min(due, end)) - now)
             if found is None:
                 continue
             if wanted(*found):
@@ -152,13 +152,13 @@ class Check(ABC):
         if end == self._end:
             raise NoAnswerError(f"--limit {self._limit:g} s is over; it waited for {what}")
         got = " and ".join(f"{what} ({n} times)" for what, n in others.most_common(2)) or "nothing"
-        if not self.wire.heard:
+        if not self.transport.received_any:
             got += "; is it in this ROS_DOMAIN_ID and --namespace?"
         raise NoAnswerError(f"expected {what} within {patience:g} s, got {got}")
 
     def drain(self, *topics: Topic) -> None:
         """Forget what has come on these topics."""
-        while self.wire.now() < self._end and self.wire.next(*topics, seconds=0.0):
+        while self.transport.now() < self._end and self.transport.next(*topics, seconds=0.0):
             pass
 
     def frame(self, values: Any, **header: Any) -> Frame:

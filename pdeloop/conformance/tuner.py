@@ -69,10 +69,10 @@ class TunerCheck(Check):
     def release(self) -> None:
         """Nothing: the run is the tuner's."""
 
-    def remind(self) -> None:
-        self.wire.send(TARGET, Frame(0, 0, 0, 0.0, np.ones(N_Z), PLANT))
+    def resend(self) -> None:
+        self.transport.send(TARGET, Frame(0, 0, 0, 0.0, np.ones(N_Z), PLANT))
         for topic, message in self._answers:
-            self.wire.send(topic, message)
+            self.transport.send(topic, message)
 
     def advance(self) -> None:
         """Wait for the next start, which has to be in order."""
@@ -85,7 +85,7 @@ class TunerCheck(Check):
         what = f"an `episode/start` above {last.episode}" + ", or the end of the run" * bool(
             last.run
         )
-        self.start = self.expect(what, wanted, START, ask=self.remind)[1]
+        self.start = self.expect(what, wanted, START, ask=self.resend)[1]
         self.run, self._answers = self.start.run, []
         try:
             if self.start.values.size:
@@ -160,9 +160,9 @@ class TunerCheck(Check):
         right = self.identified()
         other = replace(right, values=2.0 * right.values)
         self.drain(START, MODEL)
-        self.wire.send(COST, self.costs())
-        self.wire.send(MODEL_IDENTIFIED, replace(other, run=right.run ^ 1))
-        self.wire.send(MODEL_IDENTIFIED, replace(other, episode=right.episode - 1))
+        self.transport.send(COST, self.costs())
+        self.transport.send(MODEL_IDENTIFIED, replace(other, run=right.run ^ 1))
+        self.transport.send(MODEL_IDENTIFIED, replace(other, episode=right.episode - 1))
         self.again(START, self.start.values)
 
     def first_rollout(self) -> None:
@@ -179,9 +179,9 @@ class TunerCheck(Check):
         """The costs of another run, episode or plant are not taken."""
         start, right = self.rollout(), self.costs()
         self.drain(START)
-        self.wire.send(COST, replace(right, run=right.run ^ 1))
-        self.wire.send(COST, replace(right, episode=right.episode + 1))
-        self.wire.send(COST, replace(right, plant=PLANT + 1))
+        self.transport.send(COST, replace(right, run=right.run ^ 1))
+        self.transport.send(COST, replace(right, episode=right.episode + 1))
+        self.transport.send(COST, replace(right, plant=PLANT + 1))
         self.again(START, start.values)
 
     def divergence(self) -> None:
@@ -234,7 +234,7 @@ class TunerCheck(Check):
             self._take_models(start)
             self._take_policies(start)
             return
-        while (found := self.wire.next(POLICY, seconds=0.0)) is not None:
+        while (found := self.transport.next(POLICY, seconds=0.0)) is not None:
             has_policy = ids(found[1])[:2] == ids(start)[:2]
             require(not has_policy, "excitation -1 in a start with a policy", rows.tolist())
 

@@ -38,7 +38,7 @@ Mistake = Callable[[Topic, Message], Message]
 """What becomes of a message; None: it is lost, a list: these come in its place."""
 
 
-class PureWire:
+class PureTransport:
     """Between a check and a pure protocol. The clock is a number.
 
     handlers: what it does with a message at a time; tick: what it does when nothing comes; heard,
@@ -55,7 +55,7 @@ class PureWire:
         self._handlers, self._tick, self._heard, self._said = handlers, tick, heard, said
         self._inbox: deque[tuple[Topic, Message]] = deque()
         self._now = 0.0
-        self.heard, self.refused = False, ""
+        self.received_any, self.refused = False, ""
 
     def take(self, sends: Iterable[Any]) -> None:
         for send in sends:
@@ -66,7 +66,7 @@ class PureWire:
             topic = FAILED if failed else send.topic
             copy = send if failed else replace(send.frame, values=send.frame.values.copy())
             for message in _each(self._said(topic, copy)):
-                self.heard = True
+                self.received_any = True
                 self._inbox.append((topic, message))
 
     def now(self) -> float:
@@ -93,7 +93,7 @@ class PureWire:
             self.take(self._tick(self._now))
         return None
 
-    def settle(self) -> None:
+    def wait_delivered(self) -> None:
         """Nothing is on its way."""
 
 
@@ -106,9 +106,9 @@ def _each(messages: Any) -> list[Message]:
 def plant(parameters: dict[str, Any] | None = None, **mistakes: Mistake) -> Check:
     protocol = plant_protocol(**parameters or {})
     handlers = {START: protocol.start, ACTION: protocol.action}
-    wire = PureWire(handlers, protocol.tick, **mistakes)
-    wire.take([protocol.announcement()])
-    return PlantCheck(wire, 4)
+    transport = PureTransport(handlers, protocol.tick, **mistakes)
+    transport.take([protocol.announcement()])
+    return PlantCheck(transport, 4)
 
 
 def controller(settings: dict[str, Any] | None = None, **mistakes: Mistake) -> Check:
@@ -118,7 +118,7 @@ def controller(settings: dict[str, Any] | None = None, **mistakes: Mistake) -> C
     known = (TARGET, made.target), (START, made.start), (POLICY, made.policy)
     known += (MODEL, made.model), (STATE, made.state), (COST, made.cost)
     handlers = {topic: lambda message, now, h=handle: h(message) for topic, handle in known}
-    return ControllerCheck(PureWire(handlers, lambda now: [], **mistakes), 2)
+    return ControllerCheck(PureTransport(handlers, lambda now: [], **mistakes), 2)
 
 
 def tuner(options: dict[str, Any] | None = None, **mistakes: Mistake) -> Check:
@@ -142,9 +142,9 @@ def tuner(options: dict[str, Any] | None = None, **mistakes: Mistake) -> Check:
         MODEL_IDENTIFIED: then(dispatcher.model),
         FAILED: then(dispatcher.failure),
     }
-    wire = PureWire(handlers, tick, **mistakes)
-    wire.take([*session.begin(0.0), *dispatcher.presence(0, (), 0.0)])
-    return TunerCheck(wire, 4)
+    transport = PureTransport(handlers, tick, **mistakes)
+    transport.take([*session.begin(0.0), *dispatcher.presence(0, (), 0.0)])
+    return TunerCheck(transport, 4)
 
 
 WEIGHTS = {"state_weight": 1.0, "action_weight": 1.0}

@@ -393,8 +393,8 @@ def test_what_came_instead_is_said():
 
 def test_a_cost_before_the_answer_to_the_last_state_is_named():
     check = plant()
-    wire, take = check.wire, check.wire.take
-    answer = wire._handlers[ACTION]
+    transport, take = check.transport, check.transport.take
+    answer = transport._handlers[ACTION]
 
     def take_and_answer(sends):
         sends = list(sends)
@@ -402,15 +402,15 @@ def test_a_cost_before_the_answer_to_the_last_state_is_named():
         for frame in (send.frame for send in sends if send.topic is STATE):
             if frame.step == 30:
                 zeros = np.zeros((len(frame.values), 4))
-                take(answer(replace(frame, values=zeros), wire.now()))
+                take(answer(replace(frame, values=zeros), transport.now()))
 
-    wire.take = take_and_answer
+    transport.take = take_and_answer
     assert named(findings(check, "silence")) == ["silence"]
 
 
 def test_a_controller_that_takes_any_target_is_named():
     check = controller()
-    check.wire.send(TARGET, Frame(0, 0, 0, 0.0, np.zeros(64), plant=32))
+    check.transport.send(TARGET, Frame(0, 0, 0, 0.0, np.zeros(64), plant=32))
     assert named(findings(check, "target held back")) == ["target held back"]
 
 
@@ -420,7 +420,7 @@ def test_a_tuner_that_is_started_once_more_needs_another_run_id(known):
     served = check.findings()
     found = [next(served) for _ in range(10)]
     start = check.frame([[0.0, 1.0, 0.1, 0.0]], episode=1, run=9 if known else 10)
-    check.wire.take([Publication(START, start)])
+    check.transport.take([Publication(START, start)])
     assert named([*found, *served]) == (["another run"] if known else [])
 
 
@@ -436,9 +436,9 @@ def test_lost_and_doubled_messages_make_no_node_bad(kind):
 
 
 class Flood:
-    """A wire on which one message comes all the time."""
+    """A transport on which one message comes all the time."""
 
-    heard, refused = True, ""
+    received_any, refused = True, ""
 
     def __init__(self, topic: Topic, message: Message) -> None:
         self.sent, self.closed, self._now = 0, False, 0.0
@@ -454,7 +454,7 @@ class Flood:
         self._now += 0.005
         return self._found if self._found[0] in topics else None
 
-    def settle(self) -> None:
+    def wait_delivered(self) -> None:
         self.closed = True
 
 
@@ -467,24 +467,24 @@ class Flood:
     ],
 )
 def test_a_flood_of_messages_ends_the_check_in_time(make, topic, values):
-    wire = Flood(topic, Frame(99, 1, 0, 0.0, np.array(values)))
-    found = list(make(wire, patience=10.0, limit=30.0).findings())
-    assert wire.now() < 31.0
+    transport = Flood(topic, Frame(99, 1, 0, 0.0, np.array(values)))
+    found = list(make(transport, patience=10.0, limit=30.0).findings())
+    assert transport.now() < 31.0
     assert not found[-2].good and "the rest is not checked" in found[-2].text
     assert "`action` of another run" in found[-2].text or make is not ControllerCheck
-    assert wire.sent < 200 and wire.closed == (make is not TunerCheck)
+    assert transport.sent < 200 and transport.closed == (make is not TunerCheck)
 
 
 def test_the_limit_ends_a_check_that_gets_on():
     check = plant({"horizon": 1000})
-    check._end = check.wire.now() + 0.05
+    check._end = check.transport.now() + 0.05
     *_, last, _ = findings(check)
     assert "--limit 600 s is over; it waited for state" in last.text
 
 
 def test_a_check_that_is_left_leaves_the_node_free():
     check = plant()
-    protocol = check.wire._handlers[START].__self__
+    protocol = check.transport._handlers[START].__self__
     for finding in check.findings():
         if finding.name == "first state":
             assert protocol.run == check.run
