@@ -224,7 +224,9 @@ def designed(
                 f"'{settings.law}' does not have; take the law 'observer'"
             )
         every = [*trajectories, *further]
-        found_model = subspace_model(every, order=settings.reduced_order, channels=channels)
+        found_model = subspace_model(
+            every, order=settings.reduced_order, channels=channels, settings=settings.method
+        )
         return Designed(lqg.law_of_innovations(found_model, target, **weights))
     truncated = settings.identification == "dmdc"
     model = identify(
@@ -239,7 +241,9 @@ def designed(
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
     if settings.identification != "field":
-        return Designed(lqg.with_filter(rows, trajectories) if filtered else rows)
+        return Designed(
+            lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows
+        )
     with threadpool_limits(limits=1):  # as in the identification itself
         found = field_law(
             [*trajectories, *further],
@@ -250,7 +254,10 @@ def designed(
             **weights,
         )
     chosen = found.rows if found.better and found.rows else rows
-    return Designed(lqg.with_filter(chosen, trajectories) if filtered else chosen, found)
+    return Designed(
+        lqg.with_filter(chosen, trajectories, settings=settings.method) if filtered else chosen,
+        found,
+    )
 
 
 def design_each(

@@ -36,6 +36,7 @@ from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_method.design.lqt import DesignError, track_outputs
 from loop_method.reduce.reduced_model import ReducedModel, Steps, repeated, steps_of
+from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 from loop_method.reduce.subspace import InnovationModel
 
 _SEEN = 1e-10
@@ -45,8 +46,6 @@ _LEAST = 1e-6
 """Least variance of a noise, relative to that of the residuals: Riccati needs some of both."""
 _EXACT = 1e-12
 """The same relative to the mean square of the state."""
-_STANDARD_ERRORS = 2.0
-"""By how many of them a measurement noise has to show in the residuals."""
 
 
 class Filter(NamedTuple):
@@ -155,6 +154,7 @@ def noise_of(
     model: ModelRows,
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
     sigma: float | None = None,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> Noise:
     """The noise that the residuals of a reduced model show.
 
@@ -172,6 +172,8 @@ def noise_of(
     sigma : float, optional
         The noise of a number of z_k; estimated from the second equation if it is not given, and 0 where
         that is not above 0 by more than chance.
+    settings : IdentificationSettings
+        `noise_evidence`: what counts as chance.
     """
     copies = repeated(trajectories)
     steps = [steps_of([one]) for number, one in enumerate(trajectories) if number not in copies]
@@ -181,7 +183,11 @@ def noise_of(
     gram, n_s = model.U.T @ model.U, len(model.A)
     size = float(np.trace(both)) / n_s
     least = max(_LEAST * size, _EXACT * float(np.mean((states @ model.U) ** 2)))
-    variance = sigma**2 if sigma is not None else _measured_variance(model.A @ gram, parts)
+    variance = (
+        sigma**2
+        if sigma is not None
+        else _measured_variance(model.A @ gram, parts, settings.noise_evidence)
+    )
     V = max(variance, least / float(np.trace(gram)) * n_s) * gram
     values, vectors = linalg.eigh(both - V - model.A @ V @ model.A.T)
     W: Array = (vectors * np.maximum(values, least)) @ vectors.T
@@ -189,11 +195,14 @@ def noise_of(
 
 
 def with_filter(
-    rows: ModelRows, trajectories: Sequence[tuple[ArrayLike, ArrayLike]], sigma: float | None = None
+    rows: ModelRows,
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    sigma: float | None = None,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> ModelRows:
     """A reduced model with the gain of its Kalman filter; parameters as of `noise_of`."""
     with threadpool_limits(limits=1):
-        noise = noise_of(rows, trajectories, sigma)
+        noise = noise_of(rows, trajectories, sigma, settings)
     found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)
     return replace(rows, L=found.M)
 
@@ -204,7 +213,7 @@ def _residuals(model: ModelRows, steps: Steps) -> Array:
     return residuals
 
 
-def _measured_variance(AV: Array, parts: Sequence[Array]) -> float:
+def _measured_variance(AV: Array, parts: Sequence[Array], standard_errors: float) -> float:
     """sigma^2 of E r_{k+1} r_k^T = -sigma^2 A U^T U, by least squares; 0 where that may be chance."""
     products = np.concatenate([np.einsum("ki,ij,kj->k", r[1:], AV, r[:-1]) for r in parts])
     if len(products) < 2:
@@ -212,7 +221,7 @@ def _measured_variance(AV: Array, parts: Sequence[Array]) -> float:
     found = -float(np.mean(products))
     error = float(np.std(products, ddof=1)) / np.sqrt(len(products))
     weight = float(np.sum(AV * AV))
-    return found / weight if weight > 0.0 and found > _STANDARD_ERRORS * error else 0.0
+    return found / weight if weight > 0.0 and found > standard_errors * error else 0.0
 
 
 def law_of_innovations(

@@ -44,6 +44,15 @@ class IdentificationSettings(Settings):
         1.0,
         1000.0,
     )
+    subspace_tolerance: float = setting(
+        1.02, "times the least held-out error up to which a lower order is taken", 1.0, 100.0
+    )
+    noise_evidence: float = setting(
+        2.0,
+        "standard errors by which measurement noise must show in residuals for a filter of it",
+        0.0,
+        100.0,
+    )
 
 
 DEFAULTS = IdentificationSettings()

@@ -43,6 +43,7 @@ from loop_interfaces.arrays import Array
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
 from loop_method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
+from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 PASTS = (1, 2, 3, 4, 6, 8)
 """Steps p of the vector ARX that are tried."""
@@ -50,8 +51,6 @@ ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
 """Orders that are tried where none is given."""
 FOLDS = 4
 """Parts of the trajectories, each held out once."""
-AS_GOOD = 1.02
-"""Times the least error up to which a lower order is taken."""
 RESOLVED = 1e-10
 """Least singular value of what the past says of the future, relative to the largest."""
 LEAST = 1e-8
@@ -92,6 +91,7 @@ def subspace_model(
     order: int = 0,
     past: int = 0,
     channels: Channels = NUMBERED,
+    settings: IdentificationSettings = DEFAULTS,
 ) -> InnovationModel:
     """Identify a model in innovation form.
 
@@ -105,6 +105,8 @@ def subspace_model(
         p; 0: that of the least error.
     channels : Channels
         Names of states and inputs in what is refused.
+    settings : IdentificationSettings
+        `subspace_tolerance`.
 
     Raises
     ------
@@ -136,7 +138,7 @@ def subspace_model(
             p, n = tried[0]
             error = np.nan
         else:
-            p, n, error = _choose(tried, known)
+            p, n, error = _choose(tried, known, settings.subspace_tolerance)
         return _fitted(known, p, n, channels, error)
 
 
@@ -153,7 +155,7 @@ def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
 
 
 def _choose(
-    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory]
+    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory], tolerance: float
 ) -> tuple[int, int, float]:
     """p and n with the least error on parts that were held out, and that error."""
     parts = _parts(known)
@@ -174,7 +176,7 @@ def _choose(
         errors[i] = np.sqrt(total / change) if change > 0.0 else np.inf
     if not np.isfinite(errors).any():
         return (*tried[0], np.nan)
-    good = [i for i in range(len(tried)) if errors[i] <= AS_GOOD * errors.min()]
+    good = [i for i in range(len(tried)) if errors[i] <= tolerance * errors.min()]
     least = min(tried[i][1] for i in good)
     best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
     return (*tried[best], float(errors[best]))

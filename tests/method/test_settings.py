@@ -10,7 +10,9 @@ import pytest
 
 import pdeloop
 from controller_node.identification import DesignSettings
+from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.spec import ParameterError
+from loop_method.design.lqg import noise_of
 from loop_method.laws.registry import OWN_LAWS, hand_over, law_kind
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.settings import IdentificationSettings
@@ -85,6 +87,23 @@ def test_a_larger_share_suggests_a_higher_order() -> None:
     assert suggested(0.0) == 1
     assert suggested(1.0) == 4
     assert suggested(0.0) <= suggested(0.3) <= suggested(1.0)
+
+
+def test_noise_has_to_show_by_as_many_standard_errors_as_are_set() -> None:
+    """Of what certainly has noise, an absurd demand leaves none."""
+    rng = np.random.default_rng(1)
+    a, s = rng.normal(size=(400, 1)), np.zeros((401, 2))
+    A, B = np.array([[0.8, 0.2], [-0.2, 0.8]]), np.array([[1.0], [0.5]])
+    for k in range(400):
+        s[k + 1] = A @ s[k] + B @ a[k]
+    z, none = s + 0.3 * rng.normal(size=s.shape), np.zeros((1, 2))
+    rows = ModelRows(A=A, B=B, U=np.eye(2), K_a=none, K_b=none, s_r=none[0])
+    found = {
+        errors: noise_of(rows, [(z, a)], None, IdentificationSettings(noise_evidence=errors))
+        for errors in (2.0, 100.0)
+    }
+    assert found[2.0].measurement[0, 0] == pytest.approx(0.09, rel=0.3)
+    assert found[100.0].measurement[0, 0] < 1e-3
 
 
 def test_the_documents_table_is_that_of_the_class() -> None:
