@@ -302,6 +302,21 @@ def test_a_paused_plant_says_so_once_a_second():
     assert protocol.tick(20.0) == []
 
 
+@pytest.mark.parametrize("last", [False, True], ids=["a step", "the end of an episode"])
+def test_a_paused_plant_says_so_a_second_after_what_it_did_in_the_pause(last):
+    protocol = plant_protocol(horizon=6)
+    (sent,) = protocol.start(start(1), 0.0)
+    while last and sent.frame.step < 6:
+        (sent,) = protocol.action(answer(sent.frame), 0.0)
+    protocol.pause(0.0)
+    answered = protocol.action(answer(sent.frame), 0.5)
+    assert [p.topic for p in answered] == ([COST] if last else [])
+    assert protocol.deadline == 1.5 and protocol.tick(1.4) == []
+    assert [p.topic for p in protocol.tick(1.5)] == [PAUSED]
+    protocol.resume(2.0)
+    assert (protocol.deadline is None) == last
+
+
 def test_the_answer_on_its_way_is_taken_in_a_pause_and_then_every_step_lets_one_through():
     quiet = run_episode(plant_protocol(), 1)
     protocol = plant_protocol()
