@@ -19,8 +19,9 @@ from typing import Any
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.module_path import PROJECT, safe_environment
 from loop_interfaces.problem import find_problem
+from loop_interfaces.start import die_with
 from pdeloop.domain import given_domain, own_domain
-from pdeloop.supervisor import START, die_with, node_arguments
+from pdeloop.supervisor import START, node_arguments
 
 ANSWER = 300.0
 """Longest silence of a process that was asked something, in s."""

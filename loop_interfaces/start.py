@@ -16,6 +16,9 @@ from loop_interfaces.module_path import leave_out_working_directory
 
 STOPPED_BY_SIGNAL = 130
 """Exit code."""
+PARENT = "PDELOOP_PARENT"
+"""The environment variable with the id of the process that started a node, with which it ends."""
+_PR_SET_PDEATHSIG = 1
 _EXTRAS = {
     "rosbags": "record",
     "mcap": "record",
@@ -49,6 +52,15 @@ def begin(program: str) -> None:
             os._exit(STOPPED_BY_SIGNAL)
 
     on_signals(end)
+
+
+def die_with(parent: int) -> None:
+    """This process is killed when its parent, the process of this id, ends."""
+    import ctypes  # which only a process that was started by another one needs
+
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before that
+        os._exit(1)
 
 
 def _open_streams() -> None:
@@ -89,6 +101,8 @@ def what_to_install(error: ModuleNotFoundError) -> str | None:
 
 def run(node: str) -> int:
     """The `main` of a node, in whose package it is `node.main`."""
+    if parent := os.environ.pop(PARENT, ""):
+        die_with(int(parent))
     begin(node)
     try:
         module = importlib.import_module(f"{node}.node")

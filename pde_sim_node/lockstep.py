@@ -43,6 +43,8 @@ from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_s
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
+SLOW = 2**16
+"""Numbers of a state, all environments together, from which on `action_timeout` grows with it."""
 
 _STALE = (
     "actions of another episode",
@@ -142,11 +144,16 @@ class Lockstep:
         """The key that the actions of the episode carry; None before the run's first one."""
         return self._actions.signature
 
+    @property
+    def _patience(self) -> float:
+        """Seconds until a state without an answer is sent again; longer for a large one."""
+        return self._timing.action_timeout * max(1.0, self._state.size / SLOW)
+
     def overdue(self) -> bool:
         """Whether the awaited action has been missing for many repeats."""
         if self._phase is not Phase.AWAITING or (self.paused and not self._stepping):
             return False
-        return self._repeats * self._timing.action_timeout > 2.0
+        return self._repeats * self._patience > 2.0
 
     def announcement(self) -> Publication:
         """The target z_r, sent once at the start and latched."""
@@ -294,7 +301,7 @@ class Lockstep:
         for _ in digests:  # rounded as often as they are counted one by one
             self.time += self.plant.sample_time
         self._repeats = 0
-        self.deadline = now + self._timing.action_timeout
+        self.deadline = now + self._patience
 
     def tick(self, now: float) -> list[Publication]:
         """Do what is due: send the state that is ready, or again; give the episode up.
@@ -315,7 +322,7 @@ class Lockstep:
             return [self._finish(now, void=True)]
         self._repeats += 1
         self.counters["states repeated"] += 1
-        self.deadline = now + self._timing.action_timeout
+        self.deadline = now + self._patience
         state = self._stamped(topics.STATE, self._state)
         return [state, self.paused_report()] if self.paused else [state]
 
@@ -368,7 +375,7 @@ class Lockstep:
 
     def _send_state(self, now: float) -> list[Publication]:
         self._phase, self._repeats = Phase.AWAITING, 0
-        self.deadline = now + self._timing.action_timeout
+        self.deadline = now + self._patience
         return [self._stamped(topics.STATE, self._state)]
 
     def _end_episode(self, now: float) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import re
 import signal
@@ -13,12 +12,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 from loop_interfaces.files import open_own
 from loop_interfaces.module_path import safe_environment
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED
+from loop_interfaces.start import PARENT
 
 STOP_GRACE = 2.0
 """Seconds between SIGINT and SIGKILL when the run ends."""
@@ -166,9 +165,10 @@ class Supervisor:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=self._environment,
+                # No code runs between fork and execution: with the threads of a plant's library, such
+                # as JAX, in this process it could wait there for ever.
+                env={**self._environment, PARENT: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
-                preexec_fn=partial(die_with, os.getpid()),
             )
         keep_on(child.process.pid, child.cores)
         child.started, child.due = now, None
@@ -219,14 +219,3 @@ def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)
         os.killpg(process.pid, signal.SIGCONT)  # a stopped process must be able to die
-
-
-_LIBC = ctypes.CDLL(None, use_errno=True)
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with(parent: int) -> None:
-    """For `preexec_fn`: the child is killed when the process `parent`, which started it, ends."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before that
-        os._exit(1)

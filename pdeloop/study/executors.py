@@ -16,8 +16,8 @@ from typing import Any
 
 from loop_interfaces.affinity import usable_cores
 from loop_interfaces.module_path import SAFE_PATH, safe_children
+from loop_interfaces.start import die_with
 from pdeloop.study.description import StudyError
-from pdeloop.supervisor import die_with
 from spectral_solver.workers import use_cores
 
 CONNECTING = 10.0

@@ -535,3 +535,16 @@ def test_only_the_action_that_will_be_taken_is_awaited():
     assert protocol.awaits(good) and not any(map(protocol.awaits, others))
     protocol.action(good, 0.0)
     assert not protocol.awaits(good)
+
+
+def test_a_large_state_is_repeated_later(monkeypatch):
+    """A state of many numbers is long on its way: it would be sent several times before an answer."""
+    (sent,) = plant_protocol().start(start(1), now=0.0)
+    monkeypatch.setattr("pde_sim_node.lockstep.SLOW", sent.frame.values.size / 4)
+    protocol = plant_protocol()
+    protocol.start(start(1), now=0.0)
+    assert not protocol.tick(0.39)
+    (again,) = protocol.tick(0.41)
+    assert again.topic is STATE and protocol.counters["states repeated"] == 1
+    protocol.action(answer(again.frame), now=0.5)
+    assert not protocol.tick(0.89) and protocol.tick(0.91)

@@ -19,7 +19,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from pdeloop.supervisor import die_with
+from loop_interfaces.start import die_with
 
 COMMAND = [
     "chromium",

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +29,6 @@ def fork_nodes(folder: Path) -> None:
         command: Sequence[str],
         *,
         env: Mapping[str, str],
-        preexec_fn: Callable[[], None],
         **how: Any,
     ) -> subprocess.Popen[bytes]:
         start_of_command = [sys.executable, "-m", supervisor.START]
@@ -38,7 +37,6 @@ def fork_nodes(folder: Path) -> None:
             stream.flush()  # otherwise the child has what is in their buffers, too
 
         def become_the_node() -> None:
-            preexec_fn()
             _be_node(list(command[3:]), env, folder)
 
         # It never gets as far as to execute the command.

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.isolation import loopback_environment
+from loop_interfaces.start import die_with
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
-from pdeloop.supervisor import die_with
 from tests.support import forked_nodes
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -27,6 +27,7 @@ import pytest
 from rich.console import Console
 
 from loop_interfaces.loop_parameters import read_problem
+from loop_interfaces.start import PARENT, die_with
 from pdeloop import cli, training_run
 from pdeloop.cli import main
 from pdeloop.commands import problems
@@ -34,7 +35,7 @@ from pdeloop.interruption import Interruption, interruptible
 from pdeloop.output import print_json
 from pdeloop.pairs import Transport
 from pdeloop.progress import Progress
-from pdeloop.supervisor import die_with
+from pdeloop.supervisor import START
 from tests.support.interpreter import ROOT, python
 from tests.support.small import SMALL
 from tuner_node.run_folder import RunFolder
@@ -306,6 +307,15 @@ def test_who_starts_when_its_parent_has_ended_ends_too() -> None:
     for parent, code in ((os.getpid(), 0), (os.getppid(), 1)):
         child = subprocess.Popen(["true"], preexec_fn=partial(die_with, parent))
         assert child.wait(LIMIT) == code
+
+
+def test_a_node_whose_supervisor_has_ended_before_it_began_ends_too() -> None:
+    """It learns of it from its environment: nothing of ours runs between its fork and execution."""
+    command = [sys.executable, "-m", START, "pde_sim_node"]
+    done = subprocess.run(
+        command, env={**os.environ, PARENT: str(os.getppid())}, capture_output=True, timeout=LIMIT
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (1, b"", b"")
 
 
 @pytest.mark.parametrize(
