@@ -74,7 +74,7 @@ class Comparison:
         lines = aligned(table)
         if self.apart:
             lines.append(
-                f"the costs do not compare: the runs differ in {', '.join(self.apart[:SHOWN])}"
+                f"the costs cannot be compared: the runs differ in {', '.join(self.apart[:SHOWN])}"
             )
         if self.differing:
             lines += [

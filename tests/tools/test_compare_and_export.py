@@ -70,7 +70,7 @@ def test_costs_of_another_plant_are_not_compared(
 ) -> None:
     assert main(["compare", str(runs["plain"]), str(runs["thick"])]) == 0
     told = capsys.readouterr().out
-    assert "the costs do not compare: the runs differ in physical.viscosity" in told
+    assert "the costs cannot be compared: the runs differ in physical.viscosity" in told
     assert compare([load_run(runs[n]) for n in ("plain", "thick")]).rows()[1]["above_first"] is None
 
 
