@@ -42,6 +42,7 @@ from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measure
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch, part_of
 from loop_method.adapt.renewal import renew
+from loop_method.adapt.replayed_renewal import best_measured, step
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, denoised
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
@@ -203,6 +204,10 @@ class ModelBased(Optimizer):
         """Own rollouts after which the law is renewed next."""
         known, last = len(self._before), self._last_renewal()
         at = self._settings.first_renewal
+        if self._of_readings:  # of one law no more than judge it: steps are short
+            own = max(at - known, 1)
+            every = range(own, max(last, own) + 1, self._settings.judging)
+            return next((n for n in every if self._records.count < n <= last), last)
         while at - known <= self._records.count:
             at *= 2
         # One is only worth it if as many rollouts again come before the last one.
@@ -287,9 +292,22 @@ class ModelBased(Optimizer):
             row["reason"] = f"{reason} any more; the law stays"
         else:
             self._belief = belief
-            self._improve(belief, row, final)
+            if self._of_readings:
+                self._improve_replayed(belief, row)
+            else:
+                self._improve(belief, row, final)
         if final:
             self._begin_judging()
+
+    def _improve_replayed(self, belief: Belief, row: Row) -> None:
+        """A step from the law that measured best."""
+        own = self._records.all()
+        best = best_measured(own, self._first)
+        found = step(belief.loop(self._context), own, best, self._settings)
+        if found is None:
+            row["reason"] = "the law is not finite on the model; it stays"
+        else:
+            self._policy, row["steps"] = found
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         loop, fields = belief.loop(self._context), self._fields()
@@ -298,9 +316,7 @@ class ModelBased(Optimizer):
         self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
         base, near = (first, self._first) if self._safe else (none, self._none)
         settings, parts = self._settings, self._parts
-        if loop.replays:
-            settings = replace(settings, mixtures=0)
-        elif is_chaotic(loop, fields):
+        if is_chaotic(loop, fields):
             row["chaotic"] = True
             fields = measured_states(self._data(), settings.chaotic_fields)
             # Others than last time, so that the laws of the parts may know those of their own part.
@@ -333,6 +349,9 @@ class ModelBased(Optimizer):
         if self._belief is None:
             self._end(row, "no model of the whole field predicts the rollouts")
             return
+        if self._of_readings:
+            others = [r for r in self._records.all() if not np.array_equal(r.policy, self._first)]
+            self._policy = best_measured(others, self._policy).copy()
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._policy}
         base = FIRST if self._safe else NONE
         _, change, deviation = self._held_out.tolist()

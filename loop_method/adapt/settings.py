@@ -45,6 +45,13 @@ class ModelBasedSettings(Settings):
         0.0,
         10.0,
     )
+    readings_trust: float = setting(
+        1.0,
+        "weight of the distance from where a step on a model of readings begins; of a linear plant the "
+        "step is 1/(1 + this) of the whole one",
+        0.0,
+        1e6,
+    )
     mixtures: int = setting(
         24,
         "most initial fields drawn around the measured ones; half as many before the final law",

@@ -11,6 +11,7 @@ import pytest
 from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from loop_method.adapt.belief import believe
 from loop_method.adapt.replayed_loop import ReplayedLoop
+from loop_method.adapt.replayed_renewal import best_measured, step
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, evidence_of
 from loop_method.design.lqg import law_of_innovations
@@ -167,3 +168,26 @@ def test_model_based_improves_a_law_of_few_readings_and_goes_on_with_the_same_bi
         for theta in (start, optimizer.policy)
     )
     assert after < 0.95 * before
+
+
+def test_a_step_begins_with_the_law_that_measured_best_and_is_held_to_it() -> None:
+    first, other = np.zeros(2), np.ones(2)
+
+    def cost(policy: np.ndarray, *costs: float) -> list[Record]:
+        return [Record(policy, c, np.zeros((2, 1)), np.zeros((1, 1))) for c in costs]
+
+    assert best_measured([], first) is first
+    # One rollout says too little, and one that diverged too much.
+    assert best_measured(cost(other, 1.0), first) is first
+    known = [*cost(first, 3.0, 3.0), *cost(other, 1.0, np.inf)]
+    assert best_measured(known, first) is first
+    assert best_measured([*cost(first, 3.0, 3.0), *cost(other, 4.0, 1.0)], first) is other
+    loop, record, theta = loop_and_rollout()
+    begun = loop.theta(theta)
+    lengths = []
+    for trust in (0.0, 1.0, 100.0):
+        settings = ModelBasedSettings(readings_trust=trust, iterations=30)
+        found = step(loop, [record, *explored()], theta, settings)
+        assert found is not None
+        lengths.append(np.linalg.norm(loop.theta(found[0]) - begun))
+    assert lengths[0] > lengths[1] > lengths[2] > 0.0
