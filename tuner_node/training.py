@@ -26,7 +26,6 @@ import numpy as np
 
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
 from loop_interfaces.frames import digest
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
@@ -38,6 +37,7 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings
 from tuner_node.budget import Budget
 from tuner_node.errors import ContradictionError
 from tuner_node.law_check import check_law
+from tuner_node.optimizer_context import context_of
 from tuner_node.rollouts import CHECK, EVALUATED
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
@@ -342,30 +342,8 @@ class Training:
         exploration = self.explorations[m]
         if exploration is None or self.target is None or self.models is None:
             return None
-        law = self.laws()[m]
-        return Context(
-            U=law.model.U,
-            target=self.target,
-            state_weight=self.settings.state_weight,
-            action_weight=self.settings.action_weight,
-            horizon=len(exploration.actions),
-            exploration=exploration,
-            measured=self.measured[m],
-            action_limit=self.settings.action_limit,
-            noise=self.settings.measurement_noise,
-            sensors=self.settings.sensors,
-            actuator_positions=self.settings.actuator_positions,
-            periodic=self.settings.periodic,
-            line=self.settings.line,
-            further=self.further[m],
-            cost=self._cost(),
-            law=law,
-        )
-
-    def _cost(self) -> Cost | None:
-        """The whole cost where numbers and the target do not say it."""
-        cost = Cost.parse(self.settings.cost)
-        return None if cost is None or cost.plain else cost
+        known = exploration, self.further[m], self.measured[m]
+        return context_of(self.settings, self.laws()[m], self.target, *known)
 
     def _asked(self) -> list[list[Rollout]]:
         """The rollouts that each optimiser asks for; its policies may be vectors."""
