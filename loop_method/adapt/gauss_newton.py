@@ -60,7 +60,7 @@ _MEMORY = 40
 # than how much fields differ, so more of them have to judge.
 _SMALL = 0.02
 _NONE = -1
-_STAMPS = ("fields", "incumbents", "trials", "others")
+_STAMPS = ("fields", "incumbents", "trials", "compared")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class SearchState:
     """State of an optimisation, apart from the rollouts that it remembers.
 
     policy, candidate (n_a, 2 n_s): the incumbent, and what is tried if `proposed`; fields (M,):
-    numbers of the initial fields that judge; incumbents, trials, others (M,): stamps of the
+    numbers of the initial fields that judge; incumbents, trials, compared (M,): stamps of the
     rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
     compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
     candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was;
@@ -93,7 +93,7 @@ class SearchState:
     fields: Stamps
     incumbents: Stamps
     trials: Stamps
-    others: Stamps
+    compared: Stamps
     fall: float = 0.0
     damping: float = _DAMPING[1]
     accepted: bool = True
@@ -105,9 +105,9 @@ class SearchState:
     @classmethod
     def begin(cls, policy: Array, count: int, first: int) -> SearchState:
         """Before the first rollout, with this many fields from number `first` on."""
-        incumbents, trials, others = np.full((3, count), _NONE, dtype=np.int64)
+        incumbents, trials, compared = np.full((3, count), _NONE, dtype=np.int64)
         numbers = first + np.arange(count, dtype=np.int64)
-        return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, others)
+        return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, compared)
 
     def arrays(self) -> State:
         """A copy of everything, as a checkpoint holds it."""
@@ -116,6 +116,8 @@ class SearchState:
     def later(self, arrays: Arrays) -> SearchState:
         """From the `arrays` of a later state of this optimisation; a ValueError if they are none."""
         given: dict[str, Any] = {}
+        if "compared" not in arrays and "others" in arrays:  # its name in older checkpoints
+            arrays = {**arrays, "compared": arrays["others"]}
         for name, own in self.arrays().items():
             shape = (None,) if name in _STAMPS else own.shape
             array = checked_array(arrays, name, own.dtype.kind, shape)
@@ -137,7 +139,7 @@ class SearchState:
     @property
     def referred(self) -> set[int]:
         """Stamps of the rollouts that are still needed."""
-        return {int(s) for s in (*self.incumbents, *self.trials, *self.others)} - {_NONE}
+        return {int(s) for s in (*self.incumbents, *self.trials, *self.compared)} - {_NONE}
 
 
 class GaussNewton(Optimizer):
@@ -301,7 +303,7 @@ class GaussNewton(Optimizer):
         if lost:
             if from_model:
                 now.damping = min(4.0 * now.damping, _DAMPING[2])
-            now.others = now.trials.copy()
+            now.compared = now.trials.copy()
             now.accepted = False
         elif ran.all():
             fall = incumbent - trial
@@ -310,7 +312,7 @@ class GaussNewton(Optimizer):
             elif from_model and fall <= 0.2 * now.fall:
                 now.damping *= 2.0
             now.policy = now.candidate.copy()
-            now.others, now.incumbents = now.incumbents, now.trials.copy()
+            now.compared, now.incumbents = now.incumbents, now.trials.copy()
             now.accepted = True
             self._renew_fields(fall < _SMALL * incumbent)
         else:
@@ -330,13 +332,13 @@ class GaussNewton(Optimizer):
             return
         if grow:
             now.fields = np.append(now.fields, now.fields.max() + 1)
-            now.incumbents, now.trials, now.others = (
-                np.append(stamps, _NONE) for stamps in (now.incumbents, now.trials, now.others)
+            now.incumbents, now.trials, now.compared = (
+                np.append(stamps, _NONE) for stamps in (now.incumbents, now.trials, now.compared)
             )
         else:
             oldest = int(np.argmin(now.fields))
             now.fields[oldest] = now.fields.max() + 1
-            now.others[oldest] = now.incumbents[oldest] = _NONE
+            now.compared[oldest] = now.incumbents[oldest] = _NONE
 
     def _propose(self, row: Row) -> None:
         now = self._now
@@ -355,7 +357,7 @@ class GaussNewton(Optimizer):
             proposal = self._proposer.propose(
                 self._records.all(),
                 [self._records[int(stamp)] for stamp in now.incumbents],
-                [None if stamp == _NONE else self._records[int(stamp)] for stamp in now.others],
+                [None if stamp == _NONE else self._records[int(stamp)] for stamp in now.compared],
                 damping=now.damping,
                 accepted=now.accepted,
                 first=now.believed if again else None,

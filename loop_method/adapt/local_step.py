@@ -64,7 +64,7 @@ def propose(
     data: Sequence[Record],
     shares: Sequence[float],
     incumbents: Sequence[Record],
-    others: Sequence[Record | None],
+    compared: Sequence[Record | None],
     *,
     damping: float,
     accepted: bool,
@@ -79,12 +79,12 @@ def propose(
         The rollouts that the models are fitted to.
     shares : sequence of float
         How much each of them counts.
-    incumbents, others, damping, accepted
+    incumbents, compared, damping, accepted
         As of `Proposer.propose`.
     """
     V = extended_basis(loop.U, [record.states for record in data], max(_MODES, loop.U.shape[1]))
     models = _fit(data, shares, V, len(incumbents))
-    errors = mismatches(models, _comparisons(loop, V, incumbents, others), loop.horizon)
+    errors = mismatches(models, _comparisons(loop, V, incumbents, compared), loop.horizon)
     paths = [path_of(loop, record, V) for record in incumbents if len(record.actions)]
     policy, least = incumbents[0].policy, LEAST_FALL * loop.mean_cost_of(incumbents)
     proposal = None
@@ -135,12 +135,15 @@ def steps_of(
 
 
 def _comparisons(
-    loop: ClosedLoopProblem, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]
+    loop: ClosedLoopProblem,
+    V: Array,
+    incumbents: Sequence[Record],
+    compared: Sequence[Record | None],
 ) -> list[Comparison]:
     """Pairs of whole rollouts: two fields, and two policies on one field."""
     chosen = []
     for i, record in enumerate(incumbents):
-        neighbour, other = incumbents[(i + 1) % len(incumbents)], others[i]
+        neighbour, other = incumbents[(i + 1) % len(incumbents)], compared[i]
         if neighbour is not record and neighbour.usable and record.usable:
             chosen.append((record, neighbour))
         if other is not None and record.usable and other.cost < LOCAL * record.cost:

@@ -274,6 +274,18 @@ def test_a_restored_training_ends_with_the_same_bits() -> None:
     assert whole.tells > 8
 
 
+def test_continues_from_a_checkpoint_with_the_names_of_an_older_version() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    for _ in range(3):
+        optimizer.tell(measure(plant, optimizer.ask()))
+    older = optimizer.state()
+    older["others"] = older.pop("compared")
+    again = make(plant)
+    again.restore(older)
+    assert same_state(again, optimizer)
+
+
 def test_refuses_foreign_checkpoints() -> None:
     plant = Plant()
     optimizer = make(plant)
