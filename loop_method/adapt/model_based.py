@@ -44,7 +44,7 @@ from loop_method.adapt.local_search import LocalSearch, part_of
 from loop_method.adapt.renewal import renew
 from loop_method.adapt.replayed_renewal import best_measured, step
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.trajectories import Records, denoised
+from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
 from loop_method.laws.observer import Observer
 from loop_method.models.files import model_of
@@ -235,11 +235,14 @@ class ModelBased(Optimizer):
 
     def _data(self) -> list[Record]:
         """All rollouts, without what of their noise can be told from the fields."""
-        every = [r for r in (*self._before, *self._records.all()) if len(r.states)]
-        noise = self._context.noise
+        noise, measured = self._context.noise, self._measurements()
         if not noise or self._of_readings:
-            return every
-        return [replace(r, states=denoised(r.states, noise)) for r in every]
+            return measured
+        return cleaned(measured, noise, line=self._context.line)
+
+    def _measurements(self) -> list[Record]:
+        """All rollouts as they were measured."""
+        return [r for r in (*self._before, *self._records.all()) if len(r.states)]
 
     def _model_cost(self, loop: ClosedLoop, record: Record) -> float:
         return float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
@@ -266,12 +269,12 @@ class ModelBased(Optimizer):
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or search for one without."""
-        settings, data = self._settings, self._data()
+        settings = self._settings
         final = self._records.count >= self._last_renewal()
         noisy = bool(self._context.noise)
         most = settings.believed_noisy if noisy else settings.believed
         last = self._belief.model.kind if self._belief else ""
-        belief = believe(self._context, data, last)
+        belief = believe(self._context, self._measurements(), last)
         if self._of_readings:
             most = settings.believed_readings
         if belief is not None:

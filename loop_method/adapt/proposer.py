@@ -25,7 +25,8 @@ from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_step import MOST_SENSORS, SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.trajectories import denoised
+from loop_method.adapt.trajectories import cleaned
+from loop_method.models.denoising import denoised
 
 
 class Proposer:
@@ -72,7 +73,8 @@ class Proposer:
         self._context = replace(context, noise=self._noise)
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
-        self._before = [self._clean(record) for record in (exploration, *context.measured)]
+        self._measured = [exploration, *context.measured]
+        self._before = [self._clean(record) for record in self._measured]
         self._periodic = context.periodic
         self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
@@ -109,6 +111,7 @@ class Proposer:
             Kind of the model of the whole field to try first; None: try none.
         """
         loop = self.loop
+        measured = [r for r in (*self._measured, *records) if len(r.states) > 1]
         records = [self._clean(record) for record in records]
         incumbents = [self._clean(record) for record in incumbents]
         others = [other and self._clean(other) for other in others]
@@ -126,7 +129,7 @@ class Proposer:
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         believed = ""
         if self._periodic and first is not None:
-            belief, whole = field_step.field_model(self._context, data, first, self._believed)
+            belief, whole = field_step.field_model(self._context, measured, first, self._believed)
             if belief is not None:
                 believed = belief.model.kind
                 if (
@@ -134,8 +137,9 @@ class Proposer:
                     or not whole
                     or field_step.agrees_with_rejections(self._context, belief, rejected)
                 ):
+                    known = cleaned(measured, self._noise) if self._noise else data
                     return field_step.propose(
-                        *(self._context, belief, whole, data, policy, damping),
+                        *(self._context, belief, whole, known, policy, damping),
                     )
         proposal = local_step.propose(
             *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted

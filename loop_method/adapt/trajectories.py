@@ -1,13 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
-import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
+from loop_method.models.denoising import denoised, smoothed
 from loop_method.reduce.snapshots import LARGE, factored
 
 
@@ -182,29 +185,15 @@ class Records:
         return states[:length], actions[: max(length - 1, 0)]
 
 
-def denoised(states: Array, noise: float) -> Array:
-    """A trajectory with the singular values that it would have without noise, nearest in the mean.
+def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
+    """Rollouts without what of their noise can be told from their states.
 
-    Measurement noise is white in space and time, while the fields of a trajectory have much in common:
-    few singular values are above 1 + sqrt(beta), in units of noise sqrt(n), which are those of the
-    noise alone; those that are shrink to sqrt((y^2 - beta - 1)^2 - 4 beta) / y.
-
-    Parameters
-    ----------
-    states : (T, n_z) array
-        n is the larger of T and n_z, beta the smaller over it.
-    noise : float
-        Standard deviation of the noise on every number.
-
-    References
-    ----------
-    Gavish, Donoho, "Optimal shrinkage of singular values", IEEE Trans. Inf. Theory 63, 2017.
+    line: whether the states are fields on one axis, of which initial ones are known best by their
+    spectra.
     """
-    if not states.size:
-        return states
-    left, values, right = scipy.linalg.svd(states, full_matrices=False)
-    beta, unit = min(states.shape) / max(states.shape), noise * np.sqrt(max(states.shape))
-    y = np.maximum(values / unit, 1.0 + np.sqrt(beta))
-    shrunk = unit * np.sqrt(np.maximum((y**2 - beta - 1.0) ** 2 - 4.0 * beta, 0.0)) / y
-    clean: Array = (left * shrunk) @ right
-    return clean
+    found = [replace(record, states=denoised(record.states, noise)) for record in records]
+    if line and found:
+        first = smoothed(np.stack([record.states[0] for record in records]), noise)
+        for record, state in zip(found, first, strict=True):
+            record.states[0] = state
+    return found

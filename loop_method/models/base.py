@@ -72,11 +72,19 @@ class Measured:
         (k, states (M, n_z)) -> actions (M, n_a), that the rollout was under. A model is then judged by
         the closed loop that it predicts; without a law, as for an exploration, by what it predicts
         under the measured actions.
+    clean : array, optional
+        The states without what of their noise can be told from them; none: there is no noise.
     """
 
     states: Array
     actions: Array
     law: Law | None = None
+    clean: Array | None = None
+
+    @property
+    def known(self) -> Array:
+        """The states as they are best known."""
+        return np.asarray(self.states if self.clean is None else self.clean)
 
 
 def affine_law(K: Array, b: Array) -> Law:
@@ -117,7 +125,7 @@ class Samples:
         """Those of rollouts that are finite, in their order."""
         parts = []
         for rollout in rollouts:
-            states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
+            states, actions = rollout.known, np.asarray(rollout.actions)
             n = min(len(actions), len(states) - 1)
             if n < 1:
                 continue

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
+from loop_method.models.denoising import denoised, smoothed
 from loop_method.models.kinds import Kind, kinds_of
 from loop_method.models.prediction import errors, finite, pieces
 from loop_method.models.settings import FieldModelSettings
@@ -67,8 +68,8 @@ def fit_field_model(
     components : int
         Fields that stand one after the other in a state.
     noise : float
-        Standard deviation of the noise on every number of the states; 0 for none, or unknown. Its share
-        of E is not the fault of a model.
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
+        the error beyond what it explains, and kinds that know of noise are fitted as `noisy_fit` says.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
     first : str, optional
@@ -81,14 +82,15 @@ def fit_field_model(
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
     if noise:
-        share = _noise_share(rollouts, target, noise)
-        settings = replace(settings, reproduced=settings.reproduced + share)
+        rollouts = with_clean(rollouts, noise, components, line=line)
+        settings = replace(settings, reproduced=settings.reproduced_noisy)
     kinds = kinds_of(len(target), components, settings, line=line)
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load
         for kind in kinds:
-            error = _error(kind, rollouts, target, settings, min(judged.values(), default=np.inf))
+            least = min(judged.values(), default=np.inf)
+            error = _error(kind, rollouts, target, settings, least, noise)
             if error is not None:
                 judged[kind] = error
                 if error <= settings.reproduced:
@@ -98,18 +100,24 @@ def fit_field_model(
         enough = max(settings.reproduced, settings.better * min(judged.values()))
         good = [kind for kind, error in judged.items() if error <= enough]
         for kind in sorted(good, key=lambda kind: kind.unknowns):
-            model = _fitted(kind, rollouts)
+            model = _fitted(kind, rollouts, noise)
             if model is not None:
                 seen = [(kind.name, error) for kind, error in judged.items()]
                 return FittedModel(model, judged[kind], seen)
     return None
 
 
-def _noise_share(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
-    """The share of noise in sum |z - z_r|^2 of the rollouts: the E of a perfect model."""
-    states = np.concatenate([finite(rollout).states for rollout in rollouts])
-    total = float(np.sum((states - target) ** 2))
-    return min(noise**2 * states.size / total, 1.0) if total > 0.0 else 0.0
+def with_clean(
+    rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
+) -> list[Measured]:
+    """The rollouts with their states without what of the noise can be told from them."""
+    rollouts = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
+    clean = [denoised(rollout.states, noise) for rollout in rollouts]
+    if line and rollouts:
+        first = smoothed(np.stack([r.states[0] for r in rollouts]), noise, components)
+        for own, state in zip(clean, first, strict=True):
+            own[0] = state
+    return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
 
 def _error(
@@ -118,6 +126,7 @@ def _error(
     target: Array,
     settings: FieldModelSettings,
     least: float,
+    noise: float,
 ) -> float | None:
     """E of a kind, its mean over the rollouts; None where there is nothing to fit or to judge.
 
@@ -130,23 +139,25 @@ def _error(
     found: list[float] = []
     for fold in range(folds):
         others = [rollout for i, rollout in enumerate(rollouts) if i % folds != fold]
-        model = _fitted(kind, others or rollouts)
+        model = _fitted(kind, others or rollouts, noise)
         own = rollouts[fold::folds]
         if model is None:
             return None
-        found += errors(model, own, target, settings.worst).tolist()
+        found += errors(model, own, target, settings.worst, noise).tolist()
         if found and np.mean(found) > settings.hopeless * max(least, settings.reproduced):
             break
     return float(np.mean(found)) if found else None
 
 
-def _fitted(kind: Kind, rollouts: Sequence[Measured]) -> FieldModel | None:
+def _fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:
     """A fit, or None where the data overflow it."""
     samples = Samples.of(rollouts)
     if len(samples) < FEWEST_SAMPLES:
         return None
     try:
         with np.errstate(all="ignore"):
+            if noise and kind.fit_noisy is not None:
+                return kind.fit_noisy(rollouts, noise)
             return kind.fit(samples)
     except (np.linalg.LinAlgError, ValueError, FloatingPointError):
         return None

@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from loop_method.models.base import FieldModel, Samples
+from loop_method.models.base import FieldModel, Measured, Samples
 from loop_method.models.finite_difference import features_of
 from loop_method.models.finite_difference_fit import fit_finite_difference
 from loop_method.models.linear import fit_convolution, fit_linear
 from loop_method.models.low_rank import fit_low_rank
+from loop_method.models.noisy_fit import fit_noisy
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral_fit import fit_spectral
 from loop_method.models.symbols import Form
@@ -48,11 +49,15 @@ class Kind:
         The model of samples, or None.
     unknowns : (float, int)
         Those of each point or wavenumber, by which kinds are compared first, and those that all share.
+    fit_noisy : callable, optional
+        The model of rollouts whose states have noise of a known standard deviation, or None; without
+        it, `fit` is given the states without what of their noise can be told from them.
     """
 
     name: str
     fit: Callable[[Samples], FieldModel | None]
     unknowns: tuple[float, int]
+    fit_noisy: Callable[[Sequence[Measured], float], FieldModel | None] | None = None
 
 
 def kinds_of(
@@ -71,10 +76,7 @@ def kinds_of(
     if not line:
         return kinds + _linear(n_z, settings)
     if components == 1 and n_z >= FEWEST_POINTS:
-        kinds += [
-            Kind(form.name, partial(fit_spectral, form=form, settings=settings), form.unknowns)
-            for form in FORMS
-        ]
+        kinds += [_spectral(form, settings) for form in FORMS]
     kinds += _several_fields(n_z, components, settings)
     if components == 1:  # two fields, of which nobody has told
         two = _several_fields(n_z, 2, settings, "two-")
@@ -82,6 +84,17 @@ def kinds_of(
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
     return kinds + _linear(n_z, settings)
+
+
+def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
+    fit = partial(fit_spectral, form=form, settings=settings)
+    if form.free != "none":
+        return Kind(form.name, fit, form.unknowns)
+
+    def noisy(rollouts: Sequence[Measured], noise: float) -> FieldModel | None:
+        return fit_noisy(rollouts, form, settings, noise)
+
+    return Kind(form.name, fit, form.unknowns, noisy)
 
 
 def _linear(n_z: int, settings: FieldModelSettings) -> list[Kind]:

@@ -14,11 +14,11 @@ from loop_method.models.base import FieldModel, Law, Measured
 
 
 def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
-    """z_0 .. z_L of each rollout from its measured z_0, under its law or else its actions.
+    """z_0 .. z_L of each rollout from its z_0 as it is best known, under its law or else its actions.
 
     They end before the first state that is not finite.
     """
-    z = np.array([rollout.states[0] for rollout in rollouts], dtype=np.float64)
+    z = np.array([rollout.known[0] for rollout in rollouts], dtype=np.float64)
     steps = np.array([len(rollout.actions) for rollout in rollouts])
     alive, found = steps > 0, [[state.copy()] for state in z]
     with np.errstate(all="ignore"):
@@ -39,19 +39,30 @@ def _action(rollout: Measured, k: int, z: Array) -> Array:
     return rollout.actions[k : k + 1] if rollout.law is None else rollout.law(k, z)
 
 
-def errors(model: FieldModel, rollouts: Sequence[Measured], target: Array, worst: float) -> Array:
+def errors(
+    model: FieldModel,
+    rollouts: Sequence[Measured],
+    target: Array,
+    worst: float,
+    noise: float = 0.0,
+) -> Array:
     """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
 
     Of a rollout that ends in values that are not finite, those before count; one without two states
-    that are finite is left out.
+    that are finite is left out. What noise on every number of the states is expected to have in both
+    sums is subtracted from them: it is no fault of the model.
     """
     kept = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
     found = np.full(len(kept), float(worst))
     for i, (rollout, states) in enumerate(zip(kept, predicted(model, kept), strict=True)):
         if len(states) == len(rollout.states):
             with np.errstate(all="ignore"):
-                error = np.sum((states - rollout.states) ** 2)
-                relative = error / np.sum((rollout.states - target) ** 2)
+                error = float(np.sum((states - rollout.states) ** 2))
+                size = float(np.sum((rollout.states - target) ** 2))
+                if noise:
+                    share = noise**2 * states.size
+                    error, size = max(error - share, 0.0), max(size - share, share)
+                relative = np.divide(error, size)
             found[i] = min(worst, float(np.nan_to_num(relative, nan=worst)))
     return found
 
@@ -60,7 +71,8 @@ def finite(rollout: Measured) -> Measured:
     """The rollout up to the first value that is not finite, with one state more than actions."""
     states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
     steps = min(_leading(np.isfinite(actions)), max(_leading(np.isfinite(states)) - 1, 0))
-    return Measured(states[: steps + 1], actions[:steps], rollout.law)
+    clean = None if rollout.clean is None else rollout.clean[: steps + 1]
+    return Measured(states[: steps + 1], actions[:steps], rollout.law, clean)
 
 
 def _leading(good: NDArray[np.bool_]) -> int:
@@ -74,7 +86,10 @@ def pieces(rollout: Measured, count: int) -> list[Measured]:
     edges = [steps * part // count for part in range(count + 1)]
     return [
         Measured(
-            rollout.states[begin : end + 1], rollout.actions[begin:end], _later(rollout.law, begin)
+            rollout.states[begin : end + 1],
+            rollout.actions[begin:end],
+            _later(rollout.law, begin),
+            None if rollout.clean is None else rollout.clean[begin : end + 1],
         )
         for begin, end in pairwise(edges)
         if end > begin

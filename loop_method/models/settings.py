@@ -54,6 +54,21 @@ class FieldModelSettings:
         The E that counts for a model that diverges, at least 1.
     dense : int
         Largest state of models whose work grows with its square, at least 2.
+    reproduced_noisy : float
+        As `reproduced`, where there is measurement noise, which leaves initial states uncertain.
+    noisy_steps : int
+        As `samples`, of data with measurement noise, at least 50.
+    noisy_power : float
+        Times the power of the noise that a wavenumber must have on the average to be compared, at
+        least 1.
+    significance : float
+        Standard errors that a coefficient must have to be kept where there is noise, 0 to 10.
+    least_correction : float
+        Least share of an innovation that corrects the states, 0 to 1.
+    growth : float
+        Largest growth of the linear part within a window, in powers of e, 0.1 to 10.
+    relative_error : float
+        Error of a window, besides the noise, as a share of the change within it, 0 to 1.
     """
 
     passes: int = 12
@@ -75,3 +90,10 @@ class FieldModelSettings:
     hopeless: float = 20.0
     worst: float = 2.0
     dense: int = 512
+    reproduced_noisy: float = 0.05
+    noisy_steps: int = 2000
+    noisy_power: float = 3.0
+    significance: float = 3.0
+    least_correction: float = 0.02
+    growth: float = 1.5
+    relative_error: float = 0.02

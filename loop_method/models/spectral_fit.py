@@ -83,7 +83,7 @@ def fit_spectral(
         tried = replace(found, substeps=substeps_of(found.symbols, largest, settings))
     if best is None:
         return None
-    return replace(best, fewer=_fewer(best.symbols, largest, best.substeps, settings))
+    return replace(best, fewer=fewer_of(best.symbols, largest, best.substeps, settings))
 
 
 def _between(first: SpectralModel, second: SpectralModel) -> SpectralModel:
@@ -158,7 +158,7 @@ def substeps_of(symbols: Spectrum, largest: float, settings: FieldModelSettings)
     return int(_counts(symbols, largest, settings)[-1])
 
 
-def _fewer(symbols: Spectrum, largest: float, most: int, settings: FieldModelSettings) -> Array:
+def fewer_of(symbols: Spectrum, largest: float, most: int, settings: FieldModelSettings) -> Array:
     """`fewer` of a `SpectralModel`: each row has about half as many steps again as the one before."""
     counts, rows, steps = _counts(symbols, largest, settings), [], 1
     while steps < most:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_method.models.columns import Values
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral import Spectrum
 
@@ -81,8 +82,8 @@ class Regression:
     y: Spectrum
     W: Spectrum
     phi: Spectrum
-    common: Array
-    free_of_common: Array
+    common: Values
+    free_of_common: Values
     miss: float
 
     def rest(self, values: Spectrum) -> Spectrum:
@@ -90,6 +91,12 @@ class Regression:
         q = self.free_of_common
         projected: Spectrum = values - q @ (q.T @ values)
         return projected
+
+    def coefficients(
+        self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
+    ) -> Array:
+        """Real coefficients of complex columns (N, terms) that explain values (N,) best."""
+        return _real_least_squares(columns, values, settings)
 
     @property
     def k(self) -> Spectrum:
@@ -101,7 +108,8 @@ class Regression:
 
 def polynomial(data: Regression, form: Form, turn: int, settings: FieldModelSettings) -> Symbols:
     """Polynomials of ik."""
-    k, compared = data.k, form.compared(len(data.k), turn)
+    k = data.k
+    compared = min(form.compared(len(k), turn), data.y.shape[1])
     low = slice(compared)
     rests = [data.rest(W[:, low]) for W in data.W]
     terms = [(0, k**j) for j in range(form.linear_order + 1)]
@@ -111,7 +119,7 @@ def polynomial(data: Regression, form: Form, turn: int, settings: FieldModelSett
     powers = _power_terms(form)
     terms += [(p, k**j) for p, j in powers]
     columns = np.stack([(rests[p] * term[low]).ravel() for p, term in terms], axis=1)
-    found = _real_least_squares(columns, data.rest(data.y[:, low]).ravel(), settings)
+    found = data.coefficients(columns, data.rest(data.y[:, low]).ravel(), settings)
     linear = data.symbols[0] + sum(
         coefficient * term for coefficient, (_, term) in zip(found[:count], terms, strict=False)
     )

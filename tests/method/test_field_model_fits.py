@@ -229,18 +229,3 @@ def test_kinds_for_large_states_have_no_matrix_of_their_size():
     large = {kind.name for kind in kinds_of(514, 1, settings)}
     assert small - large == {"linear", "linear1e-4", "two-convolution"}
     assert "convolution" not in {kind.name for kind in kinds_of(514, 2, settings)}
-
-
-def test_what_noise_has_in_the_error_is_no_fault_of_a_model():
-    rollouts, target = explored(AllenCahnModes(), 0.01, 1, 3)
-    rng, noise = np.random.default_rng(4), 0.01
-    noisy = [
-        replace(rollout, states=rollout.states + noise * rng.normal(size=rollout.states.shape))
-        for rollout in rollouts
-    ]
-    # Not to be tried further, as no model predicts noise.
-    strict = FieldModelSettings(reproduced=1e-6, hopeless=1e9)
-    told = fit_field_model(noisy, target, settings=strict, noise=10 * noise)
-    assert told is not None and [kind for kind, _ in told.candidates] == ["poly3"]
-    size = np.mean([np.mean((rollout.states - target) ** 2) for rollout in noisy])
-    assert 1e-6 < told.error < (10 * noise) ** 2 / size

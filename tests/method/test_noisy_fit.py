@@ -1,0 +1,139 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""An equation from rollouts with measurement noise, against the one that made them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_interfaces.arrays import Array
+from loop_method.models.base import Measured, Samples
+from loop_method.models.choice import fit_field_model, with_clean
+from loop_method.models.denoising import smoothed
+from loop_method.models.filtering import filtered
+from loop_method.models.kinds import FORMS
+from loop_method.models.noisy_fit import fit_noisy, significant
+from loop_method.models.prediction import errors
+from loop_method.models.settings import FieldModelSettings
+from loop_method.models.spectral import SpectralModel
+from loop_method.models.spectral_fit import fit_spectral
+
+POINTS, ACTUATORS, STEPS, NOISE = 64, 4, 60, 0.2
+SETTINGS = FieldModelSettings()
+CUBIC = next(form for form in FORMS if form.name == "poly3")
+TARGET = np.zeros(POINTS)
+
+
+def reaction_diffusion() -> SpectralModel:
+    """u_t = 0.05 u - 0.05 u^3 + nu u_xx + B a, per sampling time, with box actuators."""
+    k = np.arange(POINTS // 2 + 1)
+    powers = np.zeros((2, len(k)), complex)
+    powers[1] = -0.05
+    B = np.zeros((POINTS, ACTUATORS))
+    for j in range(ACTUATORS):
+        B[16 * j + 4 : 16 * j + 12, j] = 0.05
+    linear = (0.05 - 4e-4 * k**2).astype(complex)
+    return SpectralModel("true", linear, powers, np.eye(2), B, np.zeros(POINTS), 4)
+
+
+def rollouts_of(
+    model: SpectralModel, count: int, noise: float = NOISE
+) -> tuple[list[Array], list[Measured]]:
+    """States without noise, and rollouts with it, from fields of four random modes."""
+    rng, x = np.random.default_rng(0), 2 * np.pi * np.arange(POINTS) / POINTS
+    true, measured = [], []
+    for _ in range(count):
+        z = np.zeros(POINTS)
+        for j in range(1, 5):
+            z += rng.standard_normal() * np.cos(j * x) + rng.standard_normal() * np.sin(j * x)
+        states, actions = [0.5 * z], 2.0 * rng.standard_normal((STEPS, ACTUATORS))
+        for a in actions:
+            states.append(model.step(states[-1][None], a[None])[0])
+        true.append(np.array(states))
+        noisy = true[-1] + noise * rng.standard_normal(true[-1].shape)
+        measured.append(Measured(noisy, actions))
+    return true, measured
+
+
+TRUE, ROLLOUTS = rollouts_of(reaction_diffusion(), 5)
+
+
+def error_in(model: SpectralModel, states: Sequence[Array]) -> float:
+    exact = [Measured(z, r.actions) for z, r in zip(states, ROLLOUTS, strict=True)]
+    return float(errors(model, exact, TARGET, 2.0).mean())
+
+
+def test_noise_leaves_the_equation_right() -> None:
+    known = with_clean(ROLLOUTS, NOISE)
+    model = fit_noisy(known, CUBIC, SETTINGS, NOISE)
+    assert model is not None
+    assert error_in(model, TRUE) < 0.02
+    # What is fitted as if it were exact is far off: noise is taken for decay.
+    naive = fit_spectral(Samples.of(ROLLOUTS), CUBIC, SETTINGS)
+    assert naive is None or error_in(naive, TRUE) > 100 * error_in(model, TRUE)
+    low = slice(1, 6)
+    assert model.symbols[0, low].real == pytest.approx(
+        reaction_diffusion().linear[low].real, abs=8e-3
+    )
+
+
+def test_the_same_rollouts_give_the_same_bits() -> None:
+    known = with_clean(ROLLOUTS[:2], NOISE)
+    first, second = (fit_noisy(known, CUBIC, SETTINGS, NOISE) for _ in range(2))
+    assert first is not None and second is not None
+    assert first.symbols.tobytes() == second.symbols.tobytes()
+    assert first.B.tobytes() == second.B.tobytes()
+
+
+def test_the_choice_believes_it_and_says_what_noise_does_not_explain() -> None:
+    _, rollouts = rollouts_of(reaction_diffusion(), 5, 0.05)
+    found = fit_field_model(rollouts, TARGET, noise=0.05)
+    assert found is not None and found.model.kind.startswith("poly")
+    assert found.error < 0.01
+
+
+def test_the_error_of_the_true_model_is_nothing_but_noise() -> None:
+    exact = [Measured(r.states, r.actions, clean=z) for r, z in zip(ROLLOUTS, TRUE, strict=True)]
+    share = NOISE**2 * sum(r.states.size for r in ROLLOUTS)
+    share /= sum(float(np.sum(r.states**2)) for r in ROLLOUTS)
+    assert errors(reaction_diffusion(), exact, TARGET, 2.0).mean() > 0.5 * share
+    assert errors(reaction_diffusion(), exact, TARGET, 2.0, NOISE).mean() < 0.05 * share
+
+
+def test_filtered_states_are_better_than_measured_ones() -> None:
+    known = with_clean(ROLLOUTS, NOISE)
+    found = filtered(
+        reaction_diffusion(), known, [r.known[0] for r in known], np.full(POINTS // 2 + 1, 0.1)
+    )
+    error = np.mean([np.mean((z - t)[20:] ** 2) for z, t in zip(found.states, TRUE, strict=True)])
+    # Without an error of the model, a gain g leaves at most g / (2 - g) of the noise.
+    assert error < 0.1 / 1.9 * NOISE**2
+    assert not found.lost
+
+
+def test_a_gain_of_one_is_what_was_measured() -> None:
+    known = with_clean(ROLLOUTS[:1], NOISE)
+    ones = np.ones(POINTS // 2 + 1)
+    found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones)
+    np.testing.assert_allclose(found.states[0], known[0].states, atol=1e-12)
+
+
+def test_smoothing_keeps_what_is_above_the_noise() -> None:
+    rng = np.random.default_rng(1)
+    fields = np.cos(4 * np.pi * np.arange(256) / 256) + 0.1 * rng.standard_normal((8, 256))
+    clean = smoothed(fields, 0.1)
+    # Of 128 wavenumbers one has the field; with 8 draws a power is known to a third.
+    assert np.mean((clean - np.cos(4 * np.pi * np.arange(256) / 256)) ** 2) < 0.2 * 0.1**2
+
+
+def test_what_is_no_larger_than_chance_is_left_out() -> None:
+    rng = np.random.default_rng(2)
+    columns: Any = rng.standard_normal((400, 5)) + 1j * rng.standard_normal((400, 5))
+    values = 2.0 * columns[:, 1] - 0.5 * columns[:, 3]
+    values = values + rng.standard_normal(400) + 1j * rng.standard_normal(400)
+    found = significant(columns, values, 1.0, SETTINGS)
+    assert np.flatnonzero(found).tolist() == [1, 3]
+    assert found[[1, 3]] == pytest.approx([2.0, -0.5], abs=0.15)  # 4 standard errors
