@@ -108,9 +108,10 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     except ValueError as error:
         raise ParameterError(str(error)) from error
     if kind.needs_affine_law and law is not Affine and law.name not in kind.also_improves:
+        adapted = " and ".join((Affine.name, *kind.also_improves))
         raise ParameterError(
-            f"the optimizer '{values['optimizer']}' improves the gains of the law 'affine' alone, and "
-            f"the law is '{values['law']}'; take an optimizer that knows no law, such as two_point"
+            f"the optimizer '{values['optimizer']}' adapts no law but {adapted}, and the law is "
+            f"'{values['law']}'; take an optimizer that adapts any law, such as two_point"
         )
     if values["identification"] == "subspace" and law.name not in FILTERED:
         raise ParameterError(

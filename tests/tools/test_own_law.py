@@ -170,14 +170,18 @@ def test_a_file_alone_does_not_run_it(
         build_training(RunFolder(out).values())
 
 
-@pytest.mark.parametrize("optimizer", ["model_based", "gauss_newton"])
+@pytest.mark.parametrize(
+    ("optimizer", "adapted"),
+    [("model_based", "affine and observer"), ("gauss_newton", "affine")],
+)
 def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
-    optimizer: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    optimizer: str, adapted: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = ["train", str(SMALL), "--law", "feedforward", "--optimizer", optimizer]
     assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
     told = capsys.readouterr().err
-    assert "improves the gains of the law 'affine' alone, and the law is 'feedforward'" in told
+    assert f"adapts no law but {adapted}, and the law is 'feedforward'" in told
+    assert "such as two_point" in told
     assert told.count("\n") == 1 and not (tmp_path / "run").exists()
 
 
