@@ -24,6 +24,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.text import shown
 
 _executing: list[Path] = []
@@ -164,12 +165,13 @@ def name_of(kind: type) -> str:
     return f"{source}:{kind.__qualname__}"
 
 
+_SHIPPED = ("loop_method", "pde_sim_node", "pdeloop", "tuner_node", "controller_node")
 FAILURES = Exception, SystemExit
 """Exceptions that count as a failure of the user's own code, calls of exit among them."""
 
 
 def called(name: str, function: Callable[..., Any], *given: Any, module: str = "") -> Any:
-    """What a call of own code returns.
+    """What a call of own code returns; which one takes long is said meanwhile.
 
     name: as the sentence has it, Class.method; module: see `located`.
 
@@ -179,9 +181,17 @@ def called(name: str, function: Callable[..., Any], *given: Any, module: str = "
         It fails; one sentence with the line.
     """
     try:
-        return function(*given)
+        if _is_shipped(function):
+            return function(*given)
+        with LONG_CALLS.during(name):
+            return function(*given)
     except FAILURES as error:
         raise OwnCodeError(f"{name} fails: {located(error, module)}") from error
+
+
+def _is_shipped(function: Callable[..., Any]) -> bool:
+    """Whether it is code of this project, of which it is known how long it takes."""
+    return (getattr(function, "__module__", None) or "").partition(".")[0] in _SHIPPED
 
 
 def located(error: BaseException, module: str = "") -> str:

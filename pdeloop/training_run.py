@@ -298,7 +298,7 @@ class Waiting:
         warnings = [child.warning(time.time() - 2 * QUIET) for child in self._children]
         text = "; ".join(dict.fromkeys(filter(None, warnings)))
         words = re.sub(r"\d+", "", text)  # but for the seconds
-        if words != self._said:
+        if words and words != self._said:
             self._said = words
             self._tell(f"  {text}")
 

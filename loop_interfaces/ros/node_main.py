@@ -15,6 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, check_profile, is_confined, outside_sockets
+from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameter_file import read_parameter_file
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -65,6 +66,7 @@ def ros_node(
                 f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
                 f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
             )
+        LONG_CALLS.tell = node.get_logger().warning  # type: ignore[method-assign]
         loop = make_loop(node)
         for name_of_signal in signals:  # before there was a loop
             loop.stop(name_of_signal)

@@ -62,6 +62,17 @@ def test_an_episode_of_one_step_and_one_that_diverged_in_it_are_trajectories():
     assert np.array_equal(diverged.states, states[:1, 1]) and diverged.actions.shape == (0, 3)
 
 
+def test_what_comes_after_the_trajectories_were_taken_is_not_kept():
+    collector = TrajectoryCollector(RUN, 1)
+    for k in range(2):
+        collector.take("states", Frame(RUN, 1, k, 0.0, np.ones((1, 2))))
+    collector.take("actions", Frame(RUN, 1, 0, 0.0, np.ones((1, 3))))
+    assert len(collector.trajectories(0, 1, np.array([COMPLETED]))) == 1
+    kept = collector.nbytes
+    collector.take("states", Frame(RUN, 1, 2, 0.0, np.ones((1, 2))))
+    assert collector.nbytes == kept and not collector.contradiction
+
+
 def test_a_stranger_with_the_right_ids_fills_no_memory(monkeypatch):
     monkeypatch.setattr("tuner_node.trajectory_collector.MAX_BYTES", 100_000)
     served = dispatcher()
