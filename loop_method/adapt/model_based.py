@@ -276,19 +276,22 @@ class ModelBased(Optimizer):
         last = self._belief.model.kind if self._belief else ""
         belief = believe(self._context, self._measurements(), last)
         if self._of_readings:
-            most = settings.believed_readings
+            most = np.inf  # what a law costs is measured after every step
         if belief is not None:
-            row["model"], row["mismatch"] = belief.model.kind, belief.error
+            row["model"] = belief.model.kind
+            if np.isfinite(belief.error):
+                row["mismatch"] = belief.error
         if belief is None or not belief.error <= most:
-            reason = "no model of the whole field predicts the rollouts"
+            seen = "the readings" if self._of_readings else "the whole field"
+            reason = f"no model of {seen} predicts the rollouts"
             unknown = "its cost" if self._context.cost is not None else ""
             unknown = "its law" if isinstance(self._context.law, Observer) else unknown
-            if self._belief is None and unknown:
+            if self._belief is None and unknown and (final or not self._of_readings):
                 self._end(
                     row, f"{reason}, and local steps do not know {unknown}: the first law stays"
                 )
                 return
-            if self._belief is None:
+            if self._belief is None and not self._of_readings:
                 row["reason"] = f"{reason}: local steps"
                 self._begin_search(row)
                 return

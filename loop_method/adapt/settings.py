@@ -38,13 +38,6 @@ class ModelBasedSettings(Settings):
         0.0,
         1.0,
     )
-    believed_readings: float = setting(
-        1.0,
-        "the same of readings that are foreseen over a whole rollout, where a law with an observer "
-        "has few of them",
-        0.0,
-        10.0,
-    )
     readings_trust: float = setting(
         1.0,
         "weight of the distance from where a step on a model of readings begins; of a linear plant the "
