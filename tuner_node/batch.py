@@ -30,6 +30,17 @@ def most_environments(max_batch: int, state_size: int, horizon: int) -> int:
     return max(min(max_batch, fitting), 1)
 
 
+def less_often(numbers: int) -> int:
+    """How many times less often a message of so many numbers, or what asks for it, is repeated: 1 to 4.
+
+    A plant keeps itself for a run whose tuner it hears every ten seconds.
+
+    >>> less_often(1000), less_often(150_000), less_often(10**7)
+    (1, 2, 4)
+    """
+    return min(max(numbers // 2**16, 1), 4)
+
+
 @dataclass(frozen=True)
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.

@@ -34,7 +34,13 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
-from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, most_environments
+from tuner_node.batch import (
+    UNKNOWN_PLANT,
+    Batch,
+    BatchResult,
+    less_often,
+    most_environments,
+)
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.pair import Chunk, Pair, PairPublication
 
@@ -281,7 +287,7 @@ class Dispatcher:
         """
         publications: list[PairPublication] = []
         for pair in self.pairs:
-            due = now - pair.last_sent > REQUEST_PERIOD
+            due = now - pair.last_sent > REQUEST_PERIOD * self._less_often(pair, now)
             if pair.chunk is None:
                 if self.paused and pair.last_start is not None and due:
                     pair.last_sent = now
@@ -303,8 +309,18 @@ class Dispatcher:
                 if now < pair.paused_until:  # not silent either
                     pair.last_heard = now
                 if due:  # of a paused plant it keeps it for this run
-                    publications += self._request(pair, now)
+                    models = 0 if self._models is None else self._models.values.size
+                    again = pair.repeats % less_often(models) == 0
+                    pair.repeats += 1
+                    publications += self._request(pair, now, again=again)
         return publications + self._begin_episodes(now)
+
+    def _less_often(self, pair: Pair, now: float) -> int:
+        """A start is answered with a state, which may be large; a paused plant waits for starts."""
+        if pair.chunk is None or now < pair.paused_until:
+            return 1
+        rows = pair.chunk.rows
+        return less_often((rows.stop - rows.start) * self.state_size)
 
     def resend(self, now: float) -> list[PairPublication]:
         """Everything that is under way, once more."""

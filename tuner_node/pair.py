@@ -66,6 +66,8 @@ class Pair:
     episode: int = -1
     last_heard: float = 0.0
     last_sent: float = 0.0
+    repeats: int = 0
+    """How often it was asked again for what is under way."""
     samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
     former_samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
     """Samples of the previous episode, which a late one can still contradict."""
@@ -88,6 +90,7 @@ class Pair:
     def begin(self, chunk: Chunk, run: int, episode: int, now: float) -> None:
         """It works on a chunk from now on."""
         self.chunk, self.run, self.episode, self.last_heard = chunk, run, episode, now
+        self.repeats = 0
         self.former_samples, self.samples = self.samples, TrajectoryCollector(run, episode)
 
     def drop(self) -> Chunk:

@@ -347,6 +347,20 @@ def test_nothing_is_handed_to_an_absent_pair_and_a_silent_one_is_repeated():
     assert second.episode == first.episode + 1
 
 
+def test_large_states_and_models_are_asked_for_less_often():
+    """A start that is repeated is answered with a state, and a repeated model is as large as states."""
+    served = dispatcher(state_size=2**17, horizon=10, episode_timeout=1e3)
+    served.assign(batch(2), 0.0)
+    assert served.tick(7.9) == []
+    assert [send.topic for _, send in served.tick(8.1)] == [POLICY, START]
+    served.models(np.zeros((1, 2**12, 32)), 1)
+    sent = [[send.topic for _, send in served.tick(8.1 * n)] for n in range(2, 10)]
+    assert [MODEL in topics for topics in sent].count(True) == 4  # of eight, every second one
+    assert all(START in topics for topics in sent)
+    served.pairs[0].paused_until = 90.0  # a paused plant is kept for this run by starts as ever
+    assert [send.topic for _, send in served.tick(75.0)][-1:] == [START]
+
+
 def test_an_absent_pair_is_waited_for_when_it_is_the_only_one():
     served = dispatcher()
     ((_, start),) = starts(served.assign(batch(1), 0.0))
