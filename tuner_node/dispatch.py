@@ -25,7 +25,6 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from loop_interfaces import topics
 from loop_interfaces.arrays import Array
@@ -41,13 +40,13 @@ from tuner_node.batch import (
     less_often,
     most_environments,
 )
+from tuner_node.chunk import Chunk, gathered, messages_of
 from tuner_node.errors import ContradictionError, DispatchError
-from tuner_node.pair import Chunk, Pair, PairPublication
+from tuner_node.pair import Pair, PairPublication
+from tuner_node.targets import Targets
 
 SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
-MAX_TARGETS, MAX_TARGET_BYTES = 64, 2**28
-"""Plants whose targets are remembered until the run's own is known, and the bytes of all."""
 REQUEST_PERIOD = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
 PAUSE_LEASE = 10.0
@@ -98,7 +97,7 @@ class Dispatcher:
         self._batch: Batch | None = None
         self._models: Frame | None = None
         self._models_digest = 0
-        self._targets: dict[int, Array] = {}
+        self._targets = Targets()
         self._chunks: list[Chunk] = []
         self._waiting: list[Chunk] = []
         self._issued = 0
@@ -146,7 +145,7 @@ class Dispatcher:
             raise FrameError(f"expected costs of shape {shape}, got {frame.values.shape}")
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
-            self._targets = {p: target for p, target in self._targets.items() if p == self.plant}
+            self._targets.keep_only(self.plant)
         known.check_plant(frame, self.plant, now)
         self.sim_time = max(self.sim_time, frame.time)
         known.last_heard = now
@@ -205,19 +204,7 @@ class Dispatcher:
         """
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             return []
-        known = self._targets.get(frame.plant)
-        if known is None:
-            size = sum(target.nbytes for target in self._targets.values()) + frame.values.nbytes
-            if len(self._targets) == MAX_TARGETS or size > MAX_TARGET_BYTES:
-                raise FrameError(
-                    f"expected the targets of at most {MAX_TARGETS} plants, {MAX_TARGET_BYTES} bytes"
-                )
-            self._targets[frame.plant] = frame.values.copy()
-        elif not np.array_equal(known, frame.values):
-            raise ContradictionError(
-                f"two different targets came for the plant {frame.plant} of this run; expected one "
-                "plant with this fingerprint: stop the other and start a new run"
-            )
+        self._targets.take(frame)
         self.pairs[pair].announced.add(frame.plant)
         return []
 
@@ -227,7 +214,7 @@ class Dispatcher:
         True if `tick` must run now: the trajectory is complete, or a used sample was contradicted.
         Raises FrameError for a sample of another shape.
         """
-        known, target = self.pairs[pair], self._targets.get(frame.plant)
+        known, target = self.pairs[pair], self._targets.of(frame.plant)
         known.sample("states", frame, frame.values.shape[1] if target is None else len(target))
         last = known.pending_cost is not None and frame.step == known.pending_cost.step
         return last or any(samples.contradiction for samples in known.used_samples())
@@ -295,7 +282,8 @@ class Dispatcher:
             elif pair.pending_cost is not None:
                 self._collect(pair)
                 if pair.pending_cost is not None and now - pair.pending_since > SAMPLE_GRACE:
-                    lost = pair.lost_samples(len(self._targets.get(pair.pending_cost.plant, ())))
+                    target = self._targets.of(pair.pending_cost.plant)
+                    lost = pair.lost_samples(0 if target is None else len(target))
                     episode = episode_name(pair.episode)
                     self._retry(pair, f"the tuner missed {lost} samples of episode {episode}")
                 elif self._batch is not None:
@@ -333,17 +321,7 @@ class Dispatcher:
         if batch is None or not all(chunk.done(batch) for chunk in self._chunks):
             return None
         self._batch = None
-        costs = np.concatenate([chunk.costs for chunk in self._chunks if chunk.costs is not None])
-        models = [chunk.models for chunk in self._chunks if chunk.models is not None]
-        seen = [t for chunk in self._chunks for t in chunk.trajectories or ()]
-        return BatchResult(
-            costs,
-            np.concatenate(models) if models else None,
-            self.plant,
-            seen if batch.trajectories else None,
-            self._targets.get(self.plant),
-            frozenset(chunk.steps for chunk in self._chunks),
-        )
+        return gathered(self._chunks, batch, self.plant, self._targets.of(self.plant))
 
     def missing(self) -> list[str]:
         """The nodes that are missing on the network, in words."""
@@ -375,7 +353,7 @@ class Dispatcher:
         if pair.samples.contradiction:
             self._retry(pair, pair.samples.contradiction)
             return
-        target = self._targets.get(pair.pending_cost.plant)
+        target = self._targets.of(pair.pending_cost.plant)
         if target is not None and not pair.lost_samples(len(target)):
             pair.take_trajectories()
 
@@ -432,17 +410,8 @@ class Dispatcher:
         def frame(values: Array, plant: int = 0) -> Frame:
             return Frame(self.run, pair.episode, generation, self.sim_time, values, plant)
 
-        # The policy first: it is then mostly there when the first state arrives.
-        sends = (
-            [Publication(topics.MODEL, self._models)] if again and self._models is not None else []
-        )
-        rows = self._batch.rows[chunk.rows]
-        signed: list[ArrayLike] = [rows, self.action_limit]
-        if self._batch.policies is not None:
-            policies = self._batch.policies[chunk.rows]
-            sends.append(Publication(topics.POLICY, frame(policies)))
-            signed += [policies, self._models_digest]
-        start = Publication(topics.START, frame(rows, digest_of(*signed)))
-        pair.started(start)
-        sends.append(start)
+        sends = messages_of(self._batch, chunk, frame, self.action_limit, self._models_digest)
+        pair.started(sends[-1])
+        if again and self._models is not None:
+            sends.insert(0, Publication(topics.MODEL, self._models))
         return [(pair.number, send) for send in sends]

@@ -4,14 +4,13 @@
 import math
 from dataclasses import dataclass, field
 
-from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, VOID, CostColumn
-from loop_method.adapt import Trajectory
 from tuner_node.batch import Batch
+from tuner_node.chunk import Chunk
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
@@ -23,35 +22,6 @@ REMEMBERED = 16
 
 FOREIGN_PLANT_GRACE = 20.0
 """Seconds with costs of another plant only, after which the run stops."""
-
-
-@dataclass
-class Chunk:
-    """A part of the batch: `rows` of it, how often they were started, and their results."""
-
-    rows: slice
-    attempts: int = 0
-    costs: Array | None = None
-    steps: int = 0
-    models: Array | None = None
-    trajectories: list[Trajectory] | None = None
-
-    @property
-    def size(self) -> int:
-        """Number of its rows."""
-        return int(self.rows.stop - self.rows.start)
-
-    def done(self, batch: Batch) -> bool:
-        """Whether all results are there that the batch asks for."""
-        return (
-            self.costs is not None
-            and (self.models is not None or not batch.exploratory)
-            and (self.trajectories is not None or not batch.trajectories)
-        )
-
-    def clear(self) -> None:
-        """Forget the results."""
-        self.costs = self.models = self.trajectories = None
 
 
 @dataclass

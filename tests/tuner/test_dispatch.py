@@ -15,9 +15,10 @@ from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START, VOID
 from tests.support.small import dispatcher_of, same_bits
 from tuner_node.batch import Batch
-from tuner_node.dispatch import MAX_TARGET_BYTES, MAX_TARGETS, Dispatcher
+from tuner_node.dispatch import Dispatcher
 from tuner_node.errors import DispatchError
 from tuner_node.pair import FOREIGN_PLANT_GRACE, REMEMBERED
+from tuner_node.targets import MAX_TARGET_BYTES, MAX_TARGETS
 
 RUN = 42
 EXPLORATION = Batch(np.array([[3.0, 4.0, 0.1, 0.0]]), None)

@@ -1,0 +1,82 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A part of a batch that is one episode: what asks for it, and what comes of it. Pure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loop_interfaces import topics
+from loop_interfaces.arrays import Array
+from loop_interfaces.frames import Frame
+from loop_interfaces.protocol import Publication
+from loop_interfaces.signature import digest_of
+from loop_method.adapt import Trajectory
+from tuner_node.batch import Batch, BatchResult
+
+
+@dataclass
+class Chunk:
+    """A part of the batch: `rows` of it, how often they were started, and their results."""
+
+    rows: slice
+    attempts: int = 0
+    costs: Array | None = None
+    steps: int = 0
+    models: Array | None = None
+    trajectories: list[Trajectory] | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of its rows."""
+        return int(self.rows.stop - self.rows.start)
+
+    def done(self, batch: Batch) -> bool:
+        """Whether all results are there that the batch asks for."""
+        return (
+            self.costs is not None
+            and (self.models is not None or not batch.exploratory)
+            and (self.trajectories is not None or not batch.trajectories)
+        )
+
+    def clear(self) -> None:
+        """Forget the results."""
+        self.costs = self.models = self.trajectories = None
+
+
+def gathered(
+    chunks: Sequence[Chunk], batch: Batch, plant: int, target: Array | None
+) -> BatchResult:
+    """The results of all chunks, in the batch's order; plant and target: of the run."""
+    models = [chunk.models for chunk in chunks if chunk.models is not None]
+    seen = [t for chunk in chunks for t in chunk.trajectories or ()]
+    return BatchResult(
+        np.concatenate([chunk.costs for chunk in chunks if chunk.costs is not None]),
+        np.concatenate(models) if models else None,
+        plant,
+        seen if batch.trajectories else None,
+        target,
+        frozenset(chunk.steps for chunk in chunks),
+    )
+
+
+def messages_of(
+    batch: Batch,
+    chunk: Chunk,
+    frame: Callable[[Array, int], Frame],
+    action_limit: float,
+    models_digest: int,
+) -> list[Publication]:
+    """What asks for the episode of a chunk: the policies, if there are any, and the signed start.
+
+    frame: makes a message of the episode, with values and signature. The policy comes first: it is
+    then mostly there when the first state arrives.
+    """
+    sends, rows = [], batch.rows[chunk.rows]
+    signed: list[ArrayLike] = [rows, action_limit]
+    if batch.policies is not None:
+        policies = batch.policies[chunk.rows]
+        sends.append(Publication(topics.POLICY, frame(policies, 0)))
+        signed += [policies, models_digest]
+    return [*sends, Publication(topics.START, frame(rows, digest_of(*signed)))]
