@@ -57,6 +57,11 @@ def test_an_environment_is_bit_identical_in_any_batch_and_is_the_law(kind: type[
         np.testing.assert_allclose(own, np.clip(expected, -2.0, 2.0), atol=1e-12)
 
 
+@pytest.mark.parametrize(("kind", "remembers"), [(Affine, False), (Observer, True)])
+def test_a_law_of_one_model_remembers_as_its_kind_does(kind: type[Law], remembers: bool) -> None:
+    assert made(kind, count=1).remembers is remembers
+
+
 def test_the_affine_law_has_the_bits_of_its_compiled_form() -> None:
     policies, index, states = episode(Affine, 5)
     batch, projected = made(Affine), ProjectedLaw([m.U for m in models(2)], TARGET)

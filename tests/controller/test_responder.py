@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import pytest
 from controller_node.identification import DesignSettings
 from controller_node.policy import excitation
 from controller_node.responder import Responder
+from controller_node.run_state import MAX_RUNS, RunState, forget
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
@@ -72,6 +75,7 @@ def test_exploration_gives_the_model_of_the_same_trajectory_in_process(responder
     (send,) = explore(responder, 1)
     assert send.topic is MODEL_IDENTIFIED
     assert same_bits(send.frame.values, models())
+    assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, 0)
     (again,) = responder.cost(Frame(RUN, 1, 30, 1.0, COSTS))
     assert same_bits(again.frame.values, send.frame.values)
 
@@ -377,6 +381,36 @@ def test_of_two_different_states_that_wait_neither_is_answered(responder):
     assert responder.state(state) == responder.state(replace(state, values=state.values + 1)) == []
     assert responder.start(start(1, (1, 2, 0.1, 0))) == []
     assert len(responder.state(state)) == 1
+
+
+def test_an_exploration_waits_for_its_start_and_the_target_alone():
+    made = Responder(SETTINGS)
+    state = Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1])).copy())
+    assert made.waits_for() == [] and made.state(state) == []
+    assert made.waits_for() == ["episode/start", "target"]
+    made.start(start(1, (1, 2, 0.1, 0)))
+    assert made.waits_for() == ["target"]
+    assert len(made.target(target())) == 1 and made.waits_for() == []
+
+
+def test_of_more_runs_than_are_kept_the_least_recently_used_one_goes():
+    known = OrderedDict((number, number) for number in range(MAX_RUNS))
+    forget(known, 3, 0)
+    assert list(known) == [*(n for n in range(MAX_RUNS) if n != 3), 3]
+    known[77] = 77
+    forget(known, 77, 0)
+    assert list(known) == [0, *(n for n in range(2, MAX_RUNS) if n != 3), 3, 77]
+    forget(known, 77, 0, full=lambda: len(known) > 3)
+    assert list(known) == [0, 3, 77]
+
+
+def test_a_run_takes_the_bytes_of_all_that_is_kept_of_it():
+    one = Frame(RUN, 1, 0, 0.0, np.ones((1, 4)))
+    state = RunState(start=one)
+    state.policies.append(replace(one, values=np.ones((1, 4, 8))))
+    assert state.nbytes == 8 * (4 + 32)
+    state.laws[3] = ((1,), SimpleNamespace(nbytes=1000))
+    assert state.nbytes == 8 * (4 + 32) + 1000
 
 
 def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(responder):

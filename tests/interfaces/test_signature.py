@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from dataclasses import asdict, replace
+from hashlib import blake2b
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.signature import DESIGN, design_digest
+from loop_interfaces.signature import DESIGN, design_digest, digest_of
 from loop_interfaces.topics import (
     COMPLETED,
     COST,
@@ -325,6 +327,12 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     # empty, and the last two with another law than the affine one.
     assert {*DESIGN, "n_a", "action_limit", "cost", "constants", "law", "horizon"} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
+
+
+def test_a_digest_is_the_first_53_bits_of_blake2b_as_a_stand_in_computes_it():
+    raw = struct.pack("<3d", 1.0, -2.5, 3.0)
+    first = int.from_bytes(blake2b(raw, digest_size=8).digest(), "big") // 2**11
+    assert digest_of([1.0, -2.5], 3.0) == first < 2**53
 
 
 @pytest.mark.parametrize("name", ["identification_settings.energy", "law_settings.gain"])

@@ -293,6 +293,19 @@ def test_what_is_recorded_of_a_plant_is_what_was_kept_last(tmp_path):
         assert (again.paused, again.signed) == (paused, signed)
 
 
+def test_an_action_advances_the_plant_at_once_unless_it_is_paused_or_paced():
+    protocol = plant_protocol()
+    assert protocol.awaiting is None
+    (sent,) = protocol.start(start(1), 0.0)
+    assert protocol.awaiting is not None and protocol.awaiting.step == sent.frame.step
+    protocol.pause(0.0)
+    assert protocol.awaiting is None
+    protocol.resume(0.0)
+    assert protocol.awaiting is not None
+    protocol.adjust(0.0, Timing(0.1, 3, 10.0, real_time_factor=1.0))
+    assert protocol.awaiting is None
+
+
 def test_a_paused_plant_says_so_once_a_second():
     protocol = plant_protocol()
     protocol.pause(0.0)

@@ -19,6 +19,21 @@ ARGUED: dict[tuple[str, str, str], str] = {
     ): "the step is not looked at where the episode is none",
     (
         "controller_node.responder",
+        "self._ended = (-1, -1)",
+        "1 -> 2",
+    ): "no run and no episode has either number",
+    (
+        "controller_node.exploration",
+        "self.nbytes = 0",
+        "0 -> 1",
+    ): "a byte among the hundreds of megabytes that are allowed",
+    (
+        "loop_interfaces.signature",
+        'return (int.from_bytes(state.digest(), "big") >> 11) or 1',
+        "1 -> 2",
+    ): "one of 2^53 texts has the digest 0",
+    (
+        "controller_node.responder",
         "self._served = (-1, -1)",
         "1 -> 2",
     ): "no run and no plant has either number",

@@ -116,6 +116,7 @@ def plant(mutant: Mutant) -> None:
             function.__code__ = code
 
 
+@functools.cache
 def _source(name: str) -> str:
     return Path(str(importlib.import_module(name).__file__)).read_text()
 
@@ -186,6 +187,8 @@ def tried(mutants: list[Mutant]) -> Iterator[tuple[Mutant, str]]:
 
 def prepare(modules: list[str]) -> None:
     """Import and compute what every mutant needs. AssertionError if the tests fail without any."""
+    for module in TESTS:
+        _source(module)  # as it is imported here, also where it is edited meanwhile
     for iterations in (0, 1, 4):
         for own_plant in (False, True):
             for law in ("affine", "observer") if iterations else ("affine",):

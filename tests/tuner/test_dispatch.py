@@ -396,6 +396,19 @@ def test_the_work_of_a_pair_that_died_while_all_were_busy_goes_to_the_first_free
     assert result.costs[:, 0].tolist() == [0.0, 1.0]
 
 
+@pytest.mark.parametrize("design", [0, 5])
+def test_a_tuner_looks_at_a_models_signature_if_it_knows_how_models_are_identified(design):
+    served = dispatcher(design=design)
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
+    model = Frame(RUN, start.episode, 0, -12345.0, np.ones((1, 9, 2)))  # signed by somebody
+    if design:
+        with pytest.raises(FrameError, match="identified with the parameters of this run"):
+            served.model(0, model, 0.0)
+    else:
+        served.model(0, model, 0.0)
+    assert (served.pairs[0].chunk.models is None) == bool(design)
+
+
 def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason():
     served = dispatcher()
     ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
