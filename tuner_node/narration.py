@@ -139,8 +139,28 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     elif worse := _worse_than_lqt(summary):
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
+    lines += [f"  {text}" for text in differences(summary)]
     lines += _reasons(summary)
     return [*lines, f"  results in {folder}"] if folder else lines
+
+
+def differences(summary: Row) -> list[str]:
+    """By how much adapted laws differ from the LQT law on the same fields, and how sure that is."""
+    known = [own.get("against_lqt") for own in summary.get("outcome", [])]
+    if not any(known):
+        return []
+    if len(known) > 1:
+        found = [own for own in known if own]
+        less, more = sum(own["high"] < 0 for own in found), sum(own["low"] > 0 for own in found)
+        return [
+            f"on the same fields (95 % intervals) the adapted law costs less than the LQT law for "
+            f"{less} of {len(known)} seeds, more for {more}"
+        ]
+    (own,) = known
+    return [
+        f"adapted less LQT on the same {own['fields']} fields: {own['change']:.4g} "
+        f"(95 % interval {own['low']:.4g} to {own['high']:.4g})"
+    ]
 
 
 def _reasons(summary: Row) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Affine
@@ -17,6 +18,11 @@ from tuner_node.training import Training
 
 WORDS = ("event", "role", "model", "chosen", "reason")
 """Entries of a row of the history that are not numbers."""
+LQT, ADAPTED = EVALUATED.index("lqt"), EVALUATED.index("adapted")
+DIFFERENCE = ("change", "low", "high", "fields")
+"""Entries of a `difference`."""
+CONFIDENCE = 0.95
+"""Of the interval of a difference of costs."""
 WORSE_THAN_NONE = "worse than no control"
 
 
@@ -46,7 +52,7 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError("its 'versions' or 'environment' are not a table of texts")
     outcome = content.get("outcome", [])
     if not isinstance(outcome, list) or not all(
-        _texts(own) and {"verdict", "reason"} <= set(own) for own in outcome
+        isinstance(own, dict) and _outcome(own) for own in outcome
     ):
         raise ValueError("its 'outcome' is not a list of verdicts with reasons")
     controller = content.get("controller", {})
@@ -68,6 +74,17 @@ def check_history(history: object, seed: int, seeds: int) -> None:
             raise ValueError("its 'history' is not a list of rows of numbers")
         if type(row.get("rollouts")) is not int or row.get("seed") not in range(seed, seed + seeds):
             raise ValueError("its 'history' has a row without 'seed' or 'rollouts'")
+
+
+def _outcome(own: Mapping[str, Any]) -> bool:
+    """Whether this is the verdict on a seed, its reason, and the difference if it has one."""
+    if not (isinstance(own.get("verdict"), str) and isinstance(own.get("reason"), str)):
+        return False
+    known = own.get("against_lqt")
+    return known is None or (
+        isinstance(known, dict)
+        and all(isinstance(known.get(name), int | float) for name in DIFFERENCE)
+    )
 
 
 def _texts(table: object) -> bool:
@@ -124,6 +141,7 @@ def summarise(training: Training) -> dict[str, Any]:
             {
                 "verdict": verdict(*mean[m].tolist(), changed=moved),
                 "reason": last_reason(training.history, training.settings.seed + m),
+                "against_lqt": difference(costs[m, LQT], costs[m, ADAPTED]) if moved else None,
             }
             for m, moved in enumerate(changed)
         ],
@@ -148,6 +166,25 @@ def verdict(none: float, lqt: float, adapted: float, *, changed: bool) -> str:
     if not changed:
         return "the first law"
     return "better" if adapted <= lqt else "worse than the first law"
+
+
+def difference(before: Sequence[float], after: Sequence[float]) -> dict[str, Any] | None:
+    """The mean change of the cost over pairs of rollouts from the same fields, and its interval.
+
+    Student's t: of 95 % of all draws of as many fields, the interval has the mean over the whole
+    distribution in it. None of fewer than two fields.
+
+    >>> difference([2.0, 3.0, 4.0], [1.0, 1.5, 3.5])
+    {'change': -1.0, 'low': -2.242, 'high': 0.2421, 'fields': 3}
+    """
+    changes = np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64)
+    count = len(changes)
+    if count < 2:
+        return None
+    mean = float(changes.mean())
+    reach = float(changes.std(ddof=1) / np.sqrt(count) * stdtrit(count - 1, 0.5 + CONFIDENCE / 2))
+    numbers = {"change": mean, "low": mean - reach, "high": mean + reach}
+    return {name: float(f"{value:.4g}") for name, value in numbers.items()} | {"fields": count}
 
 
 def last_reason(history: Sequence[Mapping[str, Any]], seed: int) -> str:

@@ -24,7 +24,7 @@ from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row,
 from loop_method.adapt.gauss_newton import GaussNewton, GaussNewtonSettings
 from loop_method.adapt.renewal import mean_and_error
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE
+from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, NONE, size_of
 from loop_method.seeds import field_seed
 
 COMPARING, SEARCHING, CONFIRMING, ENDED = "comparing", "searching", "confirming", "ended"
@@ -181,7 +181,9 @@ class LocalSearch:
             change, deviation = mean_and_error(after - before)
             row["predicted_change"], row["deviation"] = change, deviation
             better = change + self._settings.confidence * deviation < 0.0
-            row["reason"] = f"{'better' if better else 'not better'} by more than chance"
+            base = NONE if self._from_none else FIRST
+            size = size_of(ADAPTED, base, change, deviation)
+            row["reason"] = size if better else f"{NO_OTHER}: {size}"
         row["chosen"] = ADAPTED if better else NONE if self._from_none else FIRST
         if not better:
             self.policy = self._start.copy()

@@ -15,7 +15,7 @@ fields that were left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.renewal import mean_and_error
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
+NAMES = {FIRST: "the first law", ADAPTED: "the adapted law", NONE: "no control"}
+NO_OTHER = "no other law is better by more than chance"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,8 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
 
     confidence: standard errors by which another law has to be better.
     """
-    stays = Verdict(base, 0.0, 0.0, "no other law is better by more than chance")
+    stays = Verdict(base, 0.0, 0.0, NO_OTHER)
+    missed: list[str] = []
     lost = bool(np.isinf(evidence[base].excess).any())
     own_value, own_error = _corrected(evidence[base])
     found: list[Verdict] = []
@@ -79,8 +82,23 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
                 Verdict(name, own.change, own.deviation, f"a rollout of '{base}' diverged")
             )
         elif change + confidence * deviation < 0.0:
-            found.append(Verdict(name, change, deviation, "better by more than chance"))
+            found.append(Verdict(name, change, deviation, size_of(name, base, change, deviation)))
+        else:
+            missed.append(size_of(name, base, change, deviation))
+    if missed and stays.reason == NO_OTHER:
+        stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
     return min(found, key=lambda verdict: verdict.change, default=stays)
+
+
+def size_of(name: str, base: str, change: float, deviation: float) -> str:
+    """A difference with its standard error, in words.
+
+    >>> size_of(ADAPTED, FIRST, -4.116, 1.179)
+    'the adapted law costs 4.116 (standard error 1.2) less than the first law'
+    """
+    law, other = (NAMES[own] for own in (name, base))
+    more = "less" if change < 0.0 else "more"
+    return f"{law} costs {abs(change):.4g} (standard error {deviation:.2g}) {more} than {other}"
 
 
 def evidence_of(

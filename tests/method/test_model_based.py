@@ -263,6 +263,15 @@ def test_the_first_law_is_preferred_unless_the_evidence_says_otherwise(
     assert np.isfinite([verdict.change, verdict.deviation]).all()
 
 
+def test_the_reason_says_by_how_much() -> None:
+    known = {FIRST: evidence(0.0, 0.0, 0.0, 0.0)}
+    better = choose(known | {ADAPTED: evidence(-1.0, 0.1, 0.0, 0.0)}, FIRST, 1.0)
+    assert better.reason == "the adapted law costs 1 (standard error 0.1) less than the first law"
+    chance = choose(known | {ADAPTED: evidence(-1.0, 2.0, 0.0, 0.0)}, FIRST, 1.0)
+    assert chance.chosen == FIRST
+    assert chance.reason.endswith(": " + better.reason.replace("0.1", "2"))
+
+
 def test_equal_laws_are_told_apart_by_chance_no_more_often_than_the_confidence_says() -> None:
     """Two laws of one cost, measured with noise: the other one is taken in one case of six."""
     rng, wrong = np.random.default_rng(11), 0

@@ -16,6 +16,7 @@ from pdeloop.in_process import LocalPair
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training
 from tuner_node.narration import Narration, closing_lines, exit_code, failed, warnings
+from tuner_node.results import difference
 from tuner_node.rollouts import CHECK
 
 
@@ -253,3 +254,31 @@ def test_a_training_whose_laws_all_diverge_ends_with_a_warning_and_a_code(tmp_pa
     assert "e+0" not in shown
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["diverged"]["lqt"] == result["evaluation_rollouts"]
+
+
+def test_how_much_an_adaptation_gained_is_said_with_its_interval() -> None:
+    gained = {"change": -1.0, "low": -1.5, "high": -0.5, "fields": 10}
+    chance = {"change": -0.1, "low": -0.5, "high": 0.3, "fields": 10}
+    own = {"verdict": "better", "reason": ""}
+    alone = summary(
+        seeds=1,
+        changed=[True],
+        outcome=[own | {"against_lqt": gained}],
+        costs={"none": [4], "lqt": [2], "adapted": [1]},
+    )
+    said = "  adapted less LQT on the same 10 fields: -1 (95 % interval -1.5 to -0.5)"
+    assert said in closing_lines("kdv", alone, "")
+    outcome = [own | {"against_lqt": gained}, own | {"against_lqt": chance}]
+    lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
+    assert any("costs less than the LQT law for 1 of 2 seeds, more for 0" in line for line in lines)
+
+
+def test_the_interval_of_a_difference_has_the_mean_as_often_as_it_says() -> None:
+    rng, inside = np.random.default_rng(5), 0
+    for _ in range(1000):
+        before = rng.standard_normal(10)  # common to both laws, so that it does not count
+        found = difference(before, before - 0.3 + 0.1 * rng.standard_normal(10))
+        assert found is not None
+        inside += found["low"] <= -0.3 <= found["high"]
+    assert 0.95 - 3 * 0.007 < inside / 1000 < 0.95 + 3 * 0.007
+    assert difference([1.0], [2.0]) is None
