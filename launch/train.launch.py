@@ -30,7 +30,7 @@ from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
-from pdeloop.pairs import PAIR, PAIRS, Transport
+from pdeloop.pairs import PAIR, PAIRS, RECORD_EVERY, Transport
 from pdeloop.supervisor import RECORDER_GRACE
 from pdeloop.training_run import begin, reopen, unused
 
@@ -50,6 +50,7 @@ ARGUMENTS = {
     "resume": ("", "folder of an interrupted run to continue; empty: a new run"),
     "record": ("false", "true: record all topics to a rosbag2 bag in the folder"),
     "record_or_stop": ("false", "true: as record, and end if the recording fails"),
+    "record_every": ("1", "record the states of every so many steps only"),
     "view": ("false", "true: a viewer_node, for RViz, Foxglove and PlotJuggler"),
 }
 """Defaults and meanings."""
@@ -84,6 +85,7 @@ def training(context: LaunchContext) -> list[Any]:
     required, recorded = "record_or_stop" in on, bool(on & {"record", "record_or_stop"})
     transport = Transport(
         recorder="required" if required else "start" if recorded else "none",
+        record_every=RECORD_EVERY.parse(given["record_every"]),
         pairs=PAIRS.parse(given["pairs"]),
         view="view" in on,
     )

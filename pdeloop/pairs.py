@@ -27,6 +27,8 @@ MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
 PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
 """Number of pairs that a command or a launch file starts."""
+RECORD_EVERY = next(spec for spec in taken_by("recorder_node") if spec.name == "state_every")
+"""Of the states of how many steps one is recorded."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +136,7 @@ class Transport:
         if self.in_process and (self.pairs > 1 or self.view):
             raise ParameterError("--pairs and --view are about nodes; leave out --in-process")
         PAIRS.check(self.pairs)
-        next(s for s in taken_by("recorder_node") if s.name == "state_every").check(
-            self.record_every
-        )
+        RECORD_EVERY.check(self.record_every)
 
     def require(self) -> None:
         """Refuse what the nodes would end with: no ROS, a wrong ROS domain."""
