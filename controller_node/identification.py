@@ -44,6 +44,8 @@ class DesignSettings:
         Of the stage cost.
     action_limit : float
         Magnitude at which actions saturate; 0: none. The gains are designed without it.
+    measurement_noise : float
+        Standard deviation of the noise on every number of the states, for "field"; 0: none.
     cost : sequence of str
         The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it.
     identification : {"field", "regression", "subspace", "dmdc"}
@@ -65,6 +67,7 @@ class DesignSettings:
     state_weight: float
     action_weight: float
     action_limit: float = 0.0
+    measurement_noise: float = 0.0
     cost: Sequence[str] = ()
     identification: str = "regression"
     dmdc_rank: int = 0
@@ -250,6 +253,7 @@ def designed(
             target,
             rows,
             action_limit=settings.action_limit,
+            noise=settings.measurement_noise,
             settings=settings.method,
             **weights,
         )

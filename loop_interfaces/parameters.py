@@ -34,7 +34,7 @@ def _section(nodes: str, *specs: Spec) -> tuple[Spec, ...]:
 
 INSTRUMENTS = _section(
     "PT",
-    Spec("measurement_noise", 0.0, 0.0, 1e6, group="problem").means(
+    Spec("measurement_noise", 0.0, 0.0, 1e6, nodes="PCT", group="problem").means(
         "standard deviation of the noise on every number of the published state; 0: none"
     ),
     Spec("process_noise", 0.0, 0.0, 1e6, group="problem").means(

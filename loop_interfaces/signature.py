@@ -51,12 +51,15 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes.
 
     The name of a law other than the affine one follows, without the file or module that it is in, and
-    the horizon; then the constants of the identification and of the law, by their names.
+    the horizon; the noise, where there is any and the identification is "field", which is fitted for
+    it; then the constants of the identification and of the law, by their names.
     """
     values = [parameters[name] for name in DESIGN]
     values += ["".join(parameters["cost"])] if parameters.get("cost") else []
     law = parameters.get("law", "affine").rpartition(":")[2]
     values += [law, parameters["horizon"]] if law != "affine" else []
+    noise = parameters.get("measurement_noise")
+    values += [noise] if noise and parameters["identification"] == "field" else []
     constants = parameters.get("constants", parameters)
     names = sorted(name for name in constants if name.startswith(CONSTANTS))
     values += [f"{name}={constants[name]}" for name in names]

@@ -32,6 +32,7 @@ from loop_interfaces.model_rows import ModelRows
 from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
 from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
 from loop_method.models.base import Law, saturated
+from loop_method.models.denoising import smoothed
 from loop_method.models.prediction import predicted
 from loop_method.reduce.reduced_model import Trajectory, pieces
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
@@ -107,6 +108,7 @@ def best_model(
     target: Array,
     action_limit: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
+    noise: float = 0.0,
 ) -> FittedModel | None:
     """The model of the whole field that predicts the trajectories best, or pieces of them.
 
@@ -118,7 +120,7 @@ def best_model(
     best: FittedModel | None = None
     for parts in (trajectories, pieces(trajectories, settings.field_pieces)):
         rollouts = [Measured(z, a) for z, a in parts if len(a)]
-        found = fit_field_model(rollouts, target, action_limit=action_limit)
+        found = fit_field_model(rollouts, target, action_limit=action_limit, noise=noise)
         if found is not None and (best is None or found.error < best.error):
             best = found
         if best is not None and best.error <= settings.field_error:
@@ -135,6 +137,7 @@ def field_law(
     action_weight: float,
     cost: Cost | None = None,
     action_limit: float = 0.0,
+    noise: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
@@ -153,10 +156,12 @@ def field_law(
         In place of them.
     action_limit : float
         Magnitude at which actions saturate, in the data and under both laws; 0: none.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0: none.
     settings : IdentificationSettings
         Those whose names begin with `field_`. Errors are relative to sum |z - z_r|^2.
     """
-    fitted = best_model(trajectories, target, action_limit, settings)
+    fitted = best_model(trajectories, target, action_limit, settings, noise)
     if fitted is None or fitted.error > settings.field_error:
         return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]
@@ -175,6 +180,8 @@ def field_law(
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
         return FieldLaw(fitted)
     fields = [states[0] for states, _ in trajectories]
+    if noise:
+        fields = list(smoothed(np.stack(fields), noise))
     best = saturated(affine_law(K, b - K @ target), action_limit)
     none = affine_law(np.zeros_like(K), np.zeros_like(b))
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]

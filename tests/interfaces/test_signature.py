@@ -325,7 +325,8 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     assert design_digest(known | {name: other}) != design_digest(known)
     # An action has the first of these, D the second, the third and the fourth count where they are not
     # empty, and the last two with another law than the affine one.
-    assert {*DESIGN, "n_a", "action_limit", "cost", "constants", "law", "horizon"} == {*known}
+    own = {"n_a", "action_limit", "measurement_noise", "cost", "constants", "law", "horizon"}
+    assert {*DESIGN, *own} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
 
 
@@ -333,6 +334,14 @@ def test_a_digest_is_the_first_53_bits_of_blake2b_as_a_stand_in_computes_it():
     raw = struct.pack("<3d", 1.0, -2.5, 3.0)
     first = int.from_bytes(blake2b(raw, digest_size=8).digest(), "big") // 2**11
     assert digest_of([1.0, -2.5], 3.0) == first < 2**53
+
+
+def test_the_noise_counts_where_a_model_is_fitted_for_it():
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    field = known | {"identification": "field"}
+    digests = {design_digest(field | {"measurement_noise": noise}) for noise in (0.0, 0.1, 0.2)}
+    assert len(digests) == 3
+    assert design_digest(known | {"measurement_noise": 0.1}) == design_digest(known)
 
 
 @pytest.mark.parametrize("name", ["identification_settings.energy", "law_settings.gain"])
