@@ -291,7 +291,7 @@ function Nodes({ status }) {
 // One node: who it is, whether it is there, what it says of itself.
 function Card({ role, name, present, level = 0, heard, restarts, rivals, message, values = [], ended }) {
   const lost = name && !ended ? "bad" : "muted";
-  const facts = [present ? "there" : name ? "gone" : "not seen"];
+  const facts = [present ? "present" : name ? "gone" : "not seen"];
   if (heard !== null) facts.push(heard < 1.5 ? "heard now" : `last heard ${Math.round(heard)} s ago`);
   if (restarts) facts.push(restarts === 1 ? "joined again once" : `joined again ${restarts} times`);
   if (rivals) facts.push(`${rivals + 1} processes publish its topic`);
