@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -21,9 +22,47 @@ from loop_interfaces.isolation import (
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
 from tests.support.loop_harness import ROOT, Processes, udp_sockets, until
-from tests.support.small_loop import LIMIT
+from tests.support.small_loop import (
+    LIMIT,
+    assert_same_training,
+    in_process,
+    start_pair,
+    start_tuner,
+)
 
 pytestmark = pytest.mark.topics
+
+
+OF_ANOTHER_TYPE = """
+import time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from loop_interfaces import topics
+rclpy.init()
+node = rclpy.create_node("of_another_type")
+names = [value.name for value in vars(topics).values() if isinstance(value, topics.Topic)]
+quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+made = [node.create_publisher(String, name, quality) for name in names]
+print(len(made), flush=True)
+while True:
+    for publisher in made:
+        publisher.publish(String(data="x" * 1000))
+    time.sleep(0.01)
+"""
+
+
+def test_publishers_of_another_type_on_every_topic_change_nothing(
+    loop: Processes, tmp_path: Path
+) -> None:
+    stranger = loop.start("-c", OF_ANOTHER_TYPE, name="of_another_type")
+    until(lambda: loop.output(stranger), LIMIT, "publishers")
+    assert int(loop.output(stranger)) >= 9
+    nodes = start_pair(loop)
+    tuner = start_tuner(loop, tmp_path / "run", iterations=5)
+    assert "Traceback" not in loop.wait(tuner, LIMIT)
+    assert_same_training(tmp_path / "run", in_process(iterations=5))
+    assert stranger.poll() is None and all(node.poll() is None for node in nodes.values())
 
 
 def test_the_hundred_and_third_node_of_a_domain_has_its_ports_and_all_on_loopback(loop: Processes):
