@@ -25,8 +25,9 @@ BUDGET: dict[str, Any] = {"rollouts": 9, "evaluation_fields": 2, "reduced_order"
 
 def solver(module: str, name: str, given: dict[str, Any]) -> Any:
     """A case of an example that needs the extra `solvers`."""
-    reason = f"{module} is not installed: extra solvers"
-    lacking = pytest.mark.skipif(find_spec(module) is None, reason=reason)
+    lacking = pytest.mark.skipif(
+        find_spec(module) is None, reason=f"{module} is not installed: extra solvers"
+    )
     return pytest.param(f"{PLANTS}/{name}", given, "two_point", marks=lacking)
 
 
