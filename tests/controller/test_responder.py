@@ -410,7 +410,8 @@ def test_a_run_takes_the_bytes_of_all_that_is_kept_of_it():
     state.policies.append(replace(one, values=np.ones((1, 4, 8))))
     assert state.nbytes == 8 * (4 + 32)
     state.laws[3] = ((1,), SimpleNamespace(nbytes=1000))
-    assert state.nbytes == 8 * (4 + 32) + 1000
+    state.exploration = SimpleNamespace(nbytes=500)
+    assert state.nbytes == 8 * (4 + 32) + 1500
 
 
 def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(responder):

@@ -293,6 +293,15 @@ def test_what_is_recorded_of_a_plant_is_what_was_kept_last(tmp_path):
         assert (again.paused, again.signed) == (paused, signed)
 
 
+def test_a_run_that_is_served_keeps_the_plant_from_another_by_its_actions_too():
+    protocol = plant_protocol()
+    (sent,) = protocol.start(start(1), 0.0)
+    protocol.action(answer(sent.frame), 9.0)  # a run is forgotten after 10 s
+    with pytest.raises(FrameError, match=f"run {RUN} has this plant"):
+        protocol.start(start(1, run=RUN + 1), 18.0)
+    assert protocol.start(start(1, run=RUN + 1), 19.0)
+
+
 def test_an_action_advances_the_plant_at_once_unless_it_is_paused_or_paced():
     protocol = plant_protocol()
     assert protocol.awaiting is None

@@ -8,6 +8,11 @@ ARGUED: dict[tuple[str, str, str], str] = {
         "removed",
     ): "whatever reads it comes after a state was sent, which sets it",
     (
+        "tuner_node.pair",
+        "void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())",
+        "1 -> 2",
+    ): "the column before it counts steps, which are not negative",
+    (
         "controller_node.answered_steps",
         "self._furthest = -1",
         "1 -> 2",

@@ -49,6 +49,8 @@ def _in_body(body: list[ast.stmt]) -> Iterator[Change]:
     for i, statement in enumerate(body):
         if isinstance(statement, ast.FunctionDef | ast.Assert) or _says(statement):
             continue
+        if isinstance(statement, ast.If) and all(map(_says, statement.body + statement.orelse)):
+            continue
         if _can_go(statement):
             yield _removed(body, i)
         for name in ("body", "orelse", "finalbody"):

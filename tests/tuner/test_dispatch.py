@@ -396,6 +396,15 @@ def test_the_work_of_a_pair_that_died_while_all_were_busy_goes_to_the_first_free
     assert result.costs[:, 0].tolist() == [0.0, 1.0]
 
 
+@pytest.mark.parametrize(("wanted", "count"), [(EXPLORATION, 2), (batch(1), 1)])
+def test_models_that_were_not_asked_for_are_refused(wanted, count):
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(wanted, 0.0))
+    with pytest.raises(FrameError, match=f"expected 1 models, got {count}"):
+        served.model(0, Frame(RUN, start.episode, 0, 0.0, np.ones((count, 9, 2))), 0.0)
+    assert served.pairs[0].chunk.models is None
+
+
 @pytest.mark.parametrize("design", [0, 5])
 def test_a_tuner_looks_at_a_models_signature_if_it_knows_how_models_are_identified(design):
     served = dispatcher(design=design)
