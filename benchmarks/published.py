@@ -135,7 +135,8 @@ def _lid(budgets: list[int], seeds: int) -> Iterator[Row]:
         laws = [_trained(Cavity, seed, budget, **how) for seed in range(seeds)]
         found_returns = [returned(law) for law, _ in laws]
         spent = max(count for _, count in laws)
-        yield row(f"{_name(budget)}, affine law", _shown(found_returns, np.min), spent)
+        name = "the first law, affine" if budget == 1 else f"{_name(budget)}, affine law"
+        yield row(name, _shown(found_returns, np.min), spent)
     yield row("limit: the best 199 inputs", f"{-_least(plant):.7g}", "")
 
 

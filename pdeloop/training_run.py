@@ -19,7 +19,9 @@ from typing import Any
 import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
+from loop_interfaces.frames import MAX_VALUES
 from loop_interfaces.own_code import OwnCodeError
+from loop_interfaces.parameters import model_order
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant, complete
 from pdeloop.display import Display, ProgressFile
@@ -101,12 +103,26 @@ def begin(
     values = resolve(problem, options)
     transport = transport or Transport()
     refuse_unused(options, values, in_process=transport.in_process, viewed=transport.view)
-    build_training(values)
+    training = build_training(values)
+    if not transport.in_process:
+        check_messages(values, training)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).refuse_another()
     load_compiled(values)
     RunFolder(folder).create(values)
     return folder, values
+
+
+def check_messages(values: Mapping[str, Any], training: Training) -> None:
+    """ParameterError where the models of an exploration are more than one message can hold."""
+    order, together = model_order(values), training.settings.explorations
+    numbers = together * values["n_z"] * order
+    if numbers > MAX_VALUES:
+        raise ParameterError(
+            f"parameter 'reduced_order' is {order}: {together} models of a state of {values['n_z']} "
+            f"numbers are {numbers} numbers, and a message holds at most {MAX_VALUES}; take a lower "
+            "order, or train in one process: --in-process"
+        )
 
 
 def reopen(folder: Path) -> dict[str, Any]:

@@ -7,11 +7,15 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import pdeloop
 from loop_interfaces.arrays import Array
+from loop_interfaces.spec import ParameterError
 from loop_method.reduce.channels import state_faults
+from pdeloop.training_run import check_messages, resolve
 from tuner_node.batch import EPISODE_BYTES, MESSAGE_BYTES, most_environments
+from tuner_node.build import build_training
 
 N_Z, T, ROLLOUTS = 16_384, 16, 8
 STATE = 8 * N_Z
@@ -74,3 +78,12 @@ def test_an_episode_of_large_states_has_fewer_environments() -> None:
     assert most * 65_536 * 8 <= MESSAGE_BYTES and most * 51 * 65_536 * 8 <= EPISODE_BYTES
     assert most_environments(1024, 2**24, 1000) == 1
     assert most_environments(1024, 0, 0) == 1024  # not known
+
+
+def test_models_that_no_message_can_hold_are_refused_before_anything_is_started() -> None:
+    values = resolve("burgers", {"reduced_order": 12})
+    training = build_training(values)
+    values["n_z"] = 2**20  # as of a plant of one's own
+    with pytest.raises(ParameterError, match="2 models of a state of 1048576 numbers are 25165824"):
+        check_messages(values, training)
+    check_messages({**values, "reduced_order": 8}, training)  # just as much as there is room for
