@@ -14,7 +14,7 @@ import pytest
 from controller_node.identification import DesignSettings
 from controller_node.policy import excitation
 from controller_node.responder import Responder
-from controller_node.run_state import MAX_RUNS, RunState, forget
+from controller_node.run_state import MAX_RUNS, Models, RunState, forget
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
@@ -393,6 +393,16 @@ def test_an_exploration_waits_for_its_start_and_the_target_alone():
     assert len(made.target(target())) == 1 and made.waits_for() == []
 
 
+def test_while_another_state_waits_nothing_is_answered_without_being_looked_at(responder):
+    responder.policy(Frame(RUN, 4, 1, 0.0, np.full((1, 4, 8), 0.1)))
+    responder.model(Frame(RUN, 0, 1, 0.0, models()))
+    responder.start(replace(start(4, (1, -1, 0.0, 0)), step=1))
+    state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])).copy())
+    assert len(responder.state(state)) == 1 and responder.answering(state) is not None
+    assert responder.state(replace(state, episode=5)) == []
+    assert responder.answering(state) is None
+
+
 def test_of_more_runs_than_are_kept_the_least_recently_used_one_goes():
     known = OrderedDict((number, number) for number in range(MAX_RUNS))
     forget(known, 3, 0)
@@ -412,6 +422,9 @@ def test_a_run_takes_the_bytes_of_all_that_is_kept_of_it():
     state.laws[3] = ((1,), SimpleNamespace(nbytes=1000))
     state.exploration = SimpleNamespace(nbytes=500)
     assert state.nbytes == 8 * (4 + 32) + 1500
+    model = SimpleNamespace(U=np.ones((9, 2)), A=np.ones((2, 2)), B=np.ones((2, 3)))
+    state.models.append(Models(1, 7, [SimpleNamespace(model=model)]))  # the law copies them
+    assert state.nbytes == 8 * (4 + 32) + 1500 + 2 * 8 * (18 + 4 + 6)
 
 
 def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(responder):

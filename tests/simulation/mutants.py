@@ -65,6 +65,7 @@ TESTS: dict[str, tuple[str, ...]] = {
 """The modules that are changed, and their tests."""
 ENDS = {1: "simulation", 2: "tests", 3: "time limit", 0: "survived"}
 """What found a mutant, by the exit code of its process."""
+_NOT_PLANTED = 9
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,11 @@ def tested(files: tuple[str, ...]) -> bool:
 
 def judge(mutant: Mutant) -> None:
     """In a process of its own: end with what found it."""
-    plant(mutant)
+    try:
+        plant(mutant)
+    except Exception as error:
+        print(f"{mutant}: {error}", file=sys.stderr, flush=True)
+        os._exit(_NOT_PLANTED)
     for seed in range(SEEDS):
         for plan in (aimed(seed), draw(seed)):
             if verdict(plan)[1]:
@@ -179,6 +184,7 @@ def tried(mutants: list[Mutant]) -> Iterator[tuple[Mutant, str]]:
             if process.exitcode is None and time.monotonic() < deadline:
                 continue
             end = ENDS[3] if process.exitcode is None else ENDS.get(process.exitcode, "tests")
+            assert process.exitcode != _NOT_PLANTED, f"{mutant} could not be planted"
             process.kill()
             process.join()
             begun.remove(entry)

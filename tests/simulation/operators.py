@@ -78,7 +78,10 @@ def _says(statement: ast.stmt) -> bool:
 def _can_go(statement: ast.stmt) -> bool:
     """Whether the module still compiles without it, and something is different."""
     if isinstance(statement, ast.Expr):
-        return not isinstance(statement.value, ast.Constant)  # a docstring
+        return "super" not in ast.unparse(statement) and not isinstance(
+            statement.value,
+            ast.Constant,  # a docstring
+        )
     if isinstance(statement, ast.Assign | ast.AugAssign):
         targets = getattr(statement, "targets", None) or [statement.target]  # type: ignore[union-attr]
         return any(isinstance(target, ast.Attribute | ast.Subscript) for target in targets)

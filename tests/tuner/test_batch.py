@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from tuner_node.batch import EPISODE_BYTES, MESSAGE_BYTES, most_environments
+from tuner_node.batch import EPISODE_BYTES, MESSAGE_BYTES, less_often, most_environments
 
 
 @pytest.mark.parametrize("n_z", [1, 256, 65_536, 2_000_000])
@@ -22,3 +22,8 @@ def test_an_episode_has_as_many_environments_as_fit_and_at_least_one(
         assert fits(found) or found == 1
         assert found == most or not fits(found + 1)
     assert most_environments(1, n_z, horizon) == 1
+
+
+def test_a_message_of_many_numbers_is_repeated_up_to_four_times_less_often() -> None:
+    many = [0, 2**16 - 1, 2 * 2**16, 3 * 2**16, 4 * 2**16, 5 * 2**16, 10**9]
+    assert [less_often(numbers) for numbers in many] == [1, 1, 2, 3, 4, 4, 4]
