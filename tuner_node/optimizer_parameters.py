@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.parameters import OPTIMIZER
+from loop_interfaces.parameters import LAW, OPTIMIZER
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import (
     IDENTIFICATION_SETTINGS,
@@ -18,6 +18,7 @@ from loop_interfaces.spec import (
 )
 from loop_method.adapt import Optimizer
 from loop_method.adapt.registry import optimizer_kind
+from loop_method.laws import Law
 from loop_method.laws.registry import law_kind
 from loop_method.reduce.settings import IdentificationSettings
 from loop_method.settings import Settings, parameters_of, with_defaults
@@ -31,12 +32,17 @@ def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
         raise ParameterError(str(error)) from error
 
 
-def _methods(values: Mapping[str, Any]) -> list[tuple[str, type[Settings], str]]:
-    """Optimiser, law and identification: how their settings begin, their class, and their name."""
+def _law_of(values: Mapping[str, Any]) -> type[Law]:
+    """The class of the law. ParameterError if there is none of that name."""
     try:
-        law = law_kind(values["law"])
+        return law_kind(str(values.get("law", LAW.default)))
     except ValueError as error:
         raise ParameterError(str(error)) from error
+
+
+def _methods(values: Mapping[str, Any]) -> list[tuple[str, type[Settings], str]]:
+    """Optimiser, law and identification: how their settings begin, their class, and their name."""
+    law = _law_of(values)
     return [
         (OPTIMIZER_SETTINGS, kind_of(values).Settings, f"optimizer '{values['optimizer']}'"),
         (LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
@@ -76,10 +82,14 @@ def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The given parameters with the defaults that their optimiser prefers.
+    """The given parameters with the defaults that optimiser and, of few sensors, law prefer.
 
     The optimiser's name may be written as the command line writes words: gauss-newton.
     """
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")
-    return {**kind_of({"optimizer": name}).preferences, **given, "optimizer": name}
+    preferences = dict(kind_of({"optimizer": name}).preferences)
+    readings = _law_of(given).from_readings
+    if readings and str(given.get("sensors", 0)) != "0":
+        preferences["identification"] = readings
+    return {**preferences, **given, "optimizer": name}

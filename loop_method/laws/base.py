@@ -81,6 +81,8 @@ class Law(ABC):
     """Its constants; none if it does not say otherwise."""
     settings: ClassVar[_Settings] = _Settings()
     """The constants of this training: parameters `law_settings.NAME`."""
+    from_readings: ClassVar[str] = ""
+    """Its preferred `identification` of a plant with few sensors; that of the optimiser if empty."""
     memory_size: int = 0
     cost: Cost | None = None
 

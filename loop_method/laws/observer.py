@@ -27,6 +27,7 @@ class Observer(Law):
     """
 
     name = "observer"
+    from_readings = "subspace"
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]

@@ -107,6 +107,17 @@ def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
     assert training_parameters("burgers", none)["identification"] == "regression"
 
 
+def test_an_observer_of_few_sensors_is_identified_from_readings() -> None:
+    few = {"law": "observer", "sensors": 16}
+    assert training_parameters("burgers", few)["identification"] == "subspace"
+    assert training_parameters("burgers", {"law": "observer"})["identification"] == "field"
+    assert training_parameters("burgers", {"sensors": 16})["identification"] == "field"
+    assert (
+        training_parameters("burgers", {**few, "identification": "dmdc"})["identification"]
+        == "dmdc"
+    )
+
+
 def test_settings_are_parameters_of_the_training() -> None:
     chosen = {"optimizer": "gauss_newton"}
     values = training_parameters("burgers", {**chosen, "optimizer_settings": {"fields": 5}})
