@@ -74,6 +74,7 @@ def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: 
 def test_exploration_gives_the_model_of_the_same_trajectory_in_process(responder):
     (send,) = explore(responder, 1)
     assert send.topic is MODEL_IDENTIFIED
+    assert not responder.under_way
     assert same_bits(send.frame.values, models())
     assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, 0)
     (again,) = responder.cost(Frame(RUN, 1, 30, 1.0, COSTS))
@@ -399,6 +400,7 @@ def test_while_another_state_waits_nothing_is_answered_without_being_looked_at(r
     responder.start(replace(start(4, (1, -1, 0.0, 0)), step=1))
     state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])).copy())
     assert len(responder.state(state)) == 1 and responder.answering(state) is not None
+    assert responder.under_way
     assert responder.state(replace(state, episode=5)) == []
     assert responder.answering(state) is None
 

@@ -5,8 +5,9 @@
 
 Of each module N mutants are drawn and tried, each in a process of its own, with a hard limit: first the
 simulation runs SEEDS plans of `aimed` and of `draw`, then pytest the tests of the module. A mutant that
-neither of them finds has survived: it is printed with its line, and unless it is among
-`equivalent.ARGUED` the exit code is 1. Which mutants there are: `operators.mutations`.
+neither of them finds has survived, and is printed with its line. The exit code is 1 if less than LEAST
+percent are found, those of `equivalent.ARGUED` not counted. Which mutants there are:
+`operators.mutations`.
 """
 
 from __future__ import annotations
@@ -210,11 +211,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation.mutants", description=__doc__)
     parser.add_argument("--sample", type=int, default=20, metavar="N", help="of each module [20]")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the sample [0]")
+    parser.add_argument("--least", type=float, default=95.0, metavar="LEAST", help="percent [95]")
     parser.add_argument("modules", nargs="*", metavar="MODULE", default=list(TESTS))
     options = parser.parse_args()
     prepare(options.modules)
     total: Counter[str] = Counter()
-    failed = False
     for module in options.modules:
         found: Counter[str] = Counter()
         for mutant, end in tried(drawn(module, options.sample, options.seed)):
@@ -222,19 +223,22 @@ def main() -> int:
                 end = "equivalent"
             found[end] += 1
             if end == "survived":
-                failed = True
                 print(f"  survived: {mutant}", flush=True)
         total += found
         print(f"{module:<34} {_score(found)}", flush=True)
     print(f"{'all':<34} {_score(total)}")
-    return int(failed)
+    return int(_share(total) < options.least)
+
+
+def _share(found: Counter[str]) -> float:
+    """How many percent were found of those that can be."""
+    possible = found.total() - found["equivalent"]
+    return 100.0 * (possible - found["survived"]) / possible if possible else 100.0
 
 
 def _score(found: Counter[str]) -> str:
-    """How many were found of those that can be, and by what."""
-    possible = found.total() - found["equivalent"]
-    share = 100.0 * (possible - found["survived"]) / max(possible, 1)
-    return f"{share:5.1f} %   " + ", ".join(
+    """How many were found, and by what."""
+    return f"{_share(found):5.1f} %   " + ", ".join(
         f"{count} {end}" for end, count in sorted(found.items())
     )
 
