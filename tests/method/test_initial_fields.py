@@ -34,6 +34,19 @@ def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) ->
     assert not is_chaotic(loop, fields[:1])  # one field tells nothing
 
 
+class Decaying(Logistic):
+    """z' = z / r at every point."""
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return states / self.r
+
+
+def test_a_linear_plant_is_never_chaotic_however_far_its_fields_are_from_each_other() -> None:
+    loop = ClosedLoop(np.eye(N_Z, 3), np.zeros(N_Z), 1.0, 1.0, 40, model=Decaying(1.1))  # type: ignore[arg-type]
+    field = np.random.default_rng(0).normal(size=N_Z)
+    assert not is_chaotic(loop, np.array([field, -field]))
+
+
 def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:
     rng = np.random.default_rng(1)
     one, two = (rng.normal(size=(21, N_Z)) for _ in range(2))
