@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
-from loop_method.models.denoising import denoised, smoothed
+from loop_method.models.denoising import cleaned_states
 from loop_method.reduce.snapshots import LARGE, factored
 
 
@@ -191,9 +191,5 @@ def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> li
     line: whether the states are fields on one axis, of which initial ones are known best by their
     spectra.
     """
-    found = [replace(record, states=denoised(record.states, noise)) for record in records]
-    if line and found:
-        first = smoothed(np.stack([record.states[0] for record in records]), noise)
-        for record, state in zip(found, first, strict=True):
-            record.states[0] = state
-    return found
+    clean = cleaned_states([record.states for record in records], noise, line=line)
+    return [replace(own, states=states) for own, states in zip(records, clean, strict=True)]

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
-from loop_method.models.denoising import denoised, smoothed
+from loop_method.models.denoising import cleaned_states
 from loop_method.models.kinds import Kind, kinds_of
 from loop_method.models.prediction import errors, finite, pieces
 from loop_method.models.settings import FieldModelSettings
@@ -112,11 +112,7 @@ def with_clean(
 ) -> list[Measured]:
     """The rollouts with their states without what of the noise can be told from them."""
     rollouts = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
-    clean = [denoised(rollout.states, noise) for rollout in rollouts]
-    if line and rollouts:
-        first = smoothed(np.stack([r.states[0] for r in rollouts]), noise, components)
-        for own, state in zip(clean, first, strict=True):
-            own[0] = state
+    clean = cleaned_states([r.states for r in rollouts], noise, components, line=line)
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
 

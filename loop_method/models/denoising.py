@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,28 @@ def smoothed(fields: Array, noise: float, components: int = 1) -> Array:
     signal, noise_power = signal_power(spectra, noise, parts.shape[2])
     kept = signal / (signal + noise_power)
     clean: Array = np.fft.irfft(kept * spectra, parts.shape[2]).reshape(fields.shape)
+    return clean
+
+
+def cleaned_states(
+    trajectories: Sequence[Array], noise: float, components: int = 1, *, line: bool = True
+) -> list[Array]:
+    """States of trajectories `denoised`, the initial ones `smoothed` together where they are on a line.
+
+    Parameters
+    ----------
+    trajectories : sequence of (T, n_z) arrays
+        None of them empty.
+    noise, components
+        As of `smoothed`.
+    line : bool
+        Whether the states are fields on one axis.
+    """
+    clean = [denoised(states, noise) for states in trajectories]
+    if line and clean:
+        first = smoothed(np.stack([states[0] for states in trajectories]), noise, components)
+        for own, state in zip(clean, first, strict=True):
+            own[0] = state
     return clean
 
 
