@@ -32,10 +32,8 @@ from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
-from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
 from loop_interfaces.topics import Topic
-from loop_method.laws.registry import law_kind
-from loop_method.reduce.settings import IdentificationSettings
+from loop_method.method_settings import law_and_identification
 from loop_method.settings import parameters_of, with_defaults
 
 FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path") else None
@@ -48,15 +46,9 @@ def declare_parameters(node: Node) -> dict[str, Any]:
     """The controller's parameters, with the settings of law and identification."""
     given = given_parameters(node, "controller_node")
     values = declare(node, taken_by("controller_node"), given)
-    methods = (
-        (LAW_SETTINGS, law_kind(values["law"]).Settings, f"law '{values['law']}'"),
-        (IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
-    )
-    for prefix, kind, method in methods:
-        with_defaults(
-            prefix, kind, given, method
-        )  # refuses a setting that the method does not have
-        values |= declare(node, parameters_of(prefix, kind), given)
+    for method in law_and_identification(values):
+        with_defaults(method.prefix, method.settings, given, method.name)  # refuses unknown ones
+        values |= declare(node, parameters_of(method.prefix, method.settings), given)
     return values
 
 

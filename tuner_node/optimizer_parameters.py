@@ -6,22 +6,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.parameters import LAW, OPTIMIZER
+from loop_interfaces.parameters import OPTIMIZER
 from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import (
-    IDENTIFICATION_SETTINGS,
-    LAW_SETTINGS,
-    OPTIMIZER_SETTINGS,
-    ParameterError,
-    Spec,
-    flatten,
-)
+from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
 from loop_method.adapt import Optimizer
 from loop_method.adapt.registry import optimizer_kind
-from loop_method.laws import Law
-from loop_method.laws.registry import law_kind
-from loop_method.reduce.settings import IdentificationSettings
-from loop_method.settings import Settings, parameters_of, with_defaults
+from loop_method.method_settings import Method, law_and_identification, law_of
+from loop_method.settings import parameters_of, with_defaults
 
 
 def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
@@ -32,22 +23,12 @@ def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
         raise ParameterError(str(error)) from error
 
 
-def _law_of(values: Mapping[str, Any]) -> type[Law]:
-    """The class of the law. ParameterError if there is none of that name."""
-    try:
-        return law_kind(str(values.get("law", LAW.default)))
-    except ValueError as error:
-        raise ParameterError(str(error)) from error
-
-
-def _methods(values: Mapping[str, Any]) -> list[tuple[str, type[Settings], str]]:
-    """Optimiser, law and identification: how their settings begin, their class, and their name."""
-    law = _law_of(values)
-    return [
-        (OPTIMIZER_SETTINGS, kind_of(values).Settings, f"optimizer '{values['optimizer']}'"),
-        (LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
-        (IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
-    ]
+def _methods(values: Mapping[str, Any]) -> list[Method]:
+    """Optimiser, law and identification."""
+    optimizer = Method(
+        OPTIMIZER_SETTINGS, kind_of(values).Settings, f"optimizer '{values['optimizer']}'"
+    )
+    return [optimizer, *law_and_identification(values)]
 
 
 def setting_specs(values: Mapping[str, Any]) -> list[Spec]:
@@ -89,7 +70,7 @@ def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")
     preferences = dict(kind_of({"optimizer": name}).preferences)
-    readings = _law_of(given).from_readings
+    readings = law_of(given).from_readings
     if readings and str(given.get("sensors", 0)) != "0":
         preferences["identification"] = readings
     return {**preferences, **given, "optimizer": name}

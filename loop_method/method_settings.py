@@ -1,0 +1,39 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The methods whose constants parameters set for controller and tuner alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from loop_interfaces.parameters import LAW
+from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS, ParameterError
+from loop_method.laws.base import Law
+from loop_method.laws.registry import law_kind
+from loop_method.reduce.settings import IdentificationSettings
+from loop_method.settings import Settings
+
+
+class Method(NamedTuple):
+    """The prefix of a method's parameters, the class of its constants, and its name in errors."""
+
+    prefix: str
+    settings: type[Settings]
+    name: str
+
+
+def law_of(values: Mapping[str, Any]) -> type[Law]:
+    """The class of the law that parameters name. ParameterError if there is none of that name."""
+    try:
+        return law_kind(str(values.get("law", LAW.default)))
+    except ValueError as error:
+        raise ParameterError(str(error)) from error
+
+
+def law_and_identification(values: Mapping[str, Any]) -> list[Method]:
+    """The two methods that controller and tuner must agree on."""
+    law = law_of(values)
+    return [
+        Method(LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
+        Method(IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
+    ]
