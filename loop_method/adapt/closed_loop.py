@@ -142,12 +142,7 @@ class ClosedLoop(ClosedLoopProblem):
                 a = (states[k] @ self.U + noise[k]) @ K.T + b
                 if self.action_limit:
                     np.clip(a, -self.action_limit, self.action_limit, out=a)
-                if self.cost is not None:
-                    self.cost.add(costs, states[k], a, k)
-                else:
-                    error = states[k] - self.target
-                    costs += self.state_weight * np.einsum("fi,fi->f", error, error)
-                    costs += self.action_weight * np.einsum("fi,fi->f", a, a)
+                self._add_stage(costs, states[k], states[k], a, k)
                 # Diverged fields stay marked and continue with numbers that a model can take.
                 finite &= np.isfinite(costs)
                 a[~finite] = 0.0
@@ -162,6 +157,15 @@ class ClosedLoop(ClosedLoopProblem):
         costs /= self.horizon
         costs[~finite] = np.inf
         return Simulation(states, actions, costs)
+
+    def _add_stage(self, costs: Array, z: Array, outputs: Array, a: Array, k: int) -> None:
+        """Add the stage costs of step k, which are of z, or of the outputs that have a target."""
+        if self.cost is not None:
+            self.cost.add(costs, z, a, k)
+            return
+        error = outputs - self.target
+        costs += self.state_weight * np.einsum("fi,fi->f", error, error)
+        costs += self.action_weight * np.einsum("fi,fi->f", a, a)
 
     replays: ClassVar[bool] = False
     """Whether initial fields are measured rollouts, with what in them was not foreseen."""
@@ -208,10 +212,8 @@ class ClosedLoop(ClosedLoopProblem):
             z, a = states[k], actions[k]
             eta, g = self.model.pull_back(z, a, eta)
             if self.cost is None:
-                on_z, on_a = (
-                    self.state_weight * share * (z - self.target),
-                    self.action_weight * share * a,
-                )
+                on_z = self.state_weight * share * (z - self.target)
+                on_a = self.action_weight * share * a
             else:
                 on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
             g = g + on_a

@@ -134,12 +134,7 @@ class ObservedLoop(ClosedLoop):
                 a = out[:, :n_a]
                 if self.action_limit:
                     a = np.clip(a, -self.action_limit, self.action_limit)
-                if self.cost is not None:
-                    self.cost.add(costs, states[k], a, k)
-                else:
-                    error = outputs - self.target
-                    costs += self.state_weight * np.einsum("fi,fi->f", error, error)
-                    costs += self.action_weight * np.einsum("fi,fi->f", a, a)
+                self._add_stage(costs, states[k], outputs, a, k)
                 memory = out[:, n_a:] + a @ B.T
                 finite &= np.isfinite(costs) & np.isfinite(memory).all(axis=1)
                 a = np.where(finite[:, None], a, 0.0)

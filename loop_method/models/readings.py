@@ -86,10 +86,7 @@ class ReadingsModel:
         follow = self.A - self.G @ self.C
         L = linalg.cholesky(self.innovations, lower=True)
         x, moved = np.zeros(len(self.A)), np.eye(len(self.A))
-        rows, wanted = (
-            [np.eye(len(x))],
-            [np.zeros(len(x))],
-        )  # x_0 ~ N(0, I), as the states are scaled
+        rows, wanted = [np.eye(len(x))], [np.zeros(len(x))]  # x_0 ~ N(0, I), as states are scaled
         for k in range(min(len(v), FOREMOST)):
             rows.append(linalg.solve_triangular(L, self.C @ moved, lower=True))
             wanted.append(linalg.solve_triangular(L, v[k] - self.C @ x, lower=True))
