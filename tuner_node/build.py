@@ -149,7 +149,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
                 context = replace(context, measured=measured)
 
         def made(context: Context | None) -> Optimizer:
-            return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
+            own = kind if context is None else kind.for_context(context)
+            return own(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
 
         if kind.in_coordinates and context is not None and is_large(context):
             return InCoordinates(made, context)

@@ -232,6 +232,11 @@ class Optimizer(Protocol):
     ) -> None: ...
 
     @classmethod
+    def for_context(cls, context: Context) -> "type[Optimizer]":
+        """The class that is made for a problem: this one, or one derived from it."""
+        return cls
+
+    @classmethod
     def first_step(cls, settings: Any) -> int:
         """Rollouts of its first step, without which there is nothing to adapt with."""
 

@@ -37,12 +37,10 @@ from loop_method.adapt.base import (
     require_results,
 )
 from loop_method.adapt.belief import Belief, believe
-from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch, part_of
 from loop_method.adapt.renewal import renew
-from loop_method.adapt.replayed_renewal import best_measured, step
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
@@ -132,6 +130,15 @@ class ModelBased(Optimizer):
         """Whether the first law is better than no control on the model."""
 
     @classmethod
+    def for_context(cls, context: Context) -> type[Optimizer]:
+        """Another one for a law that estimates the state from few readings."""
+        # Not at the top: it is derived from this class.
+        from loop_method.adapt.model_based_readings import ModelBasedReadings
+
+        few = bool(context.sensors) and isinstance(context.law, Observer)
+        return ModelBasedReadings if few else cls
+
+    @classmethod
     def first_step(cls, settings: ModelBasedSettings) -> int:
         """A rollout of the first law, and those that judge the next one."""
         return 1 + settings.judging
@@ -204,10 +211,6 @@ class ModelBased(Optimizer):
         """Own rollouts after which the law is renewed next."""
         known, last = len(self._before), self._last_renewal()
         at = self._settings.first_renewal
-        if self._of_readings:  # of one law no more than judge it: steps are short
-            own = max(at - known, 1)
-            every = range(own, max(last, own) + 1, self._settings.judging)
-            return next((n for n in every if self._records.count < n <= last), last)
         while at - known <= self._records.count:
             at *= 2
         # One is only worth it if as many rollouts again come before the last one.
@@ -226,26 +229,29 @@ class ModelBased(Optimizer):
         row: Row = {"role": self._stage}
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
-        if self._belief is not None and not self._of_readings:
-            loop = self._belief.loop(self._context)
-            predicted = [self._model_cost(loop, record) for record in added]
-            if np.isfinite(predicted).all():
-                row["predicted"] = float(np.mean(predicted))
+        predicted = self._predicted(added)
+        if predicted and np.isfinite(predicted).all():
+            row["predicted"] = float(np.mean(predicted))
         return row
+
+    def _predicted(self, added: Sequence[Record]) -> list[float]:
+        """The costs of rollouts on the last model; none without one."""
+        if self._belief is None:
+            return []
+        loop = self._belief.loop(self._context)
+        return [
+            float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
+            for record in added
+        ]
 
     def _data(self) -> list[Record]:
         """All rollouts, without what of their noise can be told from the fields."""
         noise, measured = self._context.noise, self._measurements()
-        if not noise or self._of_readings:
-            return measured
-        return cleaned(measured, noise, line=self._context.line)
+        return cleaned(measured, noise, line=self._context.line) if noise else measured
 
     def _measurements(self) -> list[Record]:
         """All rollouts as they were measured."""
         return [r for r in (*self._before, *self._records.all()) if len(r.states)]
-
-    def _model_cost(self, loop: ClosedLoop, record: Record) -> float:
-        return float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
 
     def _begin_judging(self) -> None:
         """Also without control, if that may be as good as the law."""
@@ -258,62 +264,47 @@ class ModelBased(Optimizer):
             self._none_is_close = bool(none <= (1.0 + self._settings.close) * own)
 
     def _fields(self) -> Array:
-        if self._belief is not None and self._of_readings:
-            return self._belief.loop(self._context).beginnings(self._data())
+        """Initial fields of all rollouts."""
         return initial_fields(self._data())
 
-    @property
-    def _of_readings(self) -> bool:
-        """Whether the model is one of few readings, for a law that estimates from them."""
-        return bool(self._context.sensors) and isinstance(self._context.law, Observer)
-
     def _renew(self, row: Row) -> None:
-        """Improve the law on the model that predicts the rollouts, or search for one without."""
-        settings = self._settings
+        """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._last_renewal()
-        noisy = bool(self._context.noise)
-        most = settings.believed_noisy if noisy else settings.believed
-        last = self._belief.model.kind if self._belief else ""
-        belief = believe(self._context, self._measurements(), last)
-        if self._of_readings:
-            most = np.inf  # what a law costs is measured after every step
+        belief = believe(
+            self._context, self._measurements(), self._belief.model.kind if self._belief else ""
+        )
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
                 row["mismatch"] = belief.error
-        if belief is None or not belief.error <= most:
-            seen = "the readings" if self._of_readings else "the whole field"
-            reason = f"no model of {seen} predicts the rollouts"
-            unknown = "its cost" if self._context.cost is not None else ""
-            unknown = "its law" if isinstance(self._context.law, Observer) else unknown
-            if self._belief is None and unknown and (final or not self._of_readings):
-                self._end(
-                    row, f"{reason}, and local steps do not know {unknown}: the first law stays"
-                )
-                return
-            if self._belief is None and not self._of_readings:
-                row["reason"] = f"{reason}: local steps"
-                self._begin_search(row)
-                return
-            row["reason"] = f"{reason} any more; the law stays"
-        else:
+        if belief is not None and self._is_believed(belief):
             self._belief = belief
-            if self._of_readings:
-                self._improve_replayed(belief, row)
-            else:
-                self._improve(belief, row, final)
-        if final:
+            self._improve(belief, row, final)
+        elif self._belief is not None:
+            row["reason"] = f"{self._unpredicted} any more; the law stays"
+        else:
+            self._without_model(row, final)
+        if final and self._stage == RENEWING:
             self._begin_judging()
 
-    def _improve_replayed(self, belief: Belief, row: Row) -> None:
-        """A step from the law that measured best."""
-        own = self._records.all()
-        best = best_measured(own, self._first)
-        found = step(belief.loop(self._context), own, best, self._settings)
-        if found is None:
-            row["reason"] = "the law is not finite on the model; it stays"
+    _unpredicted = "no model of the whole field predicts the rollouts"
+
+    def _is_believed(self, belief: Belief) -> bool:
+        """Whether the law is improved on a model."""
+        settings = self._settings
+        most = settings.believed_noisy if self._context.noise else settings.believed
+        return belief.error <= most
+
+    def _without_model(self, row: Row, final: bool) -> None:
+        """What follows where no model has ever been believed: local steps, if they can be taken."""
+        unknown = "its cost" if self._context.cost is not None else ""
+        unknown = "its law" if isinstance(self._context.law, Observer) else unknown
+        if unknown:
+            reason = f"{self._unpredicted}, and local steps do not know {unknown}"
+            self._end(row, f"{reason}: the first law stays")
         else:
-            self._policy, row["steps"] = found
+            row["reason"] = f"{self._unpredicted}: local steps"
+            self._begin_search(row)
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         loop, fields = belief.loop(self._context), self._fields()
@@ -353,11 +344,8 @@ class ModelBased(Optimizer):
     def _judge(self, row: Row) -> None:
         """Choose between the first law, the final one and no control."""
         if self._belief is None:
-            self._end(row, "no model of the whole field predicts the rollouts")
+            self._end(row, self._unpredicted)
             return
-        if self._of_readings:
-            others = [r for r in self._records.all() if not np.array_equal(r.policy, self._first)]
-            self._policy = best_measured(others, self._policy).copy()
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._policy}
         base = FIRST if self._safe else NONE
         _, change, deviation = self._held_out.tolist()

@@ -10,8 +10,8 @@ import pytest
 
 from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from loop_method.adapt.belief import believe
+from loop_method.adapt.model_based_readings import ModelBasedReadings, best_measured, step
 from loop_method.adapt.replayed_loop import ReplayedLoop
-from loop_method.adapt.replayed_renewal import best_measured, step
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, evidence_of
 from loop_method.design.lqg import law_of_innovations
@@ -144,7 +144,9 @@ def test_model_based_improves_a_law_of_few_readings_and_goes_on_with_the_same_bi
     start, few = 0.4 * law.theta_start, ModelBasedSettings(iterations=20)
 
     def made() -> ModelBased:
-        return ModelBased(start, seed=3, rollouts=9, settings=few, context=context())
+        kind = ModelBased.for_context(context())
+        assert kind is ModelBasedReadings
+        return kind(start, seed=3, rollouts=9, settings=few, context=context())
 
     def told(optimizer: ModelBased) -> dict[str, object]:
         found = [rolled(r.field_seed, law, r.policy) for r in optimizer.ask()]

@@ -1,0 +1,114 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`model_based` for a law that estimates the state from few readings: short steps from measured laws.
+
+A linear model of the readings is one of the plant near the fields that a law leads it through, and what
+it does not foresee changes with the law. So a step is held to the law that it begins with, the one that
+measured best, whose rollouts are then replayed for the next one. A replayed rollout is itself, so that
+measured costs alone decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Record, Row
+from loop_method.adapt.belief import Belief
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.model_based import ModelBased
+from loop_method.adapt.settings import ModelBasedSettings
+
+FEWEST = 2
+"""Rollouts of a law with which its mean cost counts."""
+
+
+class ModelBasedReadings(ModelBased):
+    """`ModelBased` on a model of the readings (`replayed_loop`)."""
+
+    _unpredicted = "no model of the readings predicts the rollouts"
+
+    def _next_renewal(self) -> int:
+        """A law is rolled out no more often than judges it: steps are short."""
+        last = self._last_renewal()
+        own = max(self._settings.first_renewal - len(self._before), 1)
+        every = range(own, max(last, own) + 1, self._settings.judging)
+        return next((n for n in every if self._records.count < n <= last), last)
+
+    def _data(self) -> list[Record]:
+        """All rollouts as they were measured: the model's filter knows their noise."""
+        return self._measurements()
+
+    def _predicted(self, added: Sequence[Record]) -> list[float]:
+        """None: the model gives each rollout its own cost."""
+        return []
+
+    def _fields(self) -> Array:
+        """Where rollouts began, with what no model foresaw in them."""
+        if self._belief is None:
+            return super()._fields()
+        return self._belief.loop(self._context).beginnings(self._data())
+
+    def _is_believed(self, belief: Belief) -> bool:
+        """Always: what a law costs is measured after every step."""
+        return True
+
+    def _without_model(self, row: Row, final: bool) -> None:
+        """More rollouts may determine a model."""
+        if final:
+            super()._without_model(row, final)
+        else:
+            row["reason"] = f"{self._unpredicted}; the law stays"
+
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        """A step from the law that measured best."""
+        own = self._records.all()
+        best = best_measured(own, self._first)
+        found = step(belief.loop(self._context), own, best, self._settings)
+        if found is None:
+            row["reason"] = "the law is not finite on the model; it stays"
+        else:
+            self._policy, row["steps"] = found
+
+    def _judge(self, row: Row) -> None:
+        """Judge the law that measured best in place of the last one."""
+        others = [r for r in self._records.all() if not np.array_equal(r.policy, self._first)]
+        self._policy = best_measured(others, self._policy).copy()
+        super()._judge(row)
+
+
+def best_measured(records: Sequence[Record], first: Array) -> Array:
+    """The law with the least mean cost among those of at least `FEWEST` rollouts; else the first."""
+    costs: dict[bytes, list[float]] = {}
+    laws: dict[bytes, Array] = {}
+    for record in records:
+        laws.setdefault(record.policy.tobytes(), record.policy)
+        costs.setdefault(record.policy.tobytes(), []).append(record.cost)
+    means = {name: float(np.mean(own)) for name, own in costs.items() if len(own) >= FEWEST}
+    if not means or not np.isfinite(min(means.values())):
+        return first
+    return laws[min(means, key=lambda name: means[name])]
+
+
+def step(
+    loop: ClosedLoop, records: Sequence[Record], law: Array, settings: ModelBasedSettings
+) -> tuple[Array, int] | None:
+    """The law after a step on replayed rollouts of laws, and how many of L-BFGS that took.
+
+    None where it is not finite on the model.
+    """
+    fields = loop.beginnings(records)
+    weights = np.full(len(fields), 1.0 / len(fields))
+    found = improve(
+        loop,
+        loop.theta(law),
+        fields,
+        weights,
+        curvature_of(loop),
+        settings,
+        settings.first_gain,
+        settings.readings_trust,
+    )
+    return None if found is None else (loop.policy(found.theta, law), found.steps)
