@@ -189,7 +189,8 @@ def _with_cost(source: str, given: Mapping[str, Any], cost: object) -> dict[str,
         raise ValueError(f"cost is {cost!r}; expected a dict like {{'terminal_weight': 2.0}}")
     if given.get("plant"):
         raise ValueError("the class of a plant of your own says its cost; leave out the cost here")
-    plant, _ = complete(training_parameters(source, given), compiled=False)
+    # Of the whole field, whatever is measured of it.
+    plant, _ = complete(training_parameters(source, {**given, "sensors": 0}), compiled=False)
     own = {name: getattr(plant, name) for name in ("state_weight", "action_weight")}
     if "output" not in cost:
         own["target"] = plant.target

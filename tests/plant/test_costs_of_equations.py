@@ -162,3 +162,5 @@ def test_a_cost_of_other_sizes_is_refused_in_a_sentence() -> None:
         )
     with pytest.raises(ParameterError, match="parameter 'cost': 'nonsense' is not a cost"):
         pdeloop.problem("burgers", cost=["nonsense"])
+    with pytest.raises(ValueError, match="sensors need weights that are numbers and a constant"):
+        pdeloop.problem("burgers", sensors=16, cost={"terminal_weight": 1.0})
