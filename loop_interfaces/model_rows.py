@@ -15,7 +15,7 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -40,6 +40,12 @@ class ModelRows:
     K_b: Array
     s_r: Array
     L: Array | None = None
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """Its parts by their names."""
+        parts = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: part for name, part in parts.items() if part is not None}
 
     @property
     def policy(self) -> Array:

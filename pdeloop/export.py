@@ -43,7 +43,7 @@ class Parameters:
         """`law`, its name, `theta`, its parts as `theta.NAME`, and the reduced model."""
         parts = self.law.parts(self.theta) if self.law else {}
         arrays = {f"theta.{name}": part for name, part in parts.items()}
-        known = _parts(self.model)
+        known = self.model.arrays
         return _archive(
             law=np.array(self.kind),
             theta=self.theta,
@@ -78,7 +78,7 @@ class GainLaw:
             model=pack(self.model)[np.newaxis],
             sample_time=np.array(self.sample_time),
             action_limit=np.array(self.limit),
-            **_parts(self.model),
+            **self.model.arrays,
         )
 
     def c(self) -> bytes:
@@ -133,11 +133,6 @@ def _loaded(run: FinishedRun, m: int) -> Law | None:
         return run.laws[m]
     except ValueError:
         return None
-
-
-def _parts(model: ModelRows) -> dict[str, Array]:
-    parts = {name: getattr(model, name) for name in model.__dataclass_fields__}
-    return {name: part for name, part in parts.items() if part is not None}
 
 
 def _archive(**arrays: Any) -> bytes:

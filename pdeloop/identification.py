@@ -319,12 +319,9 @@ def save(found: Identified, path: Path) -> None:
     field, with `field_` in front of their names.
     """
     model = found.model
-    arrays: dict[str, Any] = {
-        name: part
-        for name in model.__dataclass_fields__
-        if (part := getattr(model, name)) is not None
-    }
+    arrays: dict[str, Any] = {"A": model.A, "B": model.B, "U": model.U}
     if isinstance(model, ModelRows):
+        arrays |= model.arrays
         arrays["model"] = pack(model)[np.newaxis]
     if found.sample_time is not None:
         arrays["sample_time"] = np.array(found.sample_time)
