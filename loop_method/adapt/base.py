@@ -315,3 +315,9 @@ def require_results(results: Sequence[RolloutResult], expected: int) -> None:
         )
     if len(results) != expected:
         raise ValueError(f"tell needs one result per rollout, {expected}, but got {len(results)}.")
+
+
+def part_of(state: Mapping[str, NDArray[np.generic]], prefix: str) -> State:
+    """The arrays with a prefix, without it."""
+    names = [name for name in state if name.startswith(prefix)]
+    return {name.removeprefix(prefix): state[name] for name in names}

@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from loop_method.adapt.base import Context, Record
+from loop_interfaces.array_files import checked_array
+from loop_method.adapt.base import Context, Record, State, part_of
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
+from loop_method.models.files import model_of
 from loop_method.models.prediction import pieces
 from loop_method.models.readings import ReadingsModel, fit_readings
+
+_MODEL = "model."
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +31,21 @@ class Belief:
     model: FieldModel
     error: float
     components: int
+
+    def state(self) -> State:
+        """The model, its error and its components, as the arrays of a checkpoint."""
+        arrays = {_MODEL + name: value for name, value in self.model.arrays().items()}
+        numbers = {"error": np.array(self.error), "components": np.array(self.components)}
+        return numbers | arrays
+
+    @classmethod
+    def of(cls, state: Mapping[str, NDArray[np.generic]]) -> Belief | None:
+        """The belief in a checkpoint, None where it has none; ValueError for arrays of no model."""
+        if "error" not in state:
+            return None
+        model = model_of(part_of(state, _MODEL))
+        error = float(checked_array(state, "error", "f", ()))
+        return cls(model, error, int(checked_array(state, "components", "i", ())))
 
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
-from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State
+from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State, part_of
 from loop_method.adapt.gauss_newton import GaussNewton, GaussNewtonSettings
 from loop_method.adapt.renewal import mean_and_error
 from loop_method.adapt.settings import ModelBasedSettings
@@ -188,9 +188,3 @@ class LocalSearch:
         if not better:
             self.policy = self._start.copy()
         self.stage = ENDED
-
-
-def part_of(state: Mapping[str, NDArray[np.generic]], prefix: str) -> State:
-    """The arrays with a prefix, without it."""
-    names = [name for name in state if name.startswith(prefix)]
-    return {name.removeprefix(prefix): state[name] for name in names}

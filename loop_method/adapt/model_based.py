@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -33,28 +32,27 @@ from loop_method.adapt.base import (
     State,
     checked_policy,
     checked_theta,
+    part_of,
     require_positive,
     require_results,
 )
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
-from loop_method.adapt.local_search import LocalSearch, part_of
+from loop_method.adapt.local_search import LocalSearch
+from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
 from loop_method.adapt.renewal import renew
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
 from loop_method.laws.observer import Observer
-from loop_method.models.files import model_of
 from loop_method.seeds import field_seed
 
 __all__ = ["ModelBased"]
 
-RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
-_STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
 _REMEMBERED = 10**6
 """Rollouts, more than there ever are: the law is not renewed any more once it knows enough fields."""
-_LOCAL, _MODEL = "local.", "model."
+_LOCAL = "local."
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
@@ -113,21 +111,8 @@ class ModelBased(Optimizer):
         ]
         largest = max(float(np.abs(record.states).max()) for record in self._before)
         self._records = Records(_REMEMBERED, 3.0 * largest)
-        self._stage, self._tells = RENEWING, 0
-        self._policy = self._first.copy()
-        """The present law, and at the end the chosen one."""
-        self._belief: Belief | None = None
-        self._improved: Array | None = None
-        self._parts: list[Array] = []
-        self._held_out = np.zeros(3)
-        """Fraction, change and deviation of the last renewal."""
+        self._progress = Progress(self._first.copy())
         self._local: LocalSearch | None = None
-        self._begun = 0
-        """Own rollouts before the search."""
-        self._none_is_close = False
-        """Whether no control is judged as well."""
-        self._safe = True
-        """Whether the first law is better than no control on the model."""
 
     @classmethod
     def for_context(cls, context: Context) -> type[Optimizer]:
@@ -146,27 +131,27 @@ class ModelBased(Optimizer):
     @property
     def policy(self) -> Array:
         """The present law, and at the end the chosen one."""
-        return self._policy.copy()
+        return self._progress.policy.copy()
 
     @property
     def tells(self) -> int:
         """Number of calls of `tell`."""
-        return self._tells
+        return self._progress.tells
 
     @property
     def done(self) -> bool:
         """Whether there is nothing more to ask."""
-        return self._stage == ENDED
+        return self._progress.stage == ENDED
 
     def ask(self) -> list[Rollout]:
         """The rollouts of the current stage, at once where they do not depend on each other."""
         own = self._records.count
-        if self._stage == RENEWING:
-            laws = [self._policy] * (self._next_renewal() - own)
-        elif self._stage == JUDGING:
-            laws = [self._policy] * (self._judging - self._none_is_close)
-            laws += [self._none] * self._none_is_close
-        elif self._stage == SEARCHING:
+        if self._progress.stage == RENEWING:
+            laws = [self._progress.policy] * (self._next_renewal() - own)
+        elif self._progress.stage == JUDGING:
+            laws = [self._progress.policy] * (self._judging - self._progress.none_is_close)
+            laws += [self._none] * self._progress.none_is_close
+        elif self._progress.stage == SEARCHING:
             assert self._local is not None
             return self._local.ask()
         else:
@@ -179,19 +164,19 @@ class ModelBased(Optimizer):
         require_results(results, len(asked))
         for result in results:
             self._records.validated_samples(result)
-        self._tells += 1
+        self._progress.tells += 1
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         with threadpool_limits(limits=1):
-            if self._stage == SEARCHING:
+            if self._progress.stage == SEARCHING:
                 row = self._search(results)
             added = [
                 self._records.add(rollout.policy, result, set())
                 for rollout, result in zip(asked, results, strict=True)
             ]
-            if self._stage == RENEWING:
+            if self._progress.stage == RENEWING:
                 row = self._measured(added)
                 self._renew(row)
-            elif self._stage == JUDGING:
+            elif self._progress.stage == JUDGING:
                 row = self._measured(added)
                 self._judge(row)
         row["rollouts"] = self._records.count
@@ -226,7 +211,7 @@ class ModelBased(Optimizer):
 
     def _measured(self, added: Sequence[Record]) -> Row:
         """The mean cost of some rollouts, and what the model said of them before."""
-        row: Row = {"role": self._stage}
+        row: Row = {"role": self._progress.stage}
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
         predicted = self._predicted(added)
@@ -236,9 +221,9 @@ class ModelBased(Optimizer):
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
         """The costs of rollouts on the last model; none without one."""
-        if self._belief is None:
+        if (belief := self._progress.belief) is None:
             return []
-        loop = self._belief.loop(self._context)
+        loop = belief.loop(self._context)
         return [
             float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
             for record in added
@@ -255,13 +240,12 @@ class ModelBased(Optimizer):
 
     def _begin_judging(self) -> None:
         """Also without control, if that may be as good as the law."""
-        self._stage = JUDGING
-        if self._belief is not None and self._judging > 1 and self._policy.any():
-            loop, fields = self._belief.loop(self._context), self._fields()
-            none, own = (
-                loop.costs(loop.theta(law), fields).mean() for law in (self._none, self._policy)
-            )
-            self._none_is_close = bool(none <= (1.0 + self._settings.close) * own)
+        self._progress.stage = JUDGING
+        belief, policy = self._progress.belief, self._progress.policy
+        if belief is not None and self._judging > 1 and policy.any():
+            loop, fields = belief.loop(self._context), self._fields()
+            none, own = (loop.costs(loop.theta(law), fields).mean() for law in (self._none, policy))
+            self._progress.none_is_close = bool(none <= (1.0 + self._settings.close) * own)
 
     def _fields(self) -> Array:
         """Initial fields of all rollouts."""
@@ -270,21 +254,21 @@ class ModelBased(Optimizer):
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._last_renewal()
-        belief = believe(
-            self._context, self._measurements(), self._belief.model.kind if self._belief else ""
-        )
+        before = self._progress.belief
+        kind = "" if before is None else before.model.kind
+        belief = believe(self._context, self._measurements(), kind)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
                 row["mismatch"] = belief.error
         if belief is not None and self._is_believed(belief):
-            self._belief = belief
+            self._progress.belief = belief
             self._improve(belief, row, final)
-        elif self._belief is not None:
+        elif before is not None:
             row["reason"] = f"{self._unpredicted} any more; the law stays"
         else:
             self._without_model(row, final)
-        if final and self._stage == RENEWING:
+        if final and self._progress.stage == RENEWING:
             self._begin_judging()
 
     _unpredicted = "no model of the whole field predicts the rollouts"
@@ -310,9 +294,10 @@ class ModelBased(Optimizer):
         loop, fields = belief.loop(self._context), self._fields()
         first, none = loop.theta(self._first), loop.theta(self._none)
         # A first law that is worse than no control is nothing to stay near to.
-        self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
-        base, near = (first, self._first) if self._safe else (none, self._none)
-        settings, parts = self._settings, self._parts
+        safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
+        base, near = (first, self._first) if safe else (none, self._none)
+        self._progress.safe = safe
+        settings, parts = self._settings, self._progress.parts
         if is_chaotic(loop, fields):
             row["chaotic"] = True
             fields = measured_states(self._data(), settings.chaotic_fields)
@@ -322,7 +307,7 @@ class ModelBased(Optimizer):
         found = renew(
             loop,
             base,
-            base if self._improved is None else self._improved,
+            base if self._progress.improved is None else self._progress.improved,
             parts,
             fields,
             rng,
@@ -334,23 +319,23 @@ class ModelBased(Optimizer):
         if found is None:
             row["reason"] = "no law is finite on the model; the law stays"
             return
-        self._improved, self._parts = found.improved, found.parts
-        self._held_out = np.array([found.fraction, found.change, found.deviation])
-        self._policy = loop.policy(found.theta, near) if found.fraction else near.copy()
+        self._progress.improved, self._progress.parts = found.improved, found.parts
+        self._progress.held_out = np.array([found.fraction, found.change, found.deviation])
+        self._progress.policy = loop.policy(found.theta, near) if found.fraction else near.copy()
         row["fraction"], row["steps"] = found.fraction, found.steps
         if np.isfinite(found.change):
             row["predicted_change"], row["deviation"] = found.change, found.deviation
 
     def _judge(self, row: Row) -> None:
         """Choose between the first law, the final one and no control."""
-        if self._belief is None:
+        if self._progress.belief is None:
             self._end(row, self._unpredicted)
             return
-        laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._policy}
-        base = FIRST if self._safe else NONE
-        _, change, deviation = self._held_out.tolist()
+        laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
+        base = FIRST if self._progress.safe else NONE
+        _, change, deviation = self._progress.held_out.tolist()
         evidence = evidence_of(
-            self._belief.loop(self._context),
+            self._progress.belief.loop(self._context),
             laws,
             base,
             self._data()[len(self._context.every_exploration) :],
@@ -358,7 +343,7 @@ class ModelBased(Optimizer):
             (change, deviation),
         )
         verdict = choose(evidence, base, self._settings.confidence)
-        self._policy = laws[verdict.chosen].copy()
+        self._progress.policy = laws[verdict.chosen].copy()
         row["chosen"] = verdict.chosen
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
         early = self._left > 0
@@ -366,12 +351,12 @@ class ModelBased(Optimizer):
         self._end(row, verdict.reason + f"; more than {known} fields would not change it" * early)
 
     def _end(self, row: Row, reason: str) -> None:
-        row["reason"], self._stage = reason, ENDED
+        row["reason"], self._progress.stage = reason, ENDED
 
     def _begin_search(self, row: Row) -> None:
-        self._begun = self._records.count
-        self._local = self._search_from(self._begun)
-        self._stage = SEARCHING
+        self._progress.begun = self._records.count
+        self._local = self._search_from(self._progress.begun)
+        self._progress.stage = SEARCHING
         if not self._local.ask():
             self._end(row, f"{row['reason']}, for which too few rollouts are left")
 
@@ -389,29 +374,14 @@ class ModelBased(Optimizer):
     def _search(self, results: Sequence[RolloutResult]) -> Row:
         assert self._local is not None
         row = self._local.tell(results)
-        self._policy = self._local.policy.copy()
+        self._progress.policy = self._local.policy.copy()
         if self._local.stage == LOCAL_ENDED:
-            self._stage = ENDED
+            self._progress.stage = ENDED
         return row
 
     def state(self) -> State:
-        """The stage, the laws, the model, and all rollouts."""
-        arrays: State = {
-            "stage": np.array(self._stage),
-            "tells": np.array(self._tells),
-            "policy": self._policy.copy(),
-            "held_out": self._held_out.copy(),
-            "begun": np.array(self._begun),
-            "none_is_close": np.array(self._none_is_close),
-            "safe": np.array(self._safe),
-            **self._records.state(),
-        }
-        if self._improved is not None:
-            arrays["laws"] = np.stack([self._improved, *self._parts])
-        if (belief := self._belief) is not None:
-            arrays["error"] = np.array(belief.error)
-            arrays["components"] = np.array(belief.components)
-            arrays |= {_MODEL + name: value for name, value in belief.model.arrays().items()}
+        """The progress, all rollouts, and the state of local steps."""
+        arrays = self._progress.state() | self._records.state()
         if self._local is not None:
             arrays |= {_LOCAL + name: value for name, value in self._local.state().items()}
         return arrays
@@ -419,27 +389,9 @@ class ModelBased(Optimizer):
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
         n_z, shape = len(self._context.U), self._first.shape
-        stage = str(checked_array(state, "stage", "U", ()))
-        if stage not in _STAGES:
-            raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        self._progress = Progress.of(state, shape)
         self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
-        self._stage, self._tells = stage, int(checked_array(state, "tells", "i", ()))
-        self._policy = checked_array(state, "policy", "f", shape).copy()
-        self._held_out = checked_array(state, "held_out", "f", (3,), finite=False).copy()
-        self._begun = int(checked_array(state, "begun", "i", ()))
-        self._none_is_close = bool(checked_array(state, "none_is_close", "b", ()))
-        self._safe = bool(checked_array(state, "safe", "b", ()))
-        self._improved, self._parts = None, []
-        if "laws" in state:
-            self._improved, *self._parts = (
-                a.copy() for a in checked_array(state, "laws", "f", (None, None, None))
-            )
-        self._belief = None
-        if "error" in state:
-            model = model_of(part_of(state, _MODEL))
-            error = float(checked_array(state, "error", "f", ()))
-            self._belief = Belief(model, error, int(checked_array(state, "components", "i", ())))
         self._local = None
         if local := part_of(state, _LOCAL):
-            self._local = self._search_from(self._begun)
+            self._local = self._search_from(self._progress.begun)
             self._local.restore(local)

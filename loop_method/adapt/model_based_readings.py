@@ -47,9 +47,9 @@ class ModelBasedReadings(ModelBased):
 
     def _fields(self) -> Array:
         """Where rollouts began, with what no model foresaw in them."""
-        if self._belief is None:
+        if self._progress.belief is None:
             return super()._fields()
-        return self._belief.loop(self._context).beginnings(self._data())
+        return self._progress.belief.loop(self._context).beginnings(self._data())
 
     def _is_believed(self, belief: Belief) -> bool:
         """Always: what a law costs is measured after every step."""
@@ -70,12 +70,12 @@ class ModelBasedReadings(ModelBased):
         if found is None:
             row["reason"] = "the law is not finite on the model; it stays"
         else:
-            self._policy, row["steps"] = found
+            self._progress.policy, row["steps"] = found
 
     def _judge(self, row: Row) -> None:
         """Judge the law that measured best in place of the last one."""
         others = [r for r in self._records.all() if not np.array_equal(r.policy, self._first)]
-        self._policy = best_measured(others, self._policy).copy()
+        self._progress.policy = best_measured(others, self._progress.policy).copy()
         super()._judge(row)
 
 

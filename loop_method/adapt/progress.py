@@ -1,0 +1,97 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""How far an optimisation with `model_based` has come: its stage, laws and model, for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.array_files import checked_array
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import State
+from loop_method.adapt.belief import Belief
+
+RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
+_STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
+
+
+@dataclass(eq=False)
+class Progress:
+    """What changes in the course of an optimisation, besides its rollouts and local steps.
+
+    Attributes
+    ----------
+    policy : array
+        The present law, and at the end the chosen one.
+    stage : str
+        One of `renewing`, `judging`, `searching`, `ended`.
+    tells : int
+        Number of calls of `tell`.
+    belief : Belief or None
+        The model that the law was improved on last.
+    improved : array or None
+        The law after the last descent, with which the next one begins.
+    parts : list of arrays
+        The same for each part of the fields, from those of the others.
+    held_out : (3,) array
+        Fraction, change and deviation of the last renewal.
+    begun : int
+        Rollouts before local steps began.
+    none_is_close : bool
+        True if no control is judged as well.
+    safe : bool
+        True if the first law is better than no control on the model.
+    """
+
+    policy: Array
+    stage: str = RENEWING
+    tells: int = 0
+    belief: Belief | None = None
+    improved: Array | None = None
+    parts: list[Array] = field(default_factory=list)
+    held_out: Array = field(default_factory=lambda: np.zeros(3))
+    begun: int = 0
+    none_is_close: bool = False
+    safe: bool = True
+
+    def state(self) -> State:
+        """All of it, as the arrays of a checkpoint."""
+        arrays: State = {
+            "stage": np.array(self.stage),
+            "tells": np.array(self.tells),
+            "policy": self.policy.copy(),
+            "held_out": self.held_out.copy(),
+            "begun": np.array(self.begun),
+            "none_is_close": np.array(self.none_is_close),
+            "safe": np.array(self.safe),
+        }
+        if self.improved is not None:
+            arrays["laws"] = np.stack([self.improved, *self.parts])
+        if self.belief is not None:
+            arrays |= self.belief.state()
+        return arrays
+
+    @classmethod
+    def of(cls, state: Mapping[str, NDArray[np.generic]], shape: tuple[int, ...]) -> Progress:
+        """The progress in a checkpoint, whose laws have this shape; ValueError if there is none."""
+        stage = str(checked_array(state, "stage", "U", ()))
+        if stage not in _STAGES:
+            raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        laws: list[Array] = []
+        if "laws" in state:
+            laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
+        return cls(
+            checked_array(state, "policy", "f", shape).copy(),
+            stage=stage,
+            tells=int(checked_array(state, "tells", "i", ())),
+            belief=Belief.of(state),
+            improved=laws[0] if laws else None,
+            parts=laws[1:],
+            held_out=checked_array(state, "held_out", "f", (3,), finite=False).copy(),
+            begun=int(checked_array(state, "begun", "i", ())),
+            none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
+            safe=bool(checked_array(state, "safe", "b", ())),
+        )
