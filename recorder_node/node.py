@@ -76,7 +76,8 @@ class RecorderNode:
         self._node, self._loop, self._log = node, loop, node.get_logger()
         self._others: list[tuple[Source, SerializedSubscription]] = []
         self._samples: list[tuple[SampleSubscription, dict[int, Source]]] = []
-        for source in self._sources:
+        # The starts last: they are discovered last, and a tuner waits until its own reach us.
+        for source in sorted(self._sources, key=lambda source: source.array is START):
             if source.array not in (STATE, ACTION) and source is not CLOCK:
                 self._subscribe(source)
         self._subscribe_samples()

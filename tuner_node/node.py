@@ -25,7 +25,7 @@ from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, samples_qos, scoped
-from loop_interfaces.ros.introspection import full_name
+from loop_interfaces.ros.introspection import full_name, matched_processes, process_of
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
@@ -254,11 +254,15 @@ class TunerNode:
             names = [self._full_name(namespace, topic) for namespace in self._pairs]
             return [(name, self._node.count_publishers(name)) for name in names]
 
+        status = self._full_name("", topics.RECORDER_STATUS)
+        recorders = {process_of(there) for there in self._node.get_publishers_info_by_topic(status)}
+        starts = [senders[topics.START.name].publisher for senders in self._senders]
         return Publishers(
             plants=[there for _, there in count(topics.COST.name)],
             controllers=[there for _, there in count(topics.MODEL_IDENTIFIED.name)],
             tuners=dict(count(topics.START.name)),
-            recorders=self._node.count_publishers(self._full_name("", topics.RECORDER_STATUS)),
+            recorders=len(recorders),
+            unmatched=max(len(recorders - matched_processes(self._node, own)) for own in starts),
         )
 
     def _report(self, row: Mapping[str, Any]) -> None:

@@ -18,13 +18,15 @@ class Publishers:
     """Numbers of publishers of the topics that show the participants.
 
     plants, controllers: of `episode/cost` and `model/identified`, by pair; tuners: of each
-    `episode/start`, this tuner's own among them; recorders: of `recorder/status`.
+    `episode/start`, this tuner's own among them; recorders: of `recorder/status`; unmatched: those of
+    them that do not yet read every `episode/start` of this tuner.
     """
 
     plants: Sequence[int]
     controllers: Sequence[int]
     tuners: Mapping[str, int]
     recorders: int
+    unmatched: int = 0
 
 
 class Participants:
@@ -45,7 +47,7 @@ class Participants:
         DispatchError where a required recorder has gone, or another tuner publishes.
         """
         self._refuse_second_tuner(there.tuners, now)
-        absent = ["recorder"] if self._awaits_recorder(there.recorders > 0) else []
+        absent = ["recorder"] if self._awaits_recorder(there) else []
         publications = []
         for pair, counts in enumerate(zip(there.plants, there.controllers, strict=True)):
             roles = zip(("plant", "controller"), counts, strict=True)
@@ -65,16 +67,19 @@ class Participants:
         which = f" of pair {', '.join(map(str, paused))}" if len(dispatcher.pairs) > 1 else ""
         return f"the plant{which} is paused"
 
-    def _awaits_recorder(self, there: bool) -> bool:
-        """Whether the first episode still waits for the recorder."""
+    def _awaits_recorder(self, there: Publishers) -> bool:
+        """True until a recorder was there from which no start of an episode can be lost.
+
+        A recorder may be discovered before its subscriptions are.
+        """
         if self._recorder == "none":
             return False
-        if self._recorder == "required" and self._recorder_seen and not there:
+        if self._recorder == "required" and self._recorder_seen and not there.recorders:
             raise DispatchError(
                 "the recorder is gone, and this training is required to be recorded; "
                 "it can be continued from its folder with resume:=true"
             )
-        self._recorder_seen |= there
+        self._recorder_seen |= there.recorders > there.unmatched
         return not self._recorder_seen
 
     def _refuse_second_tuner(self, tuners: Mapping[str, int], now: float) -> None:

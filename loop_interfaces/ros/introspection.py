@@ -45,6 +45,23 @@ def full_name(endpoint: Any) -> str:
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
+def process_of(endpoint: Any) -> bytes:
+    """The process of an endpoint in the ROS graph: what the ids of all its endpoints begin with."""
+    return bytes(endpoint.endpoint_gid)[:12]
+
+
+def matched_processes(node: Node, publisher: Publisher) -> set[bytes]:
+    """The processes whose subscriptions receive what the publisher sends from now on.
+
+    The graph tells who subscribes, the publisher how many of them it is matched with: none is named
+    before all are.
+    """
+    there = node.get_subscriptions_info_by_topic(publisher.topic_name)
+    if publisher.get_subscription_count() < len(there):
+        return set()
+    return {process_of(endpoint) for endpoint in there}
+
+
 class Introspection:
     """Publishes a node's diagnostics, and warns of other nodes that should not be there."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
-from loop_interfaces.ros.introspection import NAMELESS, full_name
+from loop_interfaces.ros.introspection import NAMELESS, full_name, process_of
 from loop_interfaces.ros.parameters import RemoteParameters
 
 
@@ -72,7 +72,7 @@ class Peers:
     def _publishers(self, topic: str, now: float) -> list[Peer]:
         peers = []
         for endpoint in self._node.get_publishers_info_by_topic(topic):
-            process = bytes(endpoint.endpoint_gid)[:12]
+            process = process_of(endpoint)
             peer = self._known.setdefault(process, Peer(process, now))
             if not peer.name and endpoint.node_name != NAMELESS:
                 peer.name = full_name(endpoint)

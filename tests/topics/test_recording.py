@@ -303,6 +303,35 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     assert both.compared["policies"] == 2 + 2 * iterations + 30
 
 
+LATE_SUBSCRIPTION = """
+import time
+import rclpy
+from std_msgs.msg import Float64MultiArray, String
+from loop_interfaces.episodes import episode_name
+from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, writer_qos
+from loop_interfaces.topics import MODEL, RECORDER_STATUS, START
+
+rclpy.init()
+node = rclpy.create_node("late")
+publisher = node.create_publisher(String, RECORDER_STATUS, writer_qos(MODEL))
+time.sleep(2)  # in which a tuner that needs no more than this has long begun
+subscription = raw_subscription(node, Float64MultiArray, START.name, reader_qos(START))
+while (taken := subscription.handle.take_message(Float64MultiArray, True)) is None:
+    time.sleep(0.001)
+print("first", episode_name(START.codec().decode(taken[0]).episode))
+while node.count_publishers(START.name):
+    time.sleep(0.05)
+"""
+
+
+def test_no_episode_begins_before_its_start_reaches_the_recorder(loop, tmp_path):
+    start_pair(loop)
+    tuner = start_tuner(loop, tmp_path / "run", iterations=20, recorder="start")
+    late = loop.start("-c", LATE_SUBSCRIPTION, name="late")
+    loop.wait(tuner, LIMIT)
+    assert loop.wait(late, LIMIT).splitlines() == ["first 1.1"]
+
+
 def test_one_recorder_records_several_pairs(loop, tmp_path):
     for pair in ("a", "b"):
         where = ("-r", f"__ns:=/{pair}", "--params-file", str(SMALL))

@@ -24,8 +24,10 @@ def participants(recorder: str = "none", *, pairs: int = 1, established: bool = 
     return Participants(session, recorder), dispatcher  # type: ignore[arg-type]
 
 
-def there(plants: int = 1, controllers: int = 1, tuners: int = 1, recorders: int = 0) -> Publishers:
-    return Publishers([plants], [controllers], {"/episode/start": tuners}, recorders)
+def there(
+    plants: int = 1, controllers: int = 1, tuners: int = 1, recorders: int = 0, unmatched: int = 0
+) -> Publishers:
+    return Publishers([plants], [controllers], {"/episode/start": tuners}, recorders, unmatched)
 
 
 def test_the_dispatcher_learns_which_nodes_of_each_pair_are_missing():
@@ -41,7 +43,11 @@ def test_the_first_episode_waits_for_a_recorder(recorder: str):
     company, dispatcher = participants(recorder)
     company.update(there(), 0.0)
     assert dispatcher.missing() == ["recorder"]
+    company.update(there(recorders=1, unmatched=1), 0.5)  # an episode's start could be lost
+    assert dispatcher.missing() == ["recorder"]
     company.update(there(recorders=1), 1.0)
+    assert dispatcher.missing() == []
+    company.update(there(recorders=1, unmatched=1), 2.0)  # it began with one
     assert dispatcher.missing() == []
 
 
