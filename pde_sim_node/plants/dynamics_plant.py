@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -46,6 +47,11 @@ class DynamicsPlant(BatchPlant):
         self.dynamics, self.name = dynamics, type(dynamics).__qualname__
         if not hasattr(dynamics, "n_a"):
             raise ValueError(f"{self.name} must set n_a, the size of an action")
+        for name in Dynamics.__annotations__:
+            if inspect.ismethod(getattr(dynamics, name)):
+                raise ValueError(
+                    f"{self.name}: {name} is a method; expected its value (an attribute or property)"
+                )
         given = {name: getattr(dynamics, name) for name in ("n_a", "sample_time", *SETTABLE)}
         given |= settings
         try:

@@ -105,8 +105,9 @@ def make(values: Mapping[str, Any]) -> Made:
     if not isinstance(made, Dynamics | Plant):
         raise ValueError(
             f"plant {shown(name)} must be a class derived from pdeloop.Dynamics, or make one of its "
-            f"objects, got {made!r}"
+            f"objects, got {shown(made)}"
         )
+    require_complete(made)
     defaults = signature_of(maker).parameters.values()
     stored = {p.name: p.default for p in defaults if _storable(p.default)}
     return Made(made, stored | arguments)
@@ -144,6 +145,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
 
     Its code is allowed here and in the processes that are started.
     """
+    require_complete(plant)
     kind = type(plant)
     arguments = arguments_of(plant) if isinstance(plant, Dynamics) else {}
     stored = {
@@ -163,8 +165,28 @@ def as_plant(plant: object) -> Plant:
     if isinstance(plant, Dynamics):
         return DynamicsPlant(plant)
     if not isinstance(plant, Plant):
-        raise ValueError(f"plant is {plant!r}; expected a Plant, or an object of a Dynamics")
+        raise ValueError(f"plant is {shown(plant)}; expected a Plant, or an object of a Dynamics")
+    require_complete(plant)
     return plant
+
+
+def require_complete(plant: Dynamics | Plant) -> None:
+    """ValueError for a class derived from `Plant` itself that leaves out a part of that interface."""
+    if isinstance(plant, Dynamics):
+        return
+    kind = type(plant)
+    left = [name for name in Plant.__annotations__ if not hasattr(plant, name)]
+    left += [
+        name
+        for name, member in vars(Plant).items()
+        if not name.startswith("_") and getattr(kind, name, None) is member
+    ]
+    if left:
+        raise ValueError(
+            f"{kind.__name__} is derived from pdeloop.Plant, the interface of many environments at "
+            f"once, and lacks {len(left)} parts of it, such as {left[0]}; derive "
+            "it from pdeloop.Dynamics, which needs sizes, initial_state and step"
+        )
 
 
 def _storable(value: object) -> bool:

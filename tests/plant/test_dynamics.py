@@ -232,6 +232,15 @@ def test_a_class_without_actuators_is_refused() -> None:
         DynamicsPlant(Idle())
 
 
+def test_a_number_that_is_a_method_is_refused() -> None:
+    class Method(Linear):
+        def target(self) -> Any:  # type: ignore[override]
+            return np.zeros(3)
+
+    with pytest.raises(ValueError, match=r"Method: target is a method; expected its value"):
+        DynamicsPlant(Method())
+
+
 def test_an_initial_state_that_is_wrong_is_told_and_changes_nothing() -> None:
     plant = DynamicsPlant(Unfit())
     plant.reset([0])

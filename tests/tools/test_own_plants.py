@@ -52,6 +52,12 @@ class Needy(Rod):
     def __init__(self, length):
         super().__init__()
 
+class Bare(pdeloop.Plant):
+    n_z, n_a, horizon, sample_time = 5, 2, 6, 0.5
+
+    def step(self, z, a):
+        return z
+
 def rods(count: int = 2):
     return Rod(0.1 * count)
 
@@ -131,6 +137,11 @@ def test_a_function_may_make_the_plant(own: Path) -> None:
             "cannot be made: missing a required argument: 'length'; give it as 'physical",
         ),
         ("nothing", {}, "must be a class derived from pdeloop.Dynamics, or make one .* got 3"),
+        (
+            "Bare",
+            {},
+            "Bare is derived from pdeloop.Plant, .* lacks .* derive it from pdeloop.Dynamics",
+        ),
         ("NUMBER", {}, "must be a class or a function, got 3"),
         ("Ring", {}, "there is no 'Ring' in"),
         ("Rod", {"n_z": 6}, "'n_z' is 6, and that of .*own.py:Rod is 5; leave it out"),
@@ -144,6 +155,19 @@ def test_a_plant_that_cannot_be_made_is_told_why(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         values_of(own, name, **given)
+
+
+def test_an_object_of_the_interface_alone_is_refused_wherever_a_plant_is_taken() -> None:
+    class Bare(pdeloop.Plant):
+        n_z, n_a = 5, 2
+
+    for use in (
+        lambda plant: pdeloop.train(plant=plant),
+        lambda plant: pdeloop.rollout(plant, lambda k, z: z, [0]),
+        pdeloop.Gradients,
+    ):
+        with pytest.raises(ValueError, match=r"Bare is derived from pdeloop\.Plant, .* lacks"):
+            use(Bare())
 
 
 def test_code_that_only_a_file_names_is_not_run(own: Path, tmp_path: Path, capsys: Any) -> None:
