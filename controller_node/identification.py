@@ -20,6 +20,8 @@ from loop_interfaces.signature import CONSTANTS
 from loop_interfaces.spec import IDENTIFICATION_SETTINGS
 from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
+from loop_method.method_settings import field_model_settings
+from loop_method.models import FieldModelSettings
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
@@ -58,7 +60,7 @@ class DesignSettings:
     horizon : int
         Steps of an episode, for a law that has parameters for each of them.
     constants : dict
-        Parameters `identification_settings.NAME` and `law_settings.NAME` as given; others have their
+        Parameters of `loop_interfaces.signature.CONSTANTS` as given; others have their
         defaults.
     """
 
@@ -91,6 +93,11 @@ class DesignSettings:
         return settings_from(
             IDENTIFICATION_SETTINGS, IdentificationSettings, self.constants, "identification"
         )
+
+    @property
+    def field_models(self) -> FieldModelSettings:
+        """The constants of field models. ParameterError for one out of range."""
+        return field_model_settings(self.constants)
 
 
 def identify(
@@ -255,6 +262,7 @@ def designed(
             action_limit=settings.action_limit,
             noise=settings.measurement_noise,
             settings=settings.method,
+            models=settings.field_models,
             **weights,
         )
     chosen = found.rows if found.better and found.rows else rows

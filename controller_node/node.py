@@ -33,7 +33,7 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
 from loop_interfaces.topics import Topic
-from loop_method.method_settings import law_and_identification
+from loop_method.method_settings import shared_methods
 from loop_method.settings import parameters_of, with_defaults
 
 FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path") else None
@@ -43,10 +43,10 @@ Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]
 
 
 def declare_parameters(node: Node) -> dict[str, Any]:
-    """The controller's parameters, with the settings of law and identification."""
+    """The controller's parameters, with the settings of the methods that it shares with the tuner."""
     given = given_parameters(node, "controller_node")
     values = declare(node, taken_by("controller_node"), given)
-    for method in law_and_identification(values):
+    for method in shared_methods(values):
         with_defaults(method.prefix, method.settings, given, method.name)  # refuses unknown ones
         values |= declare(node, parameters_of(method.prefix, method.settings), given)
     return values

@@ -8,6 +8,7 @@ from typing import Any
 from loop_interfaces.parameter_file import ParameterFile, read_parameter_file
 from loop_interfaces.parameters import NODES, table
 from loop_interfaces.spec import (
+    FIELD_MODEL_SETTINGS,
     IDENTIFICATION_SETTINGS,
     LAW_SETTINGS,
     OPTIMIZER_SETTINGS,
@@ -22,6 +23,7 @@ DECLARED_BY = {
     OPTIMIZER_SETTINGS: "T",
     LAW_SETTINGS: "CT",
     IDENTIFICATION_SETTINGS: "CT",
+    FIELD_MODEL_SETTINGS: "CT",
 }
 """Letters of the nodes that take the parameters of an equation, a plant or a method."""
 

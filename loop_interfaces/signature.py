@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS
+from loop_interfaces.spec import FIELD_MODEL_SETTINGS, IDENTIFICATION_SETTINGS, LAW_SETTINGS
 
 NOT_SIGNED = 0.0
 """In place of D: the tuner asks for no signature. In place of s: the message carries none."""
@@ -31,8 +31,8 @@ DESIGN = (
 """Parameters that a model depends on besides its episode, and the cost where it is not empty."""
 
 
-CONSTANTS = (IDENTIFICATION_SETTINGS, LAW_SETTINGS)
-"""How the names of parameters begin that are constants of the identification or of a law."""
+CONSTANTS = (IDENTIFICATION_SETTINGS, LAW_SETTINGS, FIELD_MODEL_SETTINGS)
+"""How the names of parameters begin that are constants of the identification, a law or field models."""
 
 
 def digest_of(*arrays: ArrayLike) -> int:
@@ -52,7 +52,8 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
 
     The name of a law other than the affine one follows, without the file or module that it is in, and
     the horizon; the noise, where there is any and the identification is "field", which is fitted for
-    it; then the constants of the identification and of the law, by their names.
+    it; then the constants of the identification and of the law, by their names, and those of field
+    models with "field".
     """
     values = [parameters[name] for name in DESIGN]
     values += ["".join(parameters["cost"])] if parameters.get("cost") else []
@@ -61,7 +62,8 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     noise = parameters.get("measurement_noise")
     values += [noise] if noise and parameters["identification"] == "field" else []
     constants = parameters.get("constants", parameters)
-    names = sorted(name for name in constants if name.startswith(CONSTANTS))
+    count = CONSTANTS if parameters["identification"] == "field" else CONSTANTS[:2]
+    names = sorted(name for name in constants if name.startswith(count))
     values += [f"{name}={constants[name]}" for name in names]
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
 

@@ -20,7 +20,8 @@ Value = bool | int | float | str | list[str] | list[float]
 OPTIMIZER_SETTINGS = "optimizer_settings."
 LAW_SETTINGS = "law_settings."
 IDENTIFICATION_SETTINGS = "identification_settings."
-SETTINGS = (OPTIMIZER_SETTINGS, LAW_SETTINGS, IDENTIFICATION_SETTINGS)
+FIELD_MODEL_SETTINGS = "field_model_settings."
+SETTINGS = (OPTIMIZER_SETTINGS, LAW_SETTINGS, IDENTIFICATION_SETTINGS, FIELD_MODEL_SETTINGS)
 """Prefixes of parameters that are constants of a method."""
 FREE = ("physical.", *SETTINGS)
 """Prefixes of parameters that an equation, a plant or a method declares."""

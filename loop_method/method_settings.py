@@ -7,11 +7,19 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from loop_interfaces.parameters import LAW
-from loop_interfaces.spec import IDENTIFICATION_SETTINGS, LAW_SETTINGS, ParameterError
+from loop_interfaces.spec import (
+    FIELD_MODEL_SETTINGS,
+    IDENTIFICATION_SETTINGS,
+    LAW_SETTINGS,
+    ParameterError,
+)
 from loop_method.laws.base import Law
 from loop_method.laws.registry import law_kind
+from loop_method.models.settings import FieldModelSettings
 from loop_method.reduce.settings import IdentificationSettings
-from loop_method.settings import Settings
+from loop_method.settings import Settings, settings_from
+
+FIELD_MODELS = "models of the whole field"
 
 
 class Method(NamedTuple):
@@ -22,6 +30,11 @@ class Method(NamedTuple):
     name: str
 
 
+def field_model_settings(values: Mapping[str, Any]) -> FieldModelSettings:
+    """The constants of field models that parameters give. ParameterError for one out of range."""
+    return settings_from(FIELD_MODEL_SETTINGS, FieldModelSettings, values, FIELD_MODELS)
+
+
 def law_of(values: Mapping[str, Any]) -> type[Law]:
     """The class of the law that parameters name. ParameterError if there is none of that name."""
     try:
@@ -30,10 +43,11 @@ def law_of(values: Mapping[str, Any]) -> type[Law]:
         raise ParameterError(str(error)) from error
 
 
-def law_and_identification(values: Mapping[str, Any]) -> list[Method]:
-    """The two methods that controller and tuner must agree on."""
+def shared_methods(values: Mapping[str, Any]) -> list[Method]:
+    """The methods that controller and tuner must agree on: law, identification, field models."""
     law = law_of(values)
     return [
         Method(LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
         Method(IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
+        Method(FIELD_MODEL_SETTINGS, FieldModelSettings, FIELD_MODELS),
     ]

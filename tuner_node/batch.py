@@ -11,6 +11,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
 from loop_method.adapt import Rollout, RolloutResult, Trajectory
 from loop_method.laws import Affine, Law
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
@@ -128,6 +129,8 @@ class TrainingSettings:
     """Whether they are fields on one axis, or plain vectors."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
+    field_models: FieldModelSettings = DEFAULTS
+    """How models of the whole field are fitted and one is chosen."""
     law: type[Law] = Affine
     horizon: int = 1
     """Steps of an episode as the parameters have it, for a law with parameters for each of them."""

@@ -20,6 +20,7 @@ from loop_method.adapt import Context, Optimizer
 from loop_method.adapt.in_coordinates import InCoordinates, is_large
 from loop_method.laws import Affine, Law
 from loop_method.laws.registry import law_kind
+from loop_method.method_settings import field_model_settings
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
@@ -183,6 +184,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "line": grid is None or len(grid.axes) < 2,
         "measurement_noise": values["measurement_noise"] * scale,
         "model": given_model(values, law),
+        "field_models": field_model_settings(values),
     }
     settings = TrainingSettings(
         **given,

@@ -44,4 +44,5 @@ def context_of(
         # Where numbers and the target do not say it.
         cost=None if cost is None or cost.plain else cost,
         law=law,
+        field_models=settings.field_models,
     )

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The optimiser that the parameters name, and the settings of optimiser, law and identification."""
+"""The optimiser that the parameters name, and the settings of all methods."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
 from loop_method.adapt import Optimizer
 from loop_method.adapt.registry import optimizer_kind
-from loop_method.method_settings import Method, law_and_identification, law_of
+from loop_method.method_settings import Method, law_of, shared_methods
 from loop_method.settings import parameters_of, with_defaults
 
 
@@ -24,11 +24,11 @@ def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
 
 
 def _methods(values: Mapping[str, Any]) -> list[Method]:
-    """Optimiser, law and identification."""
+    """The optimiser, and what controller and tuner share."""
     optimizer = Method(
         OPTIMIZER_SETTINGS, kind_of(values).Settings, f"optimizer '{values['optimizer']}'"
     )
-    return [optimizer, *law_and_identification(values)]
+    return [optimizer, *shared_methods(values)]
 
 
 def setting_specs(values: Mapping[str, Any]) -> list[Spec]:
@@ -37,7 +37,7 @@ def setting_specs(values: Mapping[str, Any]) -> list[Spec]:
 
 
 def with_settings(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with all settings of their optimiser, law and identification, checked.
+    """The parameters with all settings of their methods, checked.
 
     ParameterError for a setting that the method does not have, or that is out of its range.
     """

@@ -21,6 +21,7 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.laws.base import Law
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.settings import Settings as _Settings
 
 Row = dict[str, float | int | bool | str]
@@ -140,6 +141,8 @@ class Context:
         The whole cost, where the weights and the target do not say it.
     law : Law, optional
         What theta is the parameters of, with its derivatives where it has them.
+    field_models : FieldModelSettings
+        How models of the whole field are fitted and one is chosen.
     """
 
     U: Array
@@ -158,6 +161,7 @@ class Context:
     further: Sequence[Trajectory] = ()
     cost: Cost | None = None
     law: Law | None = None
+    field_models: FieldModelSettings = DEFAULTS
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:

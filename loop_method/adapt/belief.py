@@ -92,6 +92,7 @@ def believe(
     found = fit_field_model(
         rollouts,
         context.target,
+        settings=context.field_models,
         noise=context.noise,
         action_limit=context.action_limit,
         first=first,

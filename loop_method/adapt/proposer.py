@@ -81,7 +81,9 @@ class Proposer:
         if self._periodic and context.sensors == target.size and target.size <= MOST_SENSORS:
             centres = context.actuator_centres(n_a)
             largest_cost = local_step.LOCAL * self.loop.cost_of(self._before[0])
-            self.sensed = SensedProposals(self.loop, centres, context.noise, largest_cost)
+            self.sensed = SensedProposals(
+                self.loop, centres, context.noise, largest_cost, context.field_models
+            )
 
     def propose(
         self,

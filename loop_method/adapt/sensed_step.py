@@ -16,6 +16,7 @@ from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
 from loop_method.adapt.field_step import COMPARED, EXTRAPOLATION, extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # The readings are reproduced up to this share of their sum of squares.
 _REPRODUCED = 0.05
@@ -36,6 +37,8 @@ class SensedProposals:
         Standard deviation of the noise on every reading.
     largest_cost : float
         Mean stage cost of a rollout above which it is not fitted.
+    settings : FieldModelSettings
+        Constants of the model's internal steps.
 
     Attributes
     ----------
@@ -44,10 +47,15 @@ class SensedProposals:
     """
 
     def __init__(
-        self, loop: ClosedLoopProblem, centres: Array, noise: float, largest_cost: float
+        self,
+        loop: ClosedLoopProblem,
+        centres: Array,
+        noise: float,
+        largest_cost: float,
+        settings: FieldModelSettings = DEFAULTS,
     ) -> None:
         self._loop, self._centres, self._noise = loop, centres, noise
-        self._largest_cost = largest_cost
+        self._largest_cost, self._settings = largest_cost, settings
         self.equation: Array = np.zeros(SHARED)
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
@@ -72,7 +80,9 @@ class SensedProposals:
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            model=sensed_model(shared, sensors, self._centres, EXTRAPOLATION * largest),
+            model=sensed_model(
+                shared, sensors, self._centres, EXTRAPOLATION * largest, self._settings
+            ),
             noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))

@@ -30,10 +30,18 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
-from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
+from loop_method.models import (
+    FieldModel,
+    FieldModelSettings,
+    FittedModel,
+    Measured,
+    affine_law,
+    fit_field_model,
+)
 from loop_method.models.base import Law, saturated
 from loop_method.models.denoising import smoothed
 from loop_method.models.prediction import predicted
+from loop_method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from loop_method.reduce.reduced_model import Trajectory, pieces
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
@@ -109,6 +117,7 @@ def best_model(
     action_limit: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
     noise: float = 0.0,
+    models: FieldModelSettings = MODEL_DEFAULTS,
 ) -> FittedModel | None:
     """The model of the whole field that predicts the trajectories best, or pieces of them.
 
@@ -120,7 +129,9 @@ def best_model(
     best: FittedModel | None = None
     for parts in (trajectories, pieces(trajectories, settings.field_pieces)):
         rollouts = [Measured(z, a) for z, a in parts if len(a)]
-        found = fit_field_model(rollouts, target, action_limit=action_limit, noise=noise)
+        found = fit_field_model(
+            rollouts, target, action_limit=action_limit, noise=noise, settings=models
+        )
         if found is not None and (best is None or found.error < best.error):
             best = found
         if best is not None and best.error <= settings.field_error:
@@ -139,6 +150,7 @@ def field_law(
     action_limit: float = 0.0,
     noise: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
+    models: FieldModelSettings = MODEL_DEFAULTS,
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
 
@@ -160,8 +172,10 @@ def field_law(
         Standard deviation of the noise on every number of the states; 0: none.
     settings : IdentificationSettings
         Those whose names begin with `field_`. Errors are relative to sum |z - z_r|^2.
+    models : FieldModelSettings
+        How models are fitted and one is chosen.
     """
-    fitted = best_model(trajectories, target, action_limit, settings, noise)
+    fitted = best_model(trajectories, target, action_limit, settings, noise, models)
     if fitted is None or fitted.error > settings.field_error:
         return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]

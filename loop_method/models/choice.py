@@ -21,7 +21,7 @@ from loop_method.models.base import FieldModel, Measured, Samples, saturated
 from loop_method.models.denoising import cleaned_states
 from loop_method.models.kinds import Kind, kinds_of
 from loop_method.models.prediction import errors, finite, pieces
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 FEWEST_SAMPLES = 4
 
@@ -48,7 +48,7 @@ def fit_field_model(
     rollouts: Sequence[Measured],
     target: Array,
     *,
-    settings: FieldModelSettings | None = None,
+    settings: FieldModelSettings = DEFAULTS,
     components: int = 1,
     noise: float = 0.0,
     action_limit: float = 0.0,
@@ -63,7 +63,7 @@ def fit_field_model(
         Whole or not; values that are not finite are left out.
     target : (n_z,) array
         z_r; the error is measured by the distance to it.
-    settings : FieldModelSettings, optional
+    settings : FieldModelSettings
         Constants of the fits.
     components : int
         Fields that stand one after the other in a state.
@@ -77,7 +77,6 @@ def fit_field_model(
     line : bool
         Whether the states are fields on one axis, or plain vectors.
     """
-    settings = settings or FieldModelSettings()
     rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None

@@ -27,9 +27,6 @@ from scipy.fft import irfft, rfft
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured
 
-FAR = 1e3
-"""A prediction this many times beyond the measured states is none."""
-
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
@@ -45,11 +42,16 @@ class Filtered:
 
 
 def filtered(
-    model: FieldModel, rollouts: Sequence[Measured], first: Sequence[Array], shares: Array
+    model: FieldModel,
+    rollouts: Sequence[Measured],
+    first: Sequence[Array],
+    shares: Array,
+    far: float,
 ) -> Filtered:
     """The states of rollouts, each with one state more than actions.
 
-    first: their initial states; shares: g, of each wavenumber.
+    first: their initial states; shares: g, of each wavenumber; far: a prediction
+    this many times beyond the measured states is none.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]
@@ -57,7 +59,7 @@ def filtered(
         own[0] = state
     lengths = np.array([len(rollout.actions) for rollout in rollouts])
     total, count, lost = np.zeros(len(shares)), 0, 0
-    most = FAR * max(float(np.abs(rollout.states).max()) for rollout in rollouts)
+    most = far * max(float(np.abs(rollout.states).max()) for rollout in rollouts)
     for k in range(int(lengths.max())):
         rows = np.flatnonzero(lengths > k).tolist()
         actions = np.stack([rollouts[i].actions[k] for i in rows])

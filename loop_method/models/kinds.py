@@ -34,8 +34,6 @@ LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
 LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
-FEWEST_POINTS = 8
-"""Fewest grid points of a spectral model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +68,19 @@ def kinds_of(
     kinds: list[Kind] = []
     if not line or n_z > settings.dense:
         kinds = [
-            Kind(name, partial(fit_low_rank, kind=name, most=most, ridge=1e-12), (float(most), 0))
+            Kind(
+                name,
+                partial(fit_low_rank, kind=name, most=most, settings=settings),
+                (float(most), 0),
+            )
             for name, most in LOW_RANKS.items()
         ]
     if not line:
         return kinds + _linear(n_z, settings)
-    if components == 1 and n_z >= FEWEST_POINTS:
-        kinds += [_spectral(form, settings) for form in FORMS]
+    if components == 1 and n_z >= settings.fewest_points:
+        kinds += [
+            _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
+        ]
     kinds += _several_fields(n_z, components, settings)
     if components == 1:  # two fields, of which nobody has told
         two = _several_fields(n_z, 2, settings, "two-")
@@ -115,9 +119,13 @@ def _several_fields(
     kinds: list[Kind] = []
     if components > 1 and n_z <= settings.dense:
         name = f"{prefix}convolution"
-        convolution = partial(fit_convolution, kind=name, ridge=1e-9, components=components)
+        convolution = partial(
+            fit_convolution, kind=name, ridge=settings.convolution_ridge, components=components
+        )
         kinds.append(Kind(name, convolution, (float(components), 0)))
     for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
+        if degree > settings.largest_degree:
+            continue
         count = components * len(features_of(components, degree))
         for name, ridge in ridges.items():
             fit = partial(

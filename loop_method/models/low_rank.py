@@ -10,13 +10,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 from loop_method.models.linear import add_products
-
-SNAPSHOTS = 400
-"""Most states that are decomposed; the work grows with their square and the size of a state."""
-ENERGY = 1e-12
-"""Share of the sum of squares below which a mode is left out."""
-SAMPLES_A_MODE = 4
-"""Steps of the data for each unknown of a row, at least."""
+from loop_method.models.settings import FieldModelSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +73,18 @@ def _products(rows: Array, matrix: Array) -> Array:
     return totals
 
 
-def fit_low_rank(samples: Samples, *, kind: str, most: int, ridge: float) -> LowRankModel | None:
-    """Least squares in at most `most` POD modes of the data, as many as the data determine.
-
-    ridge: of normalised columns.
-    """
+def fit_low_rank(
+    samples: Samples, *, kind: str, most: int, settings: FieldModelSettings
+) -> LowRankModel | None:
+    """Least squares in at most `most` POD modes of the data, as many as the data determine."""
     n_a = samples.actions.shape[1]
-    few = samples.thinned(SNAPSHOTS).before
-    largest = min(most, len(few), len(samples) // SAMPLES_A_MODE - n_a - 1)
+    few = samples.thinned(settings.snapshots).before
+    largest = min(most, len(few), len(samples) // settings.samples_per_mode - n_a - 1)
     if largest < 1:
         return None
     energies, mixtures = np.linalg.eigh(few @ few.T)
     energies, mixtures = energies[::-1], mixtures[:, ::-1]
-    kept = int(np.count_nonzero(energies > ENERGY * max(energies[0], 0.0)))
+    kept = int(np.count_nonzero(energies > settings.energy * max(energies[0], 0.0)))
     if not kept:
         return None
     V = np.linalg.qr(few.T @ mixtures[:, : min(kept, largest)])[0]
@@ -100,7 +93,7 @@ def fit_low_rank(samples: Samples, *, kind: str, most: int, ridge: float) -> Low
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
     columns = columns / scale
-    gram = columns.T @ columns / len(x) + ridge * np.eye(len(scale))
+    gram = columns.T @ columns / len(x) + settings.low_rank_ridge * np.eye(len(scale))
     found = np.linalg.solve(gram, columns.T @ after / len(x)) / scale[:, None]
     if not np.isfinite(found).all():
         return None

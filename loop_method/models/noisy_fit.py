@@ -56,8 +56,6 @@ PASSES = ((1, 8), (2, 8), (4, 4), (8, 4), (8, 4), (16, 4), (16, 4))
 """Of each pass, the sampling times of a window, and n: the lowest 1/n wavenumbers are compared."""
 STRICTNESS = (1.0, 3.0, 9.0, 27.0)
 """Times the significance of a pass, the next where its equation grows beyond all bounds."""
-FEWEST_MODES = 4
-"""Wavenumbers that are compared even if noise has most of their power."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +63,14 @@ class WindowRegression(Regression):
     """The regression of a pass over windows; y and W of the wavenumbers that are compared alone.
 
     common (modes, N, n_a + 1) and free_of_common, its orthonormal columns, are of each wavenumber;
-    lost: numbers of each wavenumber that the initial states of the windows take.
+    lost: numbers of each wavenumber that the initial states of the windows take; strictness: multiple
+    of the significance that a coefficient must have.
     """
 
     common: Spectrum
     free_of_common: Spectrum
     lost: int = 0
+    strictness: float = 1.0
 
     def rest(self, values: Spectrum) -> Spectrum:
         q = self.free_of_common[: values.shape[1]]
@@ -82,7 +82,9 @@ class WindowRegression(Regression):
         self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
     ) -> Array:
         count = len(self.y) - self.lost - self.common.shape[2]  # complex numbers a wavenumber
-        return significant(columns, values, max(count / len(self.y), 0.1), settings)
+        return significant(
+            columns, values, max(count / len(self.y), 0.1), settings, self.strictness
+        )
 
     def inputs(self, left: Spectrum) -> Spectrum:
         """F of B and c, (n_a + 1, modes), from what the other terms leave (N, modes).
@@ -103,11 +105,15 @@ class WindowRegression(Regression):
 
 
 def significant(
-    columns: Spectrum, values: Spectrum, free: float, settings: FieldModelSettings
+    columns: Spectrum,
+    values: Spectrum,
+    free: float,
+    settings: FieldModelSettings,
+    strictness: float = 1.0,
 ) -> Array:
     """Real coefficients of complex columns, 0 where they are within a few standard errors of it.
 
-    free: share of the values that nothing else was fitted to.
+    free: share of the values that nothing else was fitted to; strictness: multiple of the significance.
     """
     scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -120,7 +126,7 @@ def significant(
         own = inverse @ moment[kept]
         rest = max(total - float(own @ moment[kept]), 0.0)
         error = np.sqrt(rest / (2.0 * free * len(values)) * np.diag(inverse))
-        size = np.abs(own) - settings.significance * error
+        size = np.abs(own) - strictness * settings.significance * error
         if size.min() >= 0.0:
             break
         kept.pop(int(np.argmin(np.abs(own) / np.where(error > 0.0, error, 1.0))))
@@ -158,8 +164,9 @@ def fit_noisy(
         settings.clip * largest if form.degree > POWERS else np.inf,
     )
     best, least = None, np.inf
-    known = filtered(model, rollouts, first, shares)
-    for steps, share in PASSES:
+    known = filtered(model, rollouts, first, shares, settings.far)
+    for window, share in PASSES:
+        steps = min(window, settings.largest_window)
         growth = max(float(model.linear.real[:cut].max()), 0.0)
         if growth * steps > settings.growth:
             steps = max(int(settings.growth / growth), 1)
@@ -168,12 +175,12 @@ def fit_noisy(
             break
         compared = replace(form, shares=(max(share, form.shares[-1]),))
         for strictness in STRICTNESS:
-            strict = replace(settings, significance=strictness * settings.significance)
-            found = _pass(data, model, compared, strict)
+            strict = replace(data, strictness=strictness)
+            found = _pass(strict, model, compared, settings)
             if found is None:
                 continue
             found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
-            known = filtered(found, rollouts, first, shares)
+            known = filtered(found, rollouts, first, shares, settings.far)
             if not known.lost:
                 break
         if found is None:
@@ -205,7 +212,7 @@ def _wavenumbers(
     spectra = [rfft(rollout.states) for rollout in rollouts]
     signal, noise_power = signal_power(np.concatenate(spectra), noise, n_z)
     weak = signal + noise_power < settings.noisy_power * noise_power
-    cut = max(int(np.argmax(weak)) if weak.any() else len(weak), FEWEST_MODES)
+    cut = max(int(np.argmax(weak)) if weak.any() else len(weak), settings.fewest_modes)
     steps = np.concatenate([np.diff(own, axis=0) for own in spectra])
     change = np.maximum(np.mean(np.abs(steps) ** 2, axis=0) - 2.0 * noise_power, 0.0)
     shares = change / (change + noise_power)

@@ -34,7 +34,7 @@ import scipy  # whose signal processing, half a second of a core, loads when it 
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import substeps_of
 
@@ -93,7 +93,13 @@ def interpolated(readings: Array) -> Array:
     return np.roll(field, n // (2 * sensors))
 
 
-def sensed_model(shared: Array, sensors: int, centres: Array, largest: float) -> SpectralModel:
+def sensed_model(
+    shared: Array,
+    sensors: int,
+    centres: Array,
+    largest: float,
+    settings: FieldModelSettings = DEFAULTS,
+) -> SpectralModel:
     """The equation on the grid for this many sensors.
 
     Parameters
@@ -106,6 +112,8 @@ def sensed_model(shared: Array, sensors: int, centres: Array, largest: float) ->
         x_i, as it was declared.
     largest : float
         Largest |z| that is simulated; the internal steps follow it.
+    settings : FieldModelSettings
+        How they do.
     """
     n = grid_points(sensors)
     equation = _Equation(shared, n, centres)
@@ -117,7 +125,7 @@ def sensed_model(shared: Array, sensors: int, centres: Array, largest: float) ->
         np.eye(2),
         np.fft.irfft(equation.actuators, n).T,
         np.full(n, equation.constant / n),
-        substeps=substeps_of(symbols, largest, FieldModelSettings()),
+        substeps=substeps_of(symbols, largest, settings),
     )
 
 

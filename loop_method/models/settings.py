@@ -1,99 +1,105 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The constants of the field models, with their meaning and range."""
+"""The constants of the models of the whole field: how they are fitted, and how a kind is chosen."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from loop_method.settings import Settings, setting
+
 
 @dataclass(frozen=True, kw_only=True)
-class FieldModelSettings:
+class FieldModelSettings(Settings):
     """Constants of fitting and choosing models of the whole field.
 
-    None has a unit: fields, inputs and time are scaled by what the data hold.
-
-    Attributes
-    ----------
-    passes : int
-        Times that an equation is fitted along the paths of the last one, 1 to 20.
-    settled : float
-        Passes end where the error of a step of the plant changes by no more than this share, 0 to
-        0.1.
-    samples : int
-        Steps of the plant that it is fitted to, at most, at least 50.
-    substeps : int
-        Internal steps of a sampling time, at most, 1 to 1000.
-    first_substeps : int
-        Those of the first pass, which has no equation yet, 1 to `substeps`.
-    reach : float
-        Fastest nonlinear rate times the internal step, 0.1 to 2.8: where ETDRK4 is stable.
-    coefficient_ridge : float
-        Of the normal equations in normalised columns, 0 to 1e-3.
-    symbol_ridge : float
-        Of a symbol that is free at every wavenumber, per mean square of its column, 0 to 1e-3.
-    clip : float
-        Largest |z| in powers above the third, per max |z| measured, 1 to 10: a polynomial of high
-        degree says nothing beyond the data.
-    point_passes, point_samples : int
-        As `passes` and `samples`, of coefficients that depend on the place.
-    point_substeps : int
-        As `substeps`, of the finite-difference models.
-    point_reach : float
-        As `reach`, of the Runge-Kutta rule of order 4.
-    reproduced : float
-        E up to which the first kind that reaches it is taken, 0 to 1; E is the squared error of a
-        simulated rollout over the sum of |z - z_r|^2.
-    better : float
-        How many times smaller the E of a richer kind must be, 1 to 100.
-    folds : int
-        Turns in which rollouts are fitted and judged, at most, at least 2.
-    hopeless : float
-        How many times worse than the best one, or than `reproduced`, a kind gets no other turn, at
-        least 1.
-    worst : float
-        The E that counts for a model that diverges, at least 1.
-    dense : int
-        Largest state of models whose work grows with its square, at least 2.
-    reproduced_noisy : float
-        As `reproduced`, where there is measurement noise, which leaves initial states uncertain.
-    noisy_steps : int
-        As `samples`, of data with measurement noise, at least 50.
-    noisy_power : float
-        Times the power of the noise that a wavenumber must have on the average to be compared, at
-        least 1.
-    significance : float
-        Standard errors that a coefficient must have to be kept where there is noise, 0 to 10.
-    least_correction : float
-        Least share of an innovation that corrects the states, 0 to 1.
-    growth : float
-        Largest growth of the linear part within a window, in powers of e, 0.1 to 10.
-    relative_error : float
-        Error of a window, besides the noise, as a share of the change within it, 0 to 1.
+    None has a unit: fields, inputs and time are scaled by what the data hold. E is the squared error of
+    a simulated rollout over the sum of |z - z_r|^2.
     """
 
-    passes: int = 12
-    settled: float = 1e-3
-    samples: int = 500
-    substeps: int = 64
-    first_substeps: int = 6
-    reach: float = 1.5
-    coefficient_ridge: float = 1e-9
-    symbol_ridge: float = 1e-7
-    clip: float = 1.2
-    point_passes: int = 4
-    point_samples: int = 800
-    point_substeps: int = 32
-    point_reach: float = 2.5
-    reproduced: float = 2e-3
-    better: float = 3.0
-    folds: int = 3
-    hopeless: float = 20.0
-    worst: float = 2.0
-    dense: int = 512
-    reproduced_noisy: float = 0.05
-    noisy_steps: int = 2000
-    noisy_power: float = 3.0
-    significance: float = 3.0
-    least_correction: float = 0.02
-    growth: float = 1.5
-    relative_error: float = 0.02
+    # The choice of a kind.
+    reproduced: float = setting(2e-3, "E up to which the first kind that reaches it is taken", 0, 1)
+    reproduced_noisy: float = setting(
+        0.05, "the same with measurement noise, which leaves initial states uncertain", 0, 1
+    )
+    better: float = setting(
+        3.0, "how many times smaller the E of a kind with more unknowns must be", 1, 100
+    )
+    folds: int = setting(3, "most turns in which rollouts are fitted and judged", 2, 100)
+    hopeless: float = setting(
+        20.0,
+        "multiple of the best E, or of `reproduced`, above which a kind gets no more turns",
+        1,
+        1e6,
+    )
+    worst: float = setting(2.0, "E that counts for a model that diverges", 1, 1e6)
+    dense: int = setting(
+        512, "largest state of the kinds whose work grows with its square", 2, 65536
+    )
+    largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
+    fewest_points: int = setting(8, "fewest grid points of a spectral model", 4, 65536)
+    # Spectral models.
+    passes: int = setting(
+        12, "times that an equation is fitted along the paths of the one before", 1, 20
+    )
+    settled: float = setting(
+        1e-3, "relative change of the one-step error at which the passes end", 0, 0.1
+    )
+    samples: int = setting(500, "most steps of the data in a fit", 50, 1_000_000)
+    substeps: int = setting(64, "most internal steps per sampling time", 1, 1000)
+    first_substeps: int = setting(6, "internal steps of the first pass", 1, 1000)
+    reach: float = setting(
+        1.5, "fastest nonlinear rate times the internal step; ETDRK4 is stable up to 2.8", 0.1, 2.8
+    )
+    coefficient_ridge: float = setting(
+        1e-9, "ridge of the normal equations in normalised columns", 0, 1e-3
+    )
+    symbol_ridge: float = setting(
+        1e-7, "ridge of a free symbol, relative to the mean square of its column", 0, 1e-3
+    )
+    clip: float = setting(
+        1.2, "bound on z in powers above the third, relative to the largest measured value", 1, 10
+    )
+    # Finite-difference, convolution and low-rank models.
+    point_passes: int = setting(4, "as `passes`, for finite-difference models", 1, 20)
+    point_samples: int = setting(800, "as `samples`, for finite-difference models", 50, 1_000_000)
+    point_substeps: int = setting(32, "as `substeps`, for finite-difference models", 2, 1000)
+    point_reach: float = setting(
+        2.5, "as `reach`, for finite-difference models, whose rule is of order 4", 0.1, 2.8
+    )
+    convolution_ridge: float = setting(1e-9, "ridge of convolution models", 0, 1e-3)
+    low_rank_ridge: float = setting(1e-12, "ridge of low-rank models", 0, 1e-3)
+    snapshots: int = setting(400, "most states that POD modes are computed from", 2, 10_000)
+    energy: float = setting(1e-12, "share of the energy below which a POD mode is left out", 0, 1)
+    samples_per_mode: int = setting(
+        4, "steps of the data per unknown of a row of a low-rank model", 1, 1000
+    )
+    # Fits to noisy data.
+    noisy_steps: int = setting(
+        2000, "most steps of the data in a fit with measurement noise", 50, 1_000_000
+    )
+    noisy_power: float = setting(
+        3.0, "mean power of a wavenumber, relative to the noise, from which it is compared", 1, 1e6
+    )
+    fewest_modes: int = setting(4, "wavenumbers that are compared whatever their power", 1, 65536)
+    largest_window: int = setting(16, "most sampling times of a window", 1, 16)
+    growth: float = setting(
+        1.5, "largest growth of the linear part within a window, as an exponent of e", 0.1, 10
+    )
+    relative_error: float = setting(
+        0.02, "model error of a window as a share of the change within it", 0, 1
+    )
+    significance: float = setting(
+        3.0, "standard errors that a coefficient must have to be kept", 0, 100
+    )
+    least_correction: float = setting(
+        0.02, "least share of an innovation that corrects a filtered state", 0, 1
+    )
+    far: float = setting(
+        1e3,
+        "multiple of the largest measured value beyond which a prediction is discarded",
+        1,
+        1e12,
+    )
+
+
+DEFAULTS = FieldModelSettings()

@@ -353,6 +353,14 @@ def test_a_model_that_is_identified_with_other_constants_has_another_signature(n
     assert design_digest(values | {name: 0.25, "run": 7}) in digests
 
 
+def test_constants_of_field_models_count_where_a_law_is_designed_from_one():
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    for identification, count in (("field", 2), ("regression", 1)):
+        own = known | {"identification": identification}
+        constants = ({"field_model_settings.folds": folds} for folds in (2, 3))
+        assert len({design_digest(own | {"constants": given}) for given in constants}) == count
+
+
 def test_a_model_for_another_law_has_another_signature_and_the_affine_one_that_without_a_name():
     known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
     nameless = {name: value for name, value in known.items() if name not in ("law", "horizon")}

@@ -106,7 +106,11 @@ def test_the_error_of_the_true_model_is_nothing_but_noise() -> None:
 def test_filtered_states_are_better_than_measured_ones() -> None:
     known = with_clean(ROLLOUTS, NOISE)
     found = filtered(
-        reaction_diffusion(), known, [r.known[0] for r in known], np.full(POINTS // 2 + 1, 0.1)
+        reaction_diffusion(),
+        known,
+        [r.known[0] for r in known],
+        np.full(POINTS // 2 + 1, 0.1),
+        SETTINGS.far,
     )
     error = np.mean([np.mean((z - t)[20:] ** 2) for z, t in zip(found.states, TRUE, strict=True)])
     # Without an error of the model, a gain g leaves at most g / (2 - g) of the noise.
@@ -117,7 +121,7 @@ def test_filtered_states_are_better_than_measured_ones() -> None:
 def test_a_gain_of_one_is_what_was_measured() -> None:
     known = with_clean(ROLLOUTS[:1], NOISE)
     ones = np.ones(POINTS // 2 + 1)
-    found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones)
+    found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones, SETTINGS.far)
     np.testing.assert_allclose(found.states[0], known[0].states, atol=1e-12)
 
 

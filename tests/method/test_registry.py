@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 from loop_interfaces.spec import ParameterError
-from loop_method.adapt import GaussNewton, ModelBased, Optimizer, TwoPoint
+from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
 from loop_method.adapt.gauss_newton import GaussNewtonSettings
-from loop_method.adapt.registry import OWN_OPTIMIZERS, offered, optimizer_kind
+from loop_method.adapt.registry import offered, optimizer_kind
 from loop_method.settings import Settings, setting
-from tests.support.interpreter import ROOT
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import settings_of, training_parameters
@@ -162,24 +161,3 @@ def test_settings_know_their_ranges() -> None:
             Own(**wrong)
     assert [spec.name for spec in Own.specs()] == ["step", "norm"]
     assert Optimizer.Settings.specs() == ()
-
-
-def test_the_documents_table_of_settings_is_that_of_the_classes() -> None:
-    text = (ROOT / "docs" / "optimizers.md").read_text()
-    section = text.partition("## Settings\n")[2].partition("\n## ")[0]
-    rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in section.splitlines()]
-    documented = [tuple(row) for row in rows if len(row) == 5][2:]
-    ours = [GaussNewton, ModelBased, TwoPoint]
-    assert {kind.name for kind in ours} == set(OWN_OPTIMIZERS.shipped)
-    assert documented == [
-        (
-            kind.name,
-            spec.name,
-            str(spec.default),
-            spec.range.partition("from ")[2],
-            spec.description,
-        )
-        for kind in ours
-        for spec in kind.Settings.specs()
-        if kind.settings_of.__func__ is Optimizer.settings_of.__func__  # type: ignore[attr-defined]
-    ]

@@ -23,12 +23,13 @@ def test_it_trains_over_topics_to_the_bits_of_one_process_and_is_recorded(
     loop: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    limited = {"law_settings": {"limit": 0.05}}
-    setting = ["--set", "law_settings.limit=0.05"]
-    words = [str(SMALL), "--law", OWN, *setting, *FLAGS, "--record", "--out", str(out)]
+    limited = {"law_settings": {"limit": 0.05}, "field_model_settings": {"folds": 2}}
+    settings = ["--set", "law_settings.limit=0.05", "--set", "field_model_settings.folds=2"]
+    field = ["--identification", "field"]
+    words = [str(SMALL), "--law", OWN, *field, *settings, *FLAGS, "--record", "--out", str(out)]
     loop.wait(loop.pdeloop("train", *words), LIMIT)
     monkeypatch.setenv(OWN_LAWS.variable, "")
-    here = pdeloop.train(str(SMALL), law=OWN, **limited, **BUDGET)
+    here = pdeloop.train(str(SMALL), law=OWN, identification="field", **limited, **BUDGET)
     assert same_bits(policies(out), here.policies)
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out), "--law", OWN), LIMIT)
     assert "no difference, to the bit" in verified
