@@ -14,12 +14,13 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import FILTERED, ModelRows, pack
+from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import model_order
 from loop_interfaces.signature import CONSTANTS
 from loop_interfaces.spec import IDENTIFICATION_SETTINGS
 from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
+from loop_method.laws.registry import law_kind
 from loop_method.method_settings import field_model_settings
 from loop_method.models import FieldModelSettings
 from loop_method.reduce import dmdc, regression
@@ -226,12 +227,12 @@ def designed(
         "action_weight": settings.action_weight,
         "cost": Cost.parse(settings.cost),
     }
-    filtered = settings.law in FILTERED
+    filtered = law_kind(settings.law, settings.constants).filtered
     if settings.identification == "subspace":
         if not filtered:
             raise ValueError(
                 "the identification 'subspace' gives a filter, which the law "
-                f"'{settings.law}' does not have; take the law 'observer'"
+                f"'{settings.law}' does not use; take the law 'observer'"
             )
         every = [*trajectories, *further]
         found_model = subspace_model(

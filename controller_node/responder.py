@@ -180,7 +180,8 @@ class Responder:
         if digest not in [known.digest for known in before]:
             n_a = self._settings.n_a
             rows = [
-                model_rows.unpack(rows.copy(), n_a, self._settings.law) for rows in frame.values
+                model_rows.unpack(rows.copy(), n_a, self._law_kind.filtered)
+                for rows in frame.values
             ]
             laws = laws_of(self._law_kind, rows, self._settings.horizon, self._settings.cost)
             run.models.append(Models(frame.step, digest, laws))

@@ -10,7 +10,7 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
     n_a               K_a      feedback gain
     n_a               K_b      gain of the target
     1                 s_r      U^T z_r, the target in reduced coordinates
-    n_s or none       L        filter gain, where the law is one of FILTERED
+    n_s or none       L        filter gain, where the law uses one
 
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
 """
@@ -20,9 +20,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from loop_interfaces.arrays import Array
-
-FILTERED = ("observer",)
-"""Laws whose models come with a filter gain."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +63,13 @@ def pack(model: ModelRows) -> Array:
     return np.vstack(parts if model.L is None else [*parts, model.L])
 
 
-def unpack(rows: Array, n_a: int, law: str = "affine") -> ModelRows:
-    """The model in `rows`, of the law of that name. ValueError where there is no room for U.
+def has_filter(rows: Array, n_a: int, n_z: int) -> bool:
+    """True if `rows` are those of a model with a filter gain, of a plant that measures n_z numbers."""
+    return bool(len(rows) == n_z + 2 * rows.shape[1] + 3 * n_a + 1)
+
+
+def unpack(rows: Array, n_a: int, filtered: bool = False) -> ModelRows:
+    """The model in `rows`, with a filter gain or not. ValueError where there is no room for U.
 
     >>> gains = np.ones((1, 2))
     >>> model = ModelRows(np.eye(2), np.ones((2, 1)), np.eye(4)[:, :2], gains, gains, np.ones(2))
@@ -75,7 +77,6 @@ def unpack(rows: Array, n_a: int, law: str = "affine") -> ModelRows:
     ((10, 2), (4, 2))
     """
     n_s = rows.shape[1]
-    filtered = law in FILTERED
     n_z = rows.shape[0] - (2 if filtered else 1) * n_s - 3 * n_a - 1
     # A filter may estimate more numbers than are measured.
     least = 1 if filtered else max(n_s, 1)

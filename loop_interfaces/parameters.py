@@ -331,6 +331,11 @@ def flags(group: str | None = None) -> tuple[Spec, ...]:
     return tuple(spec for spec in table() if spec.group and group in (None, spec.group))
 
 
+def measured_size(values: Mapping[str, Any]) -> int:
+    """Numbers of a message `state`: those of the state, or of the last readings of sensors."""
+    return int(values["sensors"] * values["sensor_delays"] or values["n_z"])
+
+
 def noisy(values: Mapping[str, Any]) -> bool:
     """Whether the plant of these parameters has noise, so that a rollout has a seed of it."""
     return bool(values["measurement_noise"] or values["process_noise"])

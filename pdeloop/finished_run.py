@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import scipy  # whose statistics, half a second of a core, load when they are used
 
-from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
@@ -22,7 +21,7 @@ from loop_method.laws.registry import law_kind
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
 from tuner_node.rollouts import EVALUATED
-from tuner_node.run_folder import RunFolder
+from tuner_node.run_folder import RunFolder, model_of
 
 RESAMPLES = 9999
 CONFIDENCE = 0.95
@@ -150,7 +149,7 @@ def load_run(folder: str | Path) -> FinishedRun:
         result,
         policies=arrays["policy"],
         warm=arrays["lqt"],
-        models=[model_rows.unpack(rows, values["n_a"], values["law"]) for rows in arrays["model"]],
+        models=[model_of(rows, values) for rows in arrays["model"]],
         costs={name: np.array(result["costs_by_field"][name]) for name in EVALUATED},
         rollouts=result.get("rollouts", []),
     )

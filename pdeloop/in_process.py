@@ -51,7 +51,7 @@ class LocalPair:
     def use_models(self, models: Array) -> None:
         """Take the reduced models (S, rows, n_s) that policies refer to."""
         unpacked = [
-            model_rows.unpack(rows, self._settings.n_a, self._settings.law) for rows in models
+            model_rows.unpack(rows, self._settings.n_a, self._kind.filtered) for rows in models
         ]
         laws = laws_of(self._kind, unpacked, self._settings.horizon, self._settings.cost)
         self._law = LawBatch(laws, self.plant.target, self._settings.action_limit)

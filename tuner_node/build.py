@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
-from loop_interfaces.model_rows import FILTERED, unpack
-from loop_interfaces.parameters import model_order, noisy
+from loop_interfaces.model_rows import unpack
+from loop_interfaces.parameters import measured_size, model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
 from loop_method.adapt import Context, Optimizer
@@ -30,7 +30,7 @@ from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training
 
 
-def read_model(path: Path, n_a: int, law: str = "affine") -> NDArray[np.float64]:
+def read_model(path: Path, n_a: int, law: type[Law] = Affine) -> NDArray[np.float64]:
     """The rows of the model that `pdeloop identify --out` wrote, or a ValueError."""
     try:
         arrays = read_arrays(path)
@@ -52,15 +52,16 @@ def read_model(path: Path, n_a: int, law: str = "affine") -> NDArray[np.float64]
             f"the model in {path} has {actuators} actuators, the plant has {n_a}; identify one of this "
             "plant"
         )
-    if filtered != (law in FILTERED):
-        other = "observer" if filtered else "affine"
+    if filtered != law.filtered:
+        gain = "has a filter gain" if filtered else "has no filter gain"
+        uses = "uses one" if law.filtered else "does not use one"
         raise ValueError(
-            f"the model in {path} was designed for the law '{other}', and the law is '{law}'; give "
-            f"--law to both, 'pdeloop identify' and the training"
+            f"the model in {path} {gain}, and the law '{law.name}' {uses}; give the same --law to "
+            "'pdeloop identify' and to the training"
         )
     model: NDArray[np.float64] = rows[0]
     try:
-        basis = unpack(model, n_a, law).U
+        basis = unpack(model, n_a, law.filtered).U
     except ValueError as error:
         raise ValueError(f"{path} holds the model of another plant: {error}") from error
     if not basis.any(axis=0).all():
@@ -70,7 +71,7 @@ def read_model(path: Path, n_a: int, law: str = "affine") -> NDArray[np.float64]
 
 def given_model(values: Mapping[str, Any], law: type[Law]) -> NDArray[np.float64] | None:
     """The rows of the model that the parameters name; None if they name none."""
-    return read_model(Path(values["model"]), values["n_a"], law.name) if values["model"] else None
+    return read_model(Path(values["model"]), values["n_a"], law) if values["model"] else None
 
 
 def check_budget(
@@ -114,10 +115,10 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
             f"the optimizer '{values['optimizer']}' adapts no law but {adapted}, and the law is "
             f"'{values['law']}'; take an optimizer that adapts any law, such as two_point"
         )
-    if values["identification"] == "subspace" and law.name not in FILTERED:
+    if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
-            f"the identification 'subspace' is for the law {' or '.join(FILTERED)}, and the law is "
-            f"'{law.name}'; give --law {FILTERED[0]}, or another identification"
+            "the identification 'subspace' gives a filter, which the law "
+            f"'{law.name}' does not use; give --law observer, or another identification"
         )
     return law
 
@@ -173,8 +174,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         n_z=values["n_z"],
     )
     # The published readings are scaled (docs/robustness.md).
-    readings = values["sensors"] * values["sensor_delays"] or values["n_z"]
-    scale = math.sqrt(values["n_z"] / readings)
+    scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
     given |= {
         "law": law,
@@ -209,6 +209,6 @@ def build_dispatcher(
         incarnation=identity.incarnation,
         plant=training.plant,
         design=design_digest(values),
-        state_size=values["sensors"] * values["sensor_delays"] or values["n_z"],
+        state_size=measured_size(values),
         horizon=values["horizon"],
     )

@@ -48,6 +48,7 @@ from loop_interfaces.parameters import (
     RECORDER,
     VIEWER,
     as_recorded,
+    measured_size,
     recorded_values,
     table,
 )
@@ -304,7 +305,7 @@ class RunFolder:
             if values["law"] != "affine":  # whose parameters only the law itself can read
                 law = (seeds, *[None] * (arrays["policy"].ndim - 1)) if "policy" in arrays else law
             for rows in model:
-                model_rows.unpack(rows, n_a, values["law"])
+                model_of(rows, values)
             return {
                 "policy": checked_array(arrays, "policy", "f", law),
                 "lqt": checked_array(arrays, "lqt", "f", law),
@@ -345,3 +346,10 @@ class RunFolder:
 def timestamp() -> str:
     """Local time for folder names."""
     return time.strftime("%Y%m%d-%H%M%S") + f"-{os.getpid()}"
+
+
+def model_of(rows: NDArray[np.float64], values: Mapping[str, Any]) -> model_rows.ModelRows:
+    """The model in rows of a run's policy.npz. ValueError where there is no room for it."""
+    n_a = values["n_a"]
+    filtered = model_rows.has_filter(rows, n_a, measured_size(values))
+    return model_rows.unpack(rows, n_a, filtered)

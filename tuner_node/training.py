@@ -176,7 +176,7 @@ class Training:
         return self._laws
 
     def _unpacked(self, rows: Array) -> model_rows.ModelRows:
-        return model_rows.unpack(rows, self.settings.n_a, self.settings.law.name)
+        return model_rows.unpack(rows, self.settings.n_a, self.settings.law.filtered)
 
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""

@@ -84,7 +84,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
     n_z = None
     if "models" in arrays:
         training.models = checked_array(arrays, "models", "f", (seeds, None, None))
-        n_z = len(model_rows.unpack(training.models[0], n_a, training.settings.law.name).U)
+        n_z = len(model_rows.unpack(training.models[0], n_a, training.settings.law.filtered).U)
     if "target" in arrays:
         training.target = checked_array(arrays, "target", "f", (n_z,))
     if "evaluation" in arrays:

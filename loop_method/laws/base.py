@@ -55,7 +55,8 @@ class Law(ABC):
     Parameters
     ----------
     model : ModelRows
-        What is known of the plant: A, B, U, the LQ-tracking gains K_a and K_b, and s_r = U^T z_r.
+        What is known of the plant: A, B, U, the LQ-tracking gains K_a and K_b, s_r = U^T z_r, and the
+        filter gain L if the class is `filtered`.
     horizon : int
         Steps T of an episode, as the parameters have it. An action is also asked for at k = T.
 
@@ -81,6 +82,8 @@ class Law(ABC):
     """Its constants; none if it does not say otherwise."""
     settings: ClassVar[_Settings] = _Settings()
     """The constants of this training: parameters `law_settings.NAME`."""
+    filtered: ClassVar[bool] = False
+    """True if it uses the filter gain L, which its model then comes with (`model.L`)."""
     from_readings: ClassVar[str] = ""
     """Its preferred `identification` of a plant with few sensors; that of the optimiser if empty."""
     memory_size: int = 0

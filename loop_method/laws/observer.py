@@ -27,6 +27,7 @@ class Observer(Law):
     """
 
     name = "observer"
+    filtered = True
     from_readings = "subspace"
 
     @property

@@ -7,10 +7,16 @@ import argparse
 import sys
 from math import isfinite
 
-from loop_interfaces.model_rows import FILTERED
 from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, a_path, add_json, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_json,
+    add_own_code,
+    allow_own_code,
+    command,
+)
 from pdeloop.output import print_json
 
 OF_DATA = ("time", "states", "inputs", "sample_time")
@@ -71,12 +77,7 @@ def add(commands: Commands) -> None:
         "with the inputs whole; subspace: a model with its filter, from measurements alone; dmdc: "
         "truncated DMDc [that of the run, or regression]",
     )
-    add(
-        "--law",
-        choices=("affine", *FILTERED),
-        help="the law that the model is for: that of the observer gets a filter gain [that of the run, "
-        "or affine]",
-    )
+    add_own_code(identify, ("law",))
     add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
     add("--episode", metavar="N", help="only this episode, as `pdeloop bag info` names it")
     add("--environment", type=int, metavar="M", help="only this environment of each episode")
@@ -102,11 +103,11 @@ def _identify(options: argparse.Namespace) -> int:
         "dmdc_order": options.order,
         "identification": options.identification,
         "dmdc_rank": options.rank,
-        "law": options.law,
         "state_weight": options.state_weight,
         "action_weight": options.action_weight,
     }
     given = {name: value for name, value in given.items() if value is not None}
+    given |= allow_own_code(options)
     if options.data is not None:
         if options.episode is not None or options.environment is not None:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")

@@ -230,7 +230,7 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
     assert batch is not None
     again = LocalPair(run.values, plant).run(replace(batch, trajectories=True))
     assert again.models is not None and again.trajectories is not None
-    found = unpack(again.models[0], run.values["n_a"], run.values["law"])
+    found = unpack(again.models[0], run.values["n_a"], training.settings.law.filtered)
     if found.U.shape != run.models[shown].U.shape or not np.allclose(found.U, run.models[shown].U):
         return None
     (explored,) = again.trajectories

@@ -34,7 +34,7 @@ def models() -> np.ndarray:
 
 
 def policies() -> np.ndarray:
-    law = Observer(unpack(models()[0], 4, "observer"), 30)
+    law = Observer(unpack(models()[0], 4, True), 30)
     rng = np.random.default_rng(2)
     return np.stack([law.theta_start + 0.1 * rng.standard_normal(law.size) for _ in ROWS])
 

@@ -113,11 +113,11 @@ def test_rows_carry_the_filter_gain_of_those_laws_that_have_one() -> None:
     L = RNG.standard_normal((N, N))
     rows = pack(model(L=L))
     assert rows.shape == (N + 2 * N + 3 * N_A + 1, N)
-    again = unpack(rows, N_A, "observer")
+    again = unpack(rows, N_A, True)
     assert again.L is not None and np.array_equal(again.L, L)
     assert np.array_equal(again.U, np.eye(N))
     # More estimated than measured numbers.
-    few = unpack(pack(ModelRows(A, B, np.ones((1, N)), B.T, B.T, np.zeros(N), L)), N_A, "observer")
+    few = unpack(pack(ModelRows(A, B, np.ones((1, N)), B.T, B.T, np.zeros(N), L)), N_A, True)
     assert few.U.shape == (1, N)
     with pytest.raises(ValueError, match="leaves 1 rows for U; expected at least 4"):
         unpack(rows[: N * 2 + 3 * N_A + 1 - N + 1], N_A)

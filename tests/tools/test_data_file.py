@@ -151,12 +151,12 @@ def test_a_law_with_a_filter_is_identified_and_applied_as_it_is_told(
 ) -> None:
     out, words = tmp_path / "model.npz", ["identify", "--data", str(EXAMPLE)]
     assert main([*words, "--identification", "subspace"]) == FAILED
-    assert "gives a filter, which the law 'affine' does not have" in capsys.readouterr().err
+    assert "gives a filter, which the law 'affine' does not use" in capsys.readouterr().err
     filtered = ["--law", "observer", "--identification", "subspace", "--out", str(out)]
     assert main([*words, *filtered]) == 0
     assert "x = p + L (U^T z - p), and then p = A x + B a" in capsys.readouterr().out
-    rows = read_model(out, 2, "observer")
-    m = unpack(rows, 2, "observer")
+    rows = read_model(out, 2, Observer)
+    m = unpack(rows, 2, True)
     law = Observer(m, 60)
     (states, actions), *_ = read_measurements(EXAMPLE).trajectories
     p, expected = m.U.T @ states[0], []
@@ -168,7 +168,7 @@ def test_a_law_with_a_filter_is_identified_and_applied_as_it_is_told(
         along(law, law.theta_start, states[:-1], actions), expected, atol=1e-9
     )
     with pytest.raises(
-        ValueError, match="designed for the law 'observer', and the law is 'affine'"
+        ValueError, match="has a filter gain, and the law 'affine' does not use one"
     ):
         read_model(out, 2)
 

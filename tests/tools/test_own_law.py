@@ -225,6 +225,46 @@ def test_an_optimizer_that_sees_trajectories_is_told_the_law(
     assert max(row["differs"] for row in run.result["history"]) == 0.2
 
 
+class Filtering(pdeloop.Law):
+    """Feedback of an estimate with a filter gain of its own; not derived from the shipped observer."""
+
+    filtered = True
+
+    @property
+    def memory_size(self) -> int:  # type: ignore[override]
+        return len(self.model.A)
+
+    def start(self):
+        return {"K": self.model.K_a, "L": self.model.L}
+
+    def action(self, theta, z, memory, k):
+        return theta["K"] @ self._estimate(theta, z, memory)
+
+    def memory_update(self, theta, z, memory, action, k):
+        return self.model.A @ self._estimate(theta, z, memory) + self.model.B @ action
+
+    def _estimate(self, theta, z, memory):
+        return memory + theta["L"] @ (self.reduced(z) - memory)
+
+
+@pytest.mark.parametrize("identification", ["subspace", "regression"])
+def test_a_law_of_ones_own_declares_that_it_has_a_filter_gain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, identification: str
+) -> None:
+    """Its run is read without its code; without the declaration there is no such identification."""
+    own = {"law": Filtering, "optimizer": "two_point", "identification": identification}
+    run = pdeloop.train(str(SMALL), **own, out=tmp_path / "run", **BUDGET)
+    assert run.laws[0].parts(run.warm[0])["L"].shape == (N_S, N_S)
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    again = load_run(tmp_path / "run")
+    gain = again.models[0].L
+    assert gain is not None and gain.any() and same_bits(gain, run.models[0].L)
+    assert len(again.models[0].U) == run.values["n_z"]
+    with monkeypatch.context() as patch, pytest.raises(ValueError, match="does not use"):
+        patch.setattr(Filtering, "filtered", False)
+        pdeloop.train(str(SMALL), **own | {"identification": "subspace"}, **BUDGET)
+
+
 def test_parameters_for_each_step_fit_one_horizon(tmp_path: Path) -> None:
     run = pdeloop.train(str(SMALL), law="feedforward", out=tmp_path / "run", **BUDGET)
     assert run.policies.shape == (1, N_A * N_S + 30 * N_A)
