@@ -314,7 +314,7 @@ def one_line_each(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _same(a: Mapping[int, Sequence[float]], b: Mapping[int, Sequence[float]]) -> bool:
-    """Whether costs agree but for rounding."""
+    """True if costs agree but for rounding."""
     return a.keys() == b.keys() and all(
         len(a[budget]) == len(b[budget]) and np.allclose(a[budget], b[budget], rtol=1e-9, atol=0.0)
         for budget in a
@@ -355,7 +355,7 @@ def number(value: float) -> str:
 
 
 def finished(cost: float) -> bool:
-    """Whether no rollout that diverged counts in a mean cost."""
+    """True if no rollout that diverged counts in a mean cost."""
     return cost < 1e-3 * DIVERGED_COST
 
 

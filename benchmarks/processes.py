@@ -200,7 +200,7 @@ def machine() -> dict[str, Any]:
 
 
 def ended_well(process: BenchProcess) -> bool:
-    """Whether a process has ended. BenchError, with its last words, if it failed."""
+    """True once a process has ended. BenchError, with its last words, if it failed."""
     code = process.process.poll()
     if code:
         words = process.log().strip().splitlines()[-1:]

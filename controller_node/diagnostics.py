@@ -21,7 +21,7 @@ class ControllerDiagnostics:
         self._heard = float("-inf")
         self._waiting = ConditionTimer()
         self.plant_paused = False
-        """Whether the plant is paused, by its `episode/paused`."""
+        """True if the plant is paused, by its `episode/paused`."""
         self.plants: int | None = None
         """Number of publishers of `state`; None if not known."""
 

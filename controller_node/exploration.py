@@ -35,7 +35,7 @@ class Exploration:
         return excitations(self._start.values, step, settings.n_a, settings.action_limit)
 
     def lacks(self, state: Frame) -> bool:
-        """Whether the state is to be kept. Two different ones of a step make the episode unusable."""
+        """True if the state is to be kept. Two different ones of a step make the episode unusable."""
         known = self._states.get((state.plant, state.step))
         if known is None or self._unusable is not None:
             return self._unusable is None

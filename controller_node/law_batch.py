@@ -69,7 +69,7 @@ class LawBatch:
 
     @property
     def remembers(self) -> bool:
-        """Whether the law has a memory."""
+        """True if the law has a memory."""
         return self._laws[0].memory_size > 0
 
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:

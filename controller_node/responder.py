@@ -86,13 +86,13 @@ class Responder:
 
     @property
     def under_way(self) -> bool:
-        """Whether the last answered episode is still under way."""
+        """True while the last answered episode is under way."""
         run = self._served[0]
         return run in self._runs and (run, self.episode) != self._ended
 
     @property
     def exploring(self) -> bool:
-        """Whether the episode that was answered last explores."""
+        """True if the episode that was answered last explores."""
         run = self._runs.get(self._served[0])
         return run is not None and run.exploration is not None
 

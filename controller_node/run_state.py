@@ -145,11 +145,11 @@ def forget(
 
 
 def differ(a: Frame, b: Frame) -> bool:
-    """Whether two starts of an episode contradict each other."""
+    """True if two starts of an episode contradict each other."""
     return (a.plant, a.step) != (b.plant, b.step) or not np.array_equal(a.values, b.values)
 
 
 def contradict(a: Frame, b: Frame) -> bool:
-    """Whether two states of one step differ."""
+    """True if two states of one step differ."""
     same = (a.run, a.plant, a.episode, a.step) == (b.run, b.plant, b.episode, b.step)
     return same and not np.array_equal(a.values, b.values)

@@ -328,7 +328,7 @@ class RclChannel:
 
     @property
     def waits(self) -> bool:
-        """Whether a message waits for the node's thread."""
+        """True while a message waits for the node's thread."""
         return bool(oldest(self.record) != 0)
 
     def next_message(self) -> bytes | None:

@@ -109,7 +109,7 @@ def append(batch: Any, kind: int, stamp: int, time: float, raw: int, length: int
 
 @jit
 def full(batch: Any) -> bool:
-    """Whether the batch should be sent."""
+    """True if the batch should be sent."""
     return bool(batch.open and batch.end >= batch.limit)
 
 

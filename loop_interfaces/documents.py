@@ -115,7 +115,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _depth_exceeds(content: Any, most: int) -> bool:
-    """Whether lists and dicts stand more than `most` deep in each other."""
+    """True if lists and dicts are nested more than `most` deep."""
     level = [content]
     for _ in range(most + 1):
         parts = [part for part in level if isinstance(part, list | dict)]

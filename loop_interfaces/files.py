@@ -104,7 +104,7 @@ def private_folder(path: Path) -> None:
 
 
 def is_private(path: Path) -> bool:
-    """Whether `path` is a folder of this user, and no link to one. OSError if nothing is there."""
+    """True if `path` is a folder of this user, and not a link. OSError if nothing is there."""
     found = path.lstat()
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
 
@@ -128,7 +128,7 @@ def open_own(path: Path, flags: int) -> BinaryIO:
 
 
 def try_lock(file: BinaryIO | BufferedReader, *, shared: bool = False) -> bool:
-    """Whether the lock of an open file could be taken, for as long as it is open.
+    """Take the lock of an open file, for as long as it is open; False if another process has it.
 
     FileError where its file system has no locks: then nobody may take it for free.
     """

@@ -75,7 +75,7 @@ class _Layout:
     """Bytes of the whole message."""
     type: np.dtype[np.float64]
     swapped: bool
-    """Whether its numbers are in big-endian order."""
+    """True if its numbers are in big-endian order."""
 
 
 class ArrayCodec:

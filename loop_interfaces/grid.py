@@ -239,7 +239,7 @@ class Grid:
 
     @property
     def is_circle(self) -> bool:
-        """Whether it is one periodic axis, on which a translation maps fields to fields."""
+        """True if it is one periodic axis, on which a translation maps fields to fields."""
         return len(self.axes) == 1 and self.axes[0].periodic
 
     def fields(self, states: Array) -> Array:

@@ -50,7 +50,7 @@ def check_profile() -> None:
 
 
 def is_confined() -> bool:
-    """Whether this process is configured to keep its traffic on this machine."""
+    """True if this process is configured to keep its traffic on this machine."""
     return os.environ.get(PROFILE) == str(loopback_profile())
 
 

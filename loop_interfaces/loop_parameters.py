@@ -64,7 +64,7 @@ def nothing_for(whom: str, files: Sequence[ParameterFile]) -> str:
 
 
 def of_ros(name: str) -> bool:
-    """Whether a parameter is one that every ROS node has."""
+    """True for a parameter that every ROS node has."""
     return name.split(".")[0] in ROS_OWN
 
 

@@ -190,7 +190,7 @@ def called(name: str, function: Callable[..., Any], *given: Any, module: str = "
 
 
 def _is_shipped(function: Callable[..., Any]) -> bool:
-    """Whether it is code of this project, of which it is known how long it takes."""
+    """True for code of this project, which is known not to take long."""
     return (getattr(function, "__module__", None) or "").partition(".")[0] in _SHIPPED
 
 

@@ -74,7 +74,7 @@ class ParameterFile:
 
 
 def matches(name: str, node: str) -> bool:
-    """Whether the name of a block stands for the node of this full name."""
+    """True if the name of a block stands for the node of this full name."""
     pattern = f"/{name.removeprefix('/')}".replace("/*", r"(/\w+)")  # so that /** is (/\w+)*
     return re.fullmatch(pattern, node, re.ASCII) is not None
 

@@ -337,5 +337,5 @@ def measured_size(values: Mapping[str, Any]) -> int:
 
 
 def noisy(values: Mapping[str, Any]) -> bool:
-    """Whether the plant of these parameters has noise, so that a rollout has a seed of it."""
+    """True if the plant of these parameters has noise, for which a rollout then has a seed."""
     return bool(values["measurement_noise"] or values["process_noise"])

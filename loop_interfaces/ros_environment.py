@@ -157,7 +157,7 @@ def _check_values(environment: Mapping[str, str]) -> None:
 
 
 def _all_loopback(servers: str) -> bool:
-    """Whether all addresses of discovery servers, as of ROS_DISCOVERY_SERVER, are on this machine."""
+    """True if all addresses of discovery servers, as of ROS_DISCOVERY_SERVER, are on this machine."""
     for server in filter(None, servers.split(";")):
         host = server.rpartition(":")[0] or server
         try:
@@ -170,7 +170,7 @@ def _all_loopback(servers: str) -> bool:
 
 
 def _installed(middleware: str, environment: Mapping[str, str]) -> bool:
-    """Whether a middleware can be loaded. The wheels are linked to theirs, and load no other."""
+    """True if a middleware can be loaded. The wheels are linked to theirs, and load no other."""
     own = Path(sys.prefix) / "lib"
     if (own / f"lib{MIDDLEWARE}.so").exists() and not (own / "librmw_implementation.so").exists():
         return False
@@ -181,7 +181,7 @@ def _installed(middleware: str, environment: Mapping[str, str]) -> bool:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, which is made as ROS would make it."""
+    """True if files can be made in a folder, which is created as ROS would."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

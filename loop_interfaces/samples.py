@@ -64,7 +64,7 @@ class TokenBucket:
         self._tokens, self._when = 0.0, -math.inf
 
     def admits(self, now: float) -> bool:
-        """Whether to show the episode that begins now (monotonic s)."""
+        """True if the episode that begins now (monotonic s) is to be shown."""
         self._tokens = max(-RATE, min(RATE, self._tokens + RATE * (now - self._when)))
         self._when = now
         return self._tokens >= 0.0

@@ -80,7 +80,7 @@ class Spec:
 
     @property
     def numbers(self) -> bool:
-        """Whether it is a list of numbers."""
+        """True if it is a list of numbers."""
         return self.type is list and self.minimum is not None
 
     @property

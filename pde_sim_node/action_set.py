@@ -42,7 +42,7 @@ class ActionSet:
 
     @property
     def everything(self) -> bool:
-        """Whether every action is in it."""
+        """True if every action is in it."""
         return not (self.zero_mean or np.isfinite([self.low, self.high]).any())
 
     def project(self, actions: Array) -> Array:

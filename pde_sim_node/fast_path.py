@@ -119,7 +119,7 @@ class PlantFastPath(FastPath):
         self._clock = MonotonicClock(self.plan["clock"])
         self._log = np.zeros((0, 0))
         self.suspended = False
-        """Whether every action is left to the lock-step."""
+        """True if every action is left to the lock-step."""
 
     def prepare(self) -> bool:
         """Within an episode of a plant whose step is compiled code alone."""

@@ -99,7 +99,7 @@ class Lockstep:
         self.paused = paused
         self._fingerprint = fingerprint
         self._stepping = False
-        """Whether a paused plant waits for the one action that it may still take."""
+        """True while a paused plant waits for the one action that it may still take."""
         self._phase = Phase.IDLE
         self._actions = TakenActions()
         self._state = np.empty((0, 0))
@@ -113,7 +113,7 @@ class Lockstep:
 
     @property
     def active(self) -> bool:
-        """Whether an episode is under way."""
+        """True while an episode is under way."""
         return self._phase is not Phase.IDLE
 
     @property
@@ -150,7 +150,7 @@ class Lockstep:
         return self._timing.action_timeout * max(1.0, self._state.size / SLOW)
 
     def overdue(self) -> bool:
-        """Whether the awaited action has been missing for many repeats."""
+        """True if the awaited action has been missing for many repeats."""
         if self._phase is not Phase.AWAITING or (self.paused and not self._stepping):
             return False
         return self._repeats * self._patience > 2.0
@@ -160,7 +160,7 @@ class Lockstep:
         return Publication(topics.TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
 
     def paused_report(self) -> Publication:
-        """Whether the plant is paused, latched."""
+        """The latched message that says whether the plant is paused."""
         return self._stamped(topics.PAUSED, np.array([float(self.paused)]))
 
     def pause(self, now: float) -> list[Publication]:
@@ -280,7 +280,7 @@ class Lockstep:
         return self._send_unless_paused(now)
 
     def awaits(self, frame: Frame) -> bool:
-        """Whether `action` will take this: it answers the state that was sent, and has its shape."""
+        """True if `action` will take this: it answers the state that was sent, and has its shape."""
         ids = self.run, self.episode, self.step, self._fingerprint
         return (
             self._phase is Phase.AWAITING

@@ -71,7 +71,7 @@ class Instruments:
 
     @property
     def ideal(self) -> bool:
-        """Whether there is nothing between the field and the controller."""
+        """True if there is nothing between the field and the controller."""
         return self == Instruments(sensor_delays=self.sensor_delays)
 
 

@@ -56,7 +56,7 @@ class RealTimePacer:
         return self._due
 
     def ready(self, now: float) -> bool:
-        """Whether the state, which is ready now, is to go out; then it is counted."""
+        """True if the state, which is ready now, is to go out; then it is counted."""
         if now < self._due:
             self._asked = True
             return False

@@ -16,7 +16,7 @@ FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-plants-{os.getuid()}"
 
 
 class RunRecord:
-    """Whether a plant is paused, and the last run whose controller signs; 0 for none.
+    """The state of a plant: paused or not, and the last run whose controller signs; 0 for none.
 
     name: full name of the plant's node; folder: made when it is needed, for this user alone.
     """

@@ -38,11 +38,11 @@ class Episode:
     cost: Frame | None = None
 
     def started_otherwise(self, rows: np.ndarray, signature: float) -> bool:
-        """Whether this is another start than its own."""
+        """True if this is another start than its own."""
         return signature != self.signature or not np.array_equal(rows, self.rows)
 
     def contradicted_by(self, action: Frame) -> bool:
-        """Whether another action was taken at this step."""
+        """True if another action was taken at this step."""
         return action.step < len(self.taken) and digest(action.values) != self.taken[action.step]
 
 
@@ -63,7 +63,7 @@ class TakenActions:
         return self.episode.signature if self.signs else NOT_SIGNED
 
     def is_signed(self, action: Frame) -> bool:
-        """Whether an action of the episode is signed as the run's controller signs."""
+        """True if an action of the episode is signed as the run's controller signs."""
         found, expected = signature_in(action.time), self.signature
         return (
             found in (NOT_SIGNED, self.episode.signature) if expected is None else found == expected

@@ -52,7 +52,7 @@ class EpisodeRecord:
 
     @property
     def whole(self) -> bool:
-        """Whether no environment diverged."""
+        """True if no environment diverged."""
         return bool((self.costs.diverged_step < 0).all())
 
 

@@ -85,7 +85,7 @@ def running() -> list[Live]:
 
 
 def is_locked(file: BinaryIO) -> bool:
-    """Whether another process holds the lock of this open file."""
+    """True if another process holds the lock of this open file."""
     return not try_lock(file, shared=True)
 
 

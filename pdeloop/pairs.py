@@ -159,7 +159,7 @@ class Transport:
 
     @property
     def recorded(self) -> bool:
-        """Whether there is a recorder."""
+        """True if there is a recorder."""
         return self.recorder != "none"
 
     def nodes(self, folder: Path) -> list[LoopNode]:

@@ -119,7 +119,7 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
 
 
 def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
-    """Whether a step has the same bits when it is computed again, and in a batch of another size."""
+    """Check that a step has the same bits when it is computed again, and in a batch of another size."""
     name = "repeatability"
     if not plant.settable:
         return Finding(name, True, "not checked: the state of the plant cannot be set")

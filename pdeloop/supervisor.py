@@ -100,7 +100,7 @@ class Supervisor:
     environment: Mapping[str, str]
     """Environment variables of the nodes (loop_interfaces.ros_environment)."""
     stopped: bool = False
-    """Whether the main node ended because an operator asked it to, through its service."""
+    """True if the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

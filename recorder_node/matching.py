@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether the nodes of the loop have discovered the recorder's subscriptions, and their parameters."""
+"""Finds out when the nodes of the loop have discovered the recorder, and asks for their parameters."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Matching:
         self._peers.poll()
 
     def complete(self, now: float) -> bool:
-        """Whether every required topic has a publisher, and all of them have discovered us.
+        """True if every required topic has a publisher, and all of them have discovered us.
 
         A node with parameter services must have answered, however long it takes; one that shows
         none within PATIENCE cannot.
@@ -41,7 +41,7 @@ class Matching:
         )
 
     def changed(self, run: int) -> bool:
-        """Whether `parameters` may have changed since the last call with the same run."""
+        """True if `parameters` may have changed since the last call with the same run."""
         answered = [peer.process for peer in self._peers.known if peer.values]
         changed, self._known = (run, answered) != self._known, (run, answered)
         return changed

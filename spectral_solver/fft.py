@@ -39,7 +39,7 @@ SIN_60 = math.sqrt(0.75)
 
 
 def is_transform_length(m: int) -> bool:
-    """Whether `fft` can transform length m."""
+    """True if `fft` can transform length m."""
     if m < 1 or m % WIDTH:
         return False
     rest = m // WIDTH

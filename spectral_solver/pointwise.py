@@ -23,7 +23,7 @@ LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
 @cached_njit()
 def all_finite(values: NDArray[np.float64]) -> bool:
-    """Whether an array holds neither NaN nor infinity."""
+    """True if an array holds neither NaN nor infinity."""
     finite = True
     for value in values.flat:
         finite &= math.isfinite(value)

@@ -94,7 +94,7 @@ class ParallelStep:
 
     @property
     def shared(self) -> bool:
-        """Whether the threads of the pool are better than compiled code that one thread calls."""
+        """True where the threads of the pool are better than compiled code that one thread calls."""
         return len(self._parts) > 1 and self._points >= COMPILED_POINTS
 
     def step(self, k: int) -> None:

@@ -153,7 +153,7 @@ class _Training:
         report.rollouts += sum(seed["adaptation"] for seed in result["rollouts"])
 
     def matches(self) -> bool:
-        """Whether policy and costs are those of the quiet training, bit for bit."""
+        """True if policy and costs are those of the quiet training, bit for bit."""
         quiet = self._quiet
         assert quiet.evaluation is not None
         result = json.loads((self._out / "result.json").read_text())

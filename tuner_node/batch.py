@@ -113,7 +113,7 @@ class TrainingSettings:
     explorations: int = 1
     """Rollouts of an exploration, from as many initial fields."""
     noise: bool = False
-    """Whether rollouts get seeds of the plant's noise."""
+    """True if rollouts get seeds for the plant's noise."""
     action_limit: float = 0.0
     measurement_noise: float = 0.0
     """Standard deviation of the noise on every number of the states."""
@@ -124,9 +124,9 @@ class TrainingSettings:
     cost: Sequence[str] = ()
     """The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it."""
     periodic: bool = True
-    """Whether the states are fields on one periodic axis."""
+    """True if the states are fields on one periodic axis."""
     line: bool = True
-    """Whether they are fields on one axis, or plain vectors."""
+    """True if they are fields on one axis, or plain vectors."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
     field_models: FieldModelSettings = DEFAULTS

@@ -60,7 +60,7 @@ class Budget:
         return self._rollouts - self._sum("identify", "check")
 
     def allows(self, seed: int, rollouts: int) -> bool:
-        """Whether a seed may pay for this many more."""
+        """True if a seed can pay for this many more."""
         return not self._rollouts or bool(self.paid[seed] + rollouts <= self._rollouts)
 
     def by_purpose(self) -> list[dict[str, int]]:

@@ -33,7 +33,7 @@ class Chunk:
         return int(self.rows.stop - self.rows.start)
 
     def done(self, batch: Batch) -> bool:
-        """Whether all results are there that the batch asks for."""
+        """True once all results are there that the batch asks for."""
         return (
             self.costs is not None
             and (self.models is not None or not batch.exploratory)

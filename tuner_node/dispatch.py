@@ -91,7 +91,7 @@ class Dispatcher:
         """Why episodes were started again, in words."""
         self.sim_time = 0.0
         self.paused = False
-        """Whether an operator lets no new episode begin."""
+        """True while an operator lets no new episode begin."""
         self.last_costs: Array | None = None
         """Mean stage costs of the last episode that was answered."""
         self._batch: Batch | None = None

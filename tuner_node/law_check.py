@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether the actions of a rollout are those of the law whose parameters the tuner publishes."""
+"""Compares the actions of a rollout with those of the law whose parameters the tuner publishes."""
 
 from collections.abc import Sequence
 

@@ -231,7 +231,7 @@ def warnings(summary: Row) -> list[str]:
 
 
 def costlier_than_none(summary: Row) -> bool:
-    """Whether the law of a seed costs more than no control."""
+    """True if the law of a seed costs more than no control."""
     costs = summary["costs"]
     pairs = zip(costs["none"], costs["adapted"], strict=True)
     return any(not adapted <= none for none, adapted in pairs)
@@ -243,7 +243,7 @@ def exit_code(summary: Row) -> int:
 
 
 def failed(summary: Row) -> bool:
-    """Whether a training has no controller to show: its policies, or all of its laws, diverged."""
+    """True if a training has no controller to show: its policies, or all of its laws, diverged."""
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     none, adapted = (sum(summary["costs"][name]) for name in ("none", "adapted"))
     return lost["adapted"] == rollouts or (lost["lqt"] == rollouts and not adapted < none)

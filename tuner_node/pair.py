@@ -90,11 +90,11 @@ class Pair:
         self.answers[topic, answer.episode] = digest(answer.values), answer.step
 
     def runs(self, episode: int) -> bool:
-        """Whether this episode is under way."""
+        """True while this episode is under way."""
         return self.chunk is not None and self.episode == episode
 
     def used(self, episode: int) -> bool:
-        """Whether an answer to this one of the last episodes was taken."""
+        """True if an answer to this one of the last episodes was taken."""
         return any(known == episode for _, known in self.answers)
 
     def check_answer(self, answer: Frame, topic: str) -> None:

@@ -77,7 +77,7 @@ def check_history(history: object, seed: int, seeds: int) -> None:
 
 
 def _outcome(own: Mapping[str, Any]) -> bool:
-    """Whether this is the verdict on a seed, its reason, and the difference if it has one."""
+    """True if this is the verdict on a seed, its reason, and the difference if it has one."""
     if not (isinstance(own.get("verdict"), str) and isinstance(own.get("reason"), str)):
         return False
     known = own.get("against_lqt")

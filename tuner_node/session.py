@@ -26,11 +26,11 @@ class Session:
         self._phase = ""
         self.done = False
         self.established = False
-        """Whether a pair has served this session: any other tuner then came later."""
+        """True once a pair has served this session: any other tuner then came later."""
         self.stopping = False
-        """Whether an operator asked for the end after the rollouts under way."""
+        """True once an operator asked for the end after the rollouts under way."""
         self.stopped = False
-        """Whether that end has come; the training's state is that of a checkpoint."""
+        """True once that end has come; the training's state is that of a checkpoint."""
         self._checked: dict[int, Mapping[str, Any]] = {}
         self._generation = 0
 

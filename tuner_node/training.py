@@ -62,7 +62,7 @@ class Training:
     history: list[dict[str, Any]] = field(default_factory=list)
     budget: Budget = field(init=False)
     law_seen: bool = False
-    """Whether rollouts were seen, all with the actions of the law whose parameters the policies are."""
+    """True once rollouts were seen, all with actions of the law whose parameters are the policies."""
     evaluation: Array | None = None
     """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
     ended: Array | None = None
@@ -78,7 +78,7 @@ class Training:
     measured: list[list[Record]] = field(default_factory=list)
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
-    """Whether the warm start of a seed was measured to be no better than no control."""
+    """True where the warm start of a seed was measured to be no better than no control."""
     _laws: list[Law] = field(default_factory=list, repr=False)
     _made_from: int = 0
     """Digest of the models of these laws."""
@@ -212,7 +212,7 @@ class Training:
 
     @property
     def ready(self) -> bool:
-        """Whether there are the models that the next rollouts are about."""
+        """True if there are models for the next rollouts."""
         return self.models is not None and self.phase != "identify"
 
     @property
@@ -317,7 +317,7 @@ class Training:
         return rows
 
     def _can_explore_again(self, m: int) -> bool:
-        """Whether there are attempts left, and rollouts for another one and a step afterwards."""
+        """True if there are attempts left, and rollouts for another one and a step afterwards."""
         settings = self.settings
         return self.attempts[m] + 1 < settings.identification_attempts and self.budget.allows(
             m, settings.explorations + CHECK + settings.step

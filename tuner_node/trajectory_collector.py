@@ -30,7 +30,7 @@ class TrajectoryCollector:
     contradiction: str = ""
     """Why the episode cannot be used, if two different samples came for one step."""
     used: bool = False
-    """Whether the trajectories were taken: what comes now is only compared."""
+    """True once the trajectories were taken: what comes now is only compared."""
     nbytes: int = 0
     """Size of the samples that are kept, and of what keeps them."""
     _samples: dict[str, dict[tuple[int, int], Array]] = field(

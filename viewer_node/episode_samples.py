@@ -137,7 +137,7 @@ class EpisodeSamples:
 
     @property
     def whole(self) -> bool:
-        """Whether it was seen from its first state."""
+        """True if it was seen from its first state."""
         return self.first == 0
 
     @property

@@ -58,7 +58,7 @@ class LoopReader:
         }
 
     def listen(self, yes: bool) -> None:
-        """Whether states and actions are read as well: each reader costs their sender something."""
+        """True while states and actions are read as well: each reader costs their sender something."""
         if yes and self._samples is None:
             self._samples = SampleSubscription(self._node, self._namespace, throttled=True)
             self._samples.poll()

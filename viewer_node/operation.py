@@ -41,7 +41,7 @@ class Operation:
         self._requests: dict[Call, _Request] = {}
         self._stopping: tuple[str, int] | None = None
         self.plant_paused = False
-        """Whether the plant is paused, by its `episode/paused`."""
+        """True if the plant is paused, by its `episode/paused`."""
 
     def asked(self, call: Call, now: float) -> None:
         """Note that an operator asks a node for something."""
@@ -75,7 +75,7 @@ class Operation:
 
     @property
     def stopping(self) -> bool:
-        """Whether the tuner has agreed to stop, and is still there."""
+        """True while the tuner has agreed to stop and is still there."""
         tuner = self._nodes.by_role["tuner"]
         return tuner.present and self._stopping == (tuner.name, tuner.starts)
 

@@ -111,7 +111,7 @@ class _BatchPublisher:
         self._flushed = time.monotonic()
 
     def poll(self, now: float) -> bool:
-        """Whether there are subscribers; publishes what has waited for long."""
+        """True if there are subscribers; publishes what has waited for long."""
         if now - self._flushed > AGE:
             self.flush()
         return self._publisher.get_subscription_count() > 0
@@ -133,12 +133,12 @@ class SampleBatcher:
         self._publishers = self._full, self._throttled
         self._rate = TokenBucket()
         self._viewers = False
-        """Whether `samples_throttled` has subscribers."""
+        """True if `samples_throttled` has subscribers."""
         self.timed = False
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody takes samples of the present episode."""
+        """True if anybody takes samples of the present episode."""
         return self._full.open or self._throttled.open
 
     def begin(self, now: float) -> None:

@@ -240,7 +240,7 @@ class Introspection:
         ]
 
     def _is_due(self, text: str, now: float) -> bool:
-        """Whether to give a warning, which may have been given before."""
+        """True unless the same warning has just been given."""
         due = now >= self._told.get(text, -math.inf) + AGAIN
         if due:
             self._told = {known: at for known, at in self._told.items() if now < at + AGAIN}

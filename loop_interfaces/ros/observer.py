@@ -46,7 +46,7 @@ class EventLoop:
         self.node = node
         self.introspection = Introspection(node)
         self.suspended = False
-        """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
+        """True if `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._stop_reason: str | None = None
         self._turned = self.now()
         """Time of the last round of the loop."""
@@ -84,7 +84,7 @@ class EventLoop:
 
     @property
     def stopped(self) -> bool:
-        """Whether `stop` was called or ROS was shut down."""
+        """True once `stop` was called or ROS was shut down."""
         return self._stop_reason is not None or not self.node.context.ok()
 
 

@@ -163,7 +163,7 @@ class RemoteParameters:
         next(self._asking, None)
 
     def offered(self) -> bool:
-        """Whether the graph shows the services, or has shown them."""
+        """True once the graph has shown the services."""
         return self.values is not None or self._list.service_is_ready()
 
     def _ask(self) -> Iterator[None]:

@@ -33,7 +33,7 @@ class Peer:
 
     @property
     def offers_parameters(self) -> bool:
-        """Whether the graph shows the node's parameter services."""
+        """True while the graph shows the node's parameter services."""
         return self.parameters is not None and self.parameters.offered()
 
 

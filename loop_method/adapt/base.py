@@ -67,7 +67,7 @@ class RolloutResult:
 
     @property
     def usable(self) -> bool:
-        """Whether the cost is a finite measurement."""
+        """True if the cost is a finite measurement."""
         return not self.diverged and bool(np.isfinite(self.cost))
 
 
@@ -95,7 +95,7 @@ class Record:
 
     @property
     def usable(self) -> bool:
-        """Whether the rollout came to its end."""
+        """True if the rollout came to its end."""
         return bool(np.isfinite(self.cost))
 
     @property
@@ -200,21 +200,21 @@ class Optimizer(Protocol):
     Settings: ClassVar[type[_Settings]] = _Settings
     """Its constants; none if it does not say otherwise."""
     needs_trajectories: ClassVar[bool] = False
-    """Whether results have to come with their trajectories."""
+    """True if results have to come with their trajectories."""
     needs_affine_law: ClassVar[bool] = False
-    """Whether it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
+    """True if it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
     also_improves: ClassVar[tuple[str, ...]] = ()
     """Names of other laws that it improves, whose theta it is given as a vector."""
     compares_first_law: ClassVar[bool] = False
-    """Whether it compares the first law with no control itself where the state is that of few sensors,
+    """True if it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""
     any_cost: ClassVar[bool] = False
-    """Whether it can use any quadratic cost (`loop_interfaces.cost.Cost`), if it needs trajectories;
+    """True if it can use any quadratic cost (`loop_interfaces.cost.Cost`), if it needs trajectories;
     otherwise scalar weights and a constant target. Optimisers that need only costs can."""
     judges_first_law: ClassVar[bool] = False
-    """Whether it does so always."""
+    """True if it always compares the first law with no control itself."""
     in_coordinates: ClassVar[bool] = False
-    """Whether it can be given coordinates in an orthonormal basis of what was measured in place of
+    """True if it can be given coordinates in an orthonormal basis of what was measured in place of
     states of more than 2,048 numbers (`loop_method.adapt.in_coordinates`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
@@ -259,7 +259,7 @@ class Optimizer(Protocol):
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing more to ask."""
+        """True once there is nothing more to ask."""
 
     def ask(self) -> list[Rollout]:
         """The rollouts needed next; the same ones on every call until `tell`, none when done."""

@@ -168,7 +168,7 @@ class ClosedLoop(ClosedLoopProblem):
         costs += self.action_weight * np.einsum("fi,fi->f", a, a)
 
     replays: ClassVar[bool] = False
-    """Whether initial fields are measured rollouts, with what in them was not foreseen."""
+    """True if initial fields are measured rollouts, with what in them was not foreseen."""
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, (n, n_z)."""

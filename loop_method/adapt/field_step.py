@@ -23,7 +23,7 @@ from loop_method.adapt.settings import ModelBasedSettings
 
 SETTINGS = ModelBasedSettings(isotropy=ISOTROPY)
 # Trust region of a law that is improved on a model of the field, per lambda; see `improve`.
-_TRUST = 3e-2
+_MODEL_TRUST_SCALE = 3e-2
 # The newest rollouts that such a model is about.
 COMPARED = 8
 # Further initial fields are this many times as far from the mean of the measured ones.
@@ -88,7 +88,8 @@ def improved(
     """The best law on a model near to theta, and by how much its cost is lower."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
-        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS), trust=_TRUST * damping
+        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS),
+        trust=_MODEL_TRUST_SCALE * damping,
     )
     return None if found is None else (found.theta, found.before - found.after)
 
@@ -106,7 +107,7 @@ def extrapolated_fields(fields: Array) -> Array:
 def agrees_with_rejections(
     context: Context, belief: Belief, rejected: Sequence[tuple[Record, Record]]
 ) -> bool:
-    """Whether the rejected candidate also costs more than the incumbent on the model.
+    """True if the rejected candidate also costs more than the incumbent on the model.
 
     rejected: rollouts of the incumbent and of the candidate on the same fields.
     """

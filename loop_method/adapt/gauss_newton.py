@@ -213,7 +213,7 @@ class GaussNewton(Optimizer):
 
     @property
     def done(self) -> bool:
-        """Whether the rollouts that are left make no step."""
+        """True if the rollouts that are left make no step."""
         return not self.ask()
 
     def ask(self) -> list[Rollout]:

@@ -202,5 +202,5 @@ class CostInCoordinates(Cost):
 
 
 def is_large(context: Context) -> bool:
-    """Whether an optimiser sees coordinates in place of the states."""
+    """True if an optimiser sees coordinates in place of the states."""
     return len(context.target) > LARGE

@@ -61,7 +61,7 @@ def measured_states(records: Sequence[Record], count: int) -> Array:
 
 
 def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
-    """Whether small changes grow on a model of the plant, so that it counts as chaotic."""
+    """True if small changes grow on a model of the plant, which then counts as chaotic."""
     if len(fields) < 2:
         return False
     none = loop.no_control

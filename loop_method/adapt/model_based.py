@@ -140,7 +140,7 @@ class ModelBased(Optimizer):
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing more to ask."""
+        """True once there is nothing more to ask."""
         return self._progress.stage == ENDED
 
     def ask(self) -> list[Rollout]:
@@ -274,7 +274,7 @@ class ModelBased(Optimizer):
     _unpredicted = "no model of the whole field predicts the rollouts"
 
     def _is_believed(self, belief: Belief) -> bool:
-        """Whether the law is improved on a model."""
+        """True if the law is improved on this model."""
         settings = self._settings
         most = settings.believed_noisy if self._context.noise else settings.believed
         return belief.error <= most

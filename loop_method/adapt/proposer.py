@@ -89,7 +89,7 @@ class Proposer:
         self,
         records: Sequence[Record],
         incumbents: Sequence[Record],
-        others: Sequence[Record | None],
+        compared: Sequence[Record | None],
         *,
         damping: float,
         accepted: bool,
@@ -103,7 +103,7 @@ class Proposer:
             All remembered rollouts.
         incumbents : sequence of Record
             The rollouts of the incumbent on the current fields.
-        others : sequence of Record or None
+        compared : sequence of Record or None
             On the same fields: the candidate that was rejected last, or the previous incumbent.
         damping : float
             lambda.
@@ -116,10 +116,10 @@ class Proposer:
         measured = [r for r in (*self._measured, *records) if len(r.states) > 1]
         records = [self._clean(record) for record in records]
         incumbents = [self._clean(record) for record in incumbents]
-        others = [other and self._clean(other) for other in others]
+        compared = [other and self._clean(other) for other in compared]
         data = [record for record in (*self._before, *records) if len(record.states) > 1]
         rejected = (
-            [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
+            [] if accepted else [(i, o) for i, o in zip(incumbents, compared, strict=True) if o]
         )
         policy = incumbents[0].policy
         if self.sensed is not None:
@@ -144,7 +144,7 @@ class Proposer:
                         *(self._context, belief, whole, known, policy, damping),
                     )
         proposal = local_step.propose(
-            *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
+            *(loop, data, shares, incumbents, compared), damping=damping, accepted=accepted
         )
         return proposal and replace(proposal, believed=believed)
 

@@ -64,7 +64,7 @@ def taken_trajectory(arrays: Arrays, name: str, n_z: int | None, n_a: int) -> Tr
 
 
 def is_kept(arrays: Arrays, name: str) -> bool:
-    """Whether there is a trajectory of that name."""
+    """True if there is a trajectory of that name."""
     return f"{name}.actions" in arrays
 
 

@@ -123,7 +123,7 @@ class TwoPoint(Optimizer):
 
     @property
     def done(self) -> bool:
-        """Whether the budget is used."""
+        """True once the budget is used."""
         return self._tells >= self._steps
 
     def ask(self) -> list[Rollout]:

@@ -68,7 +68,7 @@ class FieldLaw:
 
     @property
     def better(self) -> bool:
-        """Whether its law is cheaper on the model than the other one."""
+        """True if its law is cheaper on the model than the other one."""
         return self.rows is not None and self.cost < self.other_cost
 
     def summary(self) -> dict[str, Any]:

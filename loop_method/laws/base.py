@@ -75,7 +75,7 @@ class Law(ABC):
     name: ClassVar[str] = ""
     """Its name; that of the class if it is not set."""
     compiled: ClassVar[bool] = False
-    """Whether it has a compiled form: `gains`."""
+    """True if it has a compiled form: `gains`."""
     axes: ClassVar[int] = 1
     """Axes of theta in messages and files, where all laws but the affine one have a vector."""
     Settings: ClassVar[type[_Settings]] = _Settings
@@ -306,7 +306,7 @@ def float64(values: ArrayLike) -> Array:
 
 
 def differentiable(kind: type[Law]) -> bool:
-    """Whether a law has all derivatives that an adjoint needs."""
+    """True if a law has all derivatives that an adjoint needs."""
     own = kind.pull_back is not Law.pull_back
     remembers = kind.memory_update is not Law.memory_update
     return own and (not remembers or kind.pull_back_memory is not Law.pull_back_memory)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether trajectories determine a linear model of the plant, and which inputs they cannot tell apart.
+"""Tells whether trajectories determine a linear model, and which inputs they cannot tell apart.
 
 The regressors of s_{k+1} = A s_k + B a_k are s_k = U^T z_k and a_k. The data determine the column of
 an input in B if it moved by itself: not constant, no combination of other inputs, no function of the
@@ -103,7 +103,7 @@ class Identifiability:
 def examine(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], U: Array, channels: Channels = NUMBERED
 ) -> Identifiability:
-    """Whether trajectories determine a model on given modes; with remarks on copies and on states.
+    """Examine whether trajectories determine a model on given modes, copies and states included.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def examine(
 
 
 def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) -> Identifiability:
-    """Whether an exploration tells the effects of its inputs apart, whatever the order of the model.
+    """Examine whether an exploration tells the effects of its inputs apart, for a model of any order.
 
     trajectory : (states (N + 1, n_z), actions (N, n_a))
     """
@@ -140,7 +140,7 @@ def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) ->
 
 
 def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Identifiability:
-    """Whether the steps determine a model on the modes U (n_z, n_s). Call it with one LAPACK thread.
+    """Examine whether the steps determine a model on the modes U (n_z, n_s), with one LAPACK thread.
 
     Examples
     --------
@@ -252,7 +252,7 @@ def _state_basis(z: Array, s: Array, drift: bool, n_a: int) -> Array:
 
 
 def _rounding(left: Array, channel: Array, size: float) -> bool:
-    """Whether what is left of a channel that was scaled by `size` is no more than its rounding."""
+    """True if what is left of a channel that was scaled by `size` is no more than its rounding."""
     norm = float(linalg.norm(left))
     return norm < DEPENDENT or norm * size <= ROUNDED * _step(channel) * np.sqrt(len(left))
 

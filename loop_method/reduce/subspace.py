@@ -143,7 +143,7 @@ def subspace_model(
 
 
 def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
-    """Whether p steps can show n states, and samples are more than the unknowns of a row.
+    """True if p steps can show n states, and there are more samples than unknowns in a row.
 
     They are those after p steps, while a quarter of the data is held out.
     """

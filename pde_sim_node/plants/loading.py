@@ -190,7 +190,7 @@ def require_complete(plant: Dynamics | Plant) -> None:
 
 
 def _storable(value: object) -> bool:
-    """Whether a YAML file and ROS parameters can hold it."""
+    """True if a YAML file and ROS parameters can hold it."""
     if isinstance(value, list):
         return bool(value) and len({type(item) for item in value}) == 1 and _storable(value[0])
     return isinstance(value, bool | int | float | str | np.number)

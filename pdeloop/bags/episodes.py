@@ -101,7 +101,7 @@ class RecordedEpisode:
 
     @property
     def void(self) -> bool:
-        """Whether the plant declared it void."""
+        """True if the plant declared it void."""
         rows = None if self.cost is None else self.cost.values
         return rows is not None and bool((rows[:, CostColumn.ENDED] == VOID).any())
 
@@ -143,7 +143,7 @@ class RecordedEpisode:
         return np.stack(states), np.stack([self.actions[k].values for k in range(self.horizon)])
 
     def over(self, now: int, newest: int) -> bool:
-        """Whether nothing more is expected of it at time `now` (ns).
+        """True if nothing more is expected of it at time `now` (ns).
 
         Episodes of a pair follow each other: one without a cost is given up when there is a later one,
         `newest` being the largest number.

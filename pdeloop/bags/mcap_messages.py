@@ -90,7 +90,7 @@ def _name(text: str) -> str:
 
 
 def finished(path: Path) -> bool:
-    """Whether the recorder of the file at `path` came to its end, which repeats the magic bytes."""
+    """True if the recorder of the file at `path` finished, which repeats the magic bytes."""
     with open_ordinary(path) as file:
         file.seek(-min(len(MAGIC), path.stat().st_size), os.SEEK_END)
         return file.read() == MAGIC

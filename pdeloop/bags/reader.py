@@ -48,7 +48,7 @@ class Bag:
 
     @property
     def finished(self) -> bool:
-        """Whether it was closed properly."""
+        """True if it was closed properly."""
         return all(map(finished, self.files)) and (self.path / METADATA).exists()
 
     @cached_property

@@ -149,7 +149,7 @@ class RecordedRun:
         return True
 
     def _continues(self, claims: RunClaims | None) -> bool:
-        """Whether the bag begins with a later start of the tuner, so that another one has the rest."""
+        """True if the bag begins with a later start of the tuner, so that another one has the rest."""
         first = min(self._numbers, default=0)
         return claims is None and first // EPISODES_PER_START > 1 and not gaps({first})
 

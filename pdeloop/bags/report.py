@@ -34,7 +34,7 @@ class Report:
 
     @property
     def good(self) -> bool:
-        """Whether all that should be there is there, and nothing differs."""
+        """True if nothing is missing, and nothing differs."""
         return not (self.count or self.missing)
 
     def count_compared(self, what: str, number: int) -> None:

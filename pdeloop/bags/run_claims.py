@@ -49,7 +49,7 @@ class RunClaims:
     unreadable: list[str] = field(default_factory=list)
 
     def reached(self, training: Training) -> bool:
-        """Whether the training has been followed as far as the folder says that it went."""
+        """True if the training has been followed as far as the folder says that it went."""
         if self.result is not None:
             return False  # to its very end
         paid = dict(zip(training.settings.all_seeds, training.budget.paid.tolist(), strict=True))

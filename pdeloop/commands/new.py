@@ -85,7 +85,7 @@ def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
 
 
 def _is_module(name: str) -> bool:
-    """Whether Python would find another module of this name; a folder without code is none."""
+    """True if Python would find another module of this name; a folder without code does not count."""
     found = find_spec(name)
     return found is not None and found.origin is not None
 

@@ -1,2 +1,2 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether a stand-in keeps to the interface: `checks` (pure), and `node`, which reaches it."""
+"""Tests of a stand-in against the protocol: `checks` (pure), and `node`, which reaches it."""

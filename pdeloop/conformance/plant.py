@@ -85,7 +85,7 @@ class PlantCheck(Check):
 
     @cached_property
     def serves_two(self) -> bool:
-        """Whether a start of two rows is answered."""
+        """True if a start of two rows is answered."""
         try:
             self.begin((1, 1), (2, 2))
         except NoAnswerError:

@@ -54,7 +54,7 @@ class Finder:
 
 
 def worked_on(folder: Path) -> bool:
-    """Whether a process works on the run in `folder` (tuner_node.run_folder.RunFolder.locked)."""
+    """True if a process works on the run in `folder` (tuner_node.run_folder.RunFolder.locked)."""
     with contextlib.suppress(OSError), (folder / "lock").open("rb") as file:
         return is_locked(file)
     return False

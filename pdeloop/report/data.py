@@ -104,7 +104,7 @@ class ProblemData:
 
     @property
     def affine(self) -> bool:
-        """Whether the parameters are gains [K_a K_b]."""
+        """True if the parameters are gains [K_a K_b]."""
         return bool(self.first.values["law"] == Affine.name)
 
     @property

@@ -73,7 +73,7 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
 
 
 def has_steps(history: Rows) -> bool:
-    """Whether these are the rows of an optimiser that judges its steps as `steps` shows them."""
+    """True for the rows of an optimiser that judges its steps as `steps` shows them."""
     decided = [row for row in history if "accepted" in row]
     return (
         bool(decided)

@@ -118,7 +118,7 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
 
 
 def above(found: Mapping[str, Any] | None) -> bool:
-    """Whether a share below LQT's cost, or an end of its interval, is one above it."""
+    """True if a share below LQT's cost, or an end of its interval, is in fact above it."""
     if found is None:
         return False
     intervals = [*(found["ratio_interval"] or ()), *(found["mean_interval"] or ())]

@@ -36,10 +36,10 @@ class State(NamedTuple):
     taken: int = -1
     seen_armed: bool = False
     answering: bool = False
-    """Whether the middleware's thread is in the handler."""
+    """True while the middleware's thread is in the handler."""
     node: str = "arm"
     owns: bool = True
-    """Whether the protocol is the node's."""
+    """True if the protocol is the node's."""
     popped: int = -1
     handled: tuple[int, ...] = ()
     dropped: int = 0

@@ -65,7 +65,7 @@ NAMED = re.compile(r"`(?:tests/)?((?:\w+/)?test_\w+\.py)`|`([a-z_0-9]{12,})`")
 
 
 def has_test(name: str, part: str) -> bool:
-    """Whether a file of tests, wherever it is, has a test with this in its name."""
+    """True if a file of tests, wherever it is, has a test with this in its name."""
     return any(re.search(rf"def test_\w*{part}", file.read_text()) for file in TESTS.rglob(name))
 
 

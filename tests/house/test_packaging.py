@@ -34,7 +34,7 @@ def instructions(path: Path) -> list[tuple[str, str]]:
 
 
 def supported(image: str) -> bool:
-    """Whether an image is named without a host, and has a Python that the project runs with."""
+    """True if an image is named without a host, and has a Python that the project runs with."""
     name = re.fullmatch(r"python:(\d+)\.(\d+)-[a-z]+", image)
     least = re.fullmatch(r">=(\d+)\.(\d+)", PROJECT["requires-python"])
     assert least

@@ -47,7 +47,7 @@ def functions(tree: ast.AST) -> list[Function]:
 
 
 def checks(node: ast.AST) -> bool:
-    """Whether something in it compares or fails by itself."""
+    """True if something in it compares or fails by itself."""
     return any(
         isinstance(part, ast.Assert | ast.Raise)
         or (isinstance(part, ast.Call) and CHECKS.match(ast.unparse(part.func)))

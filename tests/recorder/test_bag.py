@@ -490,7 +490,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
 
 
 def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(tmp_path):
-    """Whether the file says how large it becomes, or not."""
+    """Both kinds of file: one that says how large it becomes, and one that does not."""
     content = zeros()
     told = [
         crafted(tmp_path / str(size), record_bytes(chunk(content, size))) for size in (2**31, 1000)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether a history kept what the loop promises; the smallest plan that does not.
+"""Checks that a history kept what the loop promises, and finds the smallest plan that does not.
 
 It knows nothing of the protocols: only the training in one process, and what an error may say.
 """

@@ -108,7 +108,7 @@ class History:
         self._costs: list[int] = []
         """Episodes of the first pair whose completed costs the tuner has heard."""
         self._answers_forged = False
-        """Whether what a controller sends now answers a forged state."""
+        """True if what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
         self._gone: dict[str, float] = {}
         self._rates = dict(zip(MAIN, plan.rates, strict=True))
@@ -136,7 +136,7 @@ class History:
 
     @property
     def unopposed(self) -> bool:
-        """Whether a forged message, or the answer to a forged state, came to a process that the
+        """True if a forged message, or the answer to a forged state, came to a process that the
         true one with its header never reached, or contradicted too late for the run.
 
         A cost in the middle of an episode plant and controller contradict together, once the tuner has
@@ -147,7 +147,7 @@ class History:
 
     @property
     def overlooked(self) -> bool:
-        """Whether the plant was handed what contradicts an episode, and nothing has followed.
+        """True if the plant was handed what contradicts an episode, and nothing has followed.
 
         The tuner is given the time in which the plant's void cost comes to it. It ends with an error,
         or starts an episode again of which it still waited for something.

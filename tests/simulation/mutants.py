@@ -147,7 +147,7 @@ def _function(names: Any, qualified: str) -> FunctionType | None:
 
 
 def tested(files: tuple[str, ...]) -> bool:
-    """Whether the tests in these files, below `tests/`, pass."""
+    """True if the tests in these files, below `tests/`, pass."""
     words = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly"]
     paths = [str(ROOT / "tests" / file) for file in files]
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

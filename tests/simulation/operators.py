@@ -69,14 +69,14 @@ def _in_body(body: list[ast.stmt]) -> Iterator[Change]:
 
 
 def _says(statement: ast.stmt) -> bool:
-    """Whether it only counts an event or sets a text."""
+    """True if it only counts an event or sets a text."""
     targets = getattr(statement, "targets", [getattr(statement, "target", None)])
     names = [getattr(n, "attr", getattr(n, "id", "")) for t in targets if t for n in ast.walk(t)]
     return isinstance(statement, ast.Assign | ast.AugAssign) and bool(set(names) & set(_SAYS))
 
 
 def _can_go(statement: ast.stmt) -> bool:
-    """Whether the module still compiles without it, and something is different."""
+    """True if the module still compiles without it, and something is different."""
     if isinstance(statement, ast.Expr):
         return "super" not in ast.unparse(statement) and not isinstance(
             statement.value,

@@ -94,7 +94,7 @@ class Plan:
 
     @property
     def harmless(self) -> bool:
-        """Whether nothing happens but that messages come which are for nobody there."""
+        """True if nothing happens but that messages come which are for nobody there."""
         return bool(self.faults) and all(
             fault.kind in ("stale", "another run") for fault in self.faults
         )

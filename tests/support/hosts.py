@@ -24,7 +24,7 @@ class HostsError(RuntimeError):
 
 
 def can_make_hosts() -> bool:
-    """Whether this process may make network namespaces."""
+    """True if this process may make network namespaces."""
     return (
         os.geteuid() == 0 and shutil.which("ip") is not None and Path("/proc/self/ns/net").exists()
     )

@@ -31,7 +31,7 @@ def python(*words: object, **environment: str) -> subprocess.CompletedProcess[st
 
 
 def helps_solver(process: int, thread: int) -> bool:
-    """Whether a thread is one of those that help a plant with its step."""
+    """True for a thread that helps a plant with its step."""
     with contextlib.suppress(OSError):
         return Path(f"/proc/{process}/task/{thread}/comm").read_text().strip() == SOLVER
     return False

@@ -54,5 +54,5 @@ def dispatcher_of(**settings: Any) -> Dispatcher:
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two float64 arrays agree in shape and in every bit."""
+    """True if two float64 arrays agree in shape and in every bit."""
     return a.shape == b.shape and a.tobytes() == b.tobytes()

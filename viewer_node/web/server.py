@@ -211,7 +211,7 @@ class Server:
         return "expected a component or a known namespace"
 
     def _knows_token(self, given: object) -> bool:
-        """Whether this is the token; that takes as long whatever it is."""
+        """True if this is the token; compared in constant time."""
         text = given if isinstance(given, str) else ""
         return hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
 
