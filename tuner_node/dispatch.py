@@ -19,7 +19,6 @@ part): an answer to an earlier tuner's episode is recognised.
     BUSY        its nodes are gone, a pair is free  FREE        the chunk is started again, there
 """
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -40,7 +39,8 @@ from tuner_node.batch import (
     less_often,
     most_environments,
 )
-from tuner_node.chunk import Chunk, gathered, messages_of
+from tuner_node.chunk import messages_of
+from tuner_node.chunk_queue import ChunkQueue
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.pair import Pair, PairPublication
 from tuner_node.targets import Targets
@@ -94,23 +94,16 @@ class Dispatcher:
         """True while an operator lets no new episode begin."""
         self.last_costs: Array | None = None
         """Mean stage costs of the last episode that was answered."""
-        self._batch: Batch | None = None
+        self._queue: ChunkQueue | None = None
         self._models: Frame | None = None
         self._models_digest = 0
         self._targets = Targets()
-        self._chunks: list[Chunk] = []
-        self._waiting: list[Chunk] = []
         self._issued = 0
 
     def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
         largest = most_environments(self.max_batch, self.state_size, self.horizon)
-        count, most = len(batch.rows) // batch.together, max(largest // batch.together, 1)
-        parts = max(-(-count // most), min(len(self._present()), count), 1)
-        edges = (batch.together * np.linspace(0, count, parts + 1).astype(int)).tolist()
-        self._batch = batch
-        self._chunks = [Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
-        self._waiting = list(self._chunks)
+        self._queue = ChunkQueue(batch, largest, len(self._present()))
         return self._begin_episodes(now)
 
     def models(self, models: Array, generation: int) -> list[PairPublication]:
@@ -239,9 +232,8 @@ class Dispatcher:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
-        if (
-            known.chunk.models is None
-        ):  # the same again says nothing of a plant that does not answer
+        # The same again says nothing of a plant that does not answer.
+        if known.chunk.models is None:
             known.last_heard = now
         known.take_answer(topics.MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
@@ -258,13 +250,7 @@ class Dispatcher:
                 raise DispatchError(f"no reduced model: {failure.reason}")
             self._retry(known, failure.reason)
             return self._begin_episodes(now)
-        # With `retry` the controller has only lost what it knew.
-        if not failure.retry and known.used(failure.episode):
-            raise ContradictionError(
-                f"the controller took back episode {episode_name(failure.episode)}, which this run "
-                f"has used, because {failure.reason}; stop who else publishes in this namespace and "
-                "start a new run"
-            )
+        known.check_failure(failure)
         return []
 
     def tick(self, now: float) -> list[PairPublication]:
@@ -274,7 +260,7 @@ class Dispatcher:
         """
         publications: list[PairPublication] = []
         for pair in self.pairs:
-            due = now - pair.last_sent > REQUEST_PERIOD * self._less_often(pair, now)
+            due = now - pair.last_sent > REQUEST_PERIOD * pair.less_often(self.state_size, now)
             if pair.chunk is None:
                 if self.paused and pair.last_start is not None and due:
                     pair.last_sent = now
@@ -303,13 +289,6 @@ class Dispatcher:
                     publications += self._request(pair, now, again=again)
         return publications + self._begin_episodes(now)
 
-    def _less_often(self, pair: Pair, now: float) -> int:
-        """A start is answered with a state, which may be large; a paused plant waits for starts."""
-        if pair.chunk is None or now < pair.paused_until:
-            return 1
-        rows = pair.chunk.rows
-        return less_often((rows.stop - rows.start) * self.state_size)
-
     def resend(self, now: float) -> list[PairPublication]:
         """Everything that is under way, once more."""
         busy = [pair for pair in self.pairs if pair.chunk]
@@ -317,11 +296,17 @@ class Dispatcher:
 
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
-        batch = self._batch
-        if batch is None or not all(chunk.done(batch) for chunk in self._chunks):
+        if self._queue is None:
             return None
-        self._batch = None
-        return gathered(self._chunks, batch, self.plant, self._targets.of(self.plant))
+        result = self._queue.result(self.plant, self._targets.of(self.plant))
+        if result is not None:
+            self._queue = None
+        return result
+
+    @property
+    def _batch(self) -> Batch | None:
+        """The batch that is served; None between two."""
+        return self._queue.batch if self._queue is not None else None
 
     def missing(self) -> list[str]:
         """The nodes that are missing on the network, in words."""
@@ -358,13 +343,11 @@ class Dispatcher:
             pair.take_trajectories()
 
     def _retry(self, pair: Pair, reason: str) -> None:
+        assert self._queue is not None
         chunk = pair.drop()
         self.notes.append(f"{reason}; starting it again with the same seeds")
         self.counters["episodes repeated"] += 1
-        chunk.attempts += 1
-        if chunk.attempts >= self.max_attempts:
-            raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
-        self._waiting.append(chunk)
+        self._queue.retry(chunk, reason, self.max_attempts)
 
     def _begin_episodes(self, now: float) -> list[PairPublication]:
         for samples in (used for pair in self.pairs for used in pair.used_samples()):
@@ -373,23 +356,23 @@ class Dispatcher:
                     f"{samples.contradiction}, one of which was used: stop who else publishes them "
                     "and start a new run"
                 )
-        publications: list[PairPublication] = []
-        if self.paused:
+        queue, publications = self._queue, list[PairPublication]()
+        if self.paused or queue is None:
             return publications
         others = any(now >= pair.paused_until for pair in self._present())
         for pair in self.pairs:
             if pair.chunk is not None or pair.missing or (others and now < pair.paused_until):
                 continue
-            if not self._waiting:
-                self._reclaim_from_absent()
-            if self._waiting:
+            if not queue.waiting:
+                self._reclaim_from_absent(queue)
+            if queue.waiting:
                 self._issued += 1
                 episode = self.incarnation * EPISODES_PER_START + self._issued
-                pair.begin(self._waiting.pop(0), self.run, episode, now)
+                pair.begin(queue.waiting.pop(0), self.run, episode, now)
                 publications += self._request(pair, now, again=False)
         return publications
 
-    def _reclaim_from_absent(self) -> None:
+    def _reclaim_from_absent(self, queue: ChunkQueue) -> None:
         """Take an absent pair's episode back, for a pair that is free to run it."""
         for pair in self.pairs:
             if pair.missing and pair.chunk is not None:
@@ -398,7 +381,7 @@ class Dispatcher:
                     f"{episode_name(pair.episode)}; another pair starts it again with the same seeds"
                 )
                 self.counters["episodes taken over"] += 1
-                self._waiting.append(pair.drop())
+                queue.waiting.append(pair.drop())
                 return
 
     def _request(self, pair: Pair, now: float, *, again: bool = True) -> list[PairPublication]:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
-from loop_interfaces.protocol import Publication
+from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, VOID, CostColumn
-from tuner_node.batch import Batch
+from tuner_node.batch import Batch, less_often
 from tuner_node.chunk import Chunk
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector
@@ -85,6 +85,15 @@ class Pair:
             del self.signed[oldest]
             self.answers = {key: known for key, known in self.answers.items() if key[1] > oldest}
 
+    def less_often(self, state_size: int, now: float) -> int:
+        """How many times less often it is asked again for an episode, whose answer may be large.
+
+        A paused plant waits for starts.
+        """
+        if self.chunk is None or now < self.paused_until:
+            return 1
+        return less_often(self.chunk.size * state_size)
+
     def take_answer(self, topic: str, answer: Frame) -> None:
         """An answer is used: another one for its episode contradicts it."""
         self.answers[topic, answer.episode] = digest(answer.values), answer.step
@@ -119,6 +128,16 @@ class Pair:
                 f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
                 "run has used, because different starts or actions came: stop the second tuner or "
                 "controller and start a new run"
+            )
+
+    def check_failure(self, failure: ModelFailure) -> None:
+        """Raise ContradictionError if an episode that was used is taken back."""
+        # With `retry` the controller has only lost what it knew.
+        if not failure.retry and self.used(failure.episode):
+            raise ContradictionError(
+                f"the controller took back episode {episode_name(failure.episode)}, which this run "
+                f"has used, because {failure.reason}; stop who else publishes in this namespace and "
+                "start a new run"
             )
 
     def check_signature(self, model: Frame, design: int) -> None:

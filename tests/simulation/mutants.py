@@ -49,6 +49,7 @@ _CONTROLLER = ("controller/test_responder.py", "controller/test_answered_steps.p
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")
 TESTS: dict[str, tuple[str, ...]] = {
     "tuner_node.dispatch": _TUNER,
+    "tuner_node.chunk_queue": _TUNER,
     "tuner_node.pair": ("tuner/test_trajectory_collector.py", *_TUNER),
     "tuner_node.session": _TUNER,
     "tuner_node.batch": ("tuner/test_batch.py", *_TUNER),
