@@ -6,6 +6,7 @@ The console scripts of the nodes are here; `python -m loop_interfaces.start NODE
 
 import importlib
 import os
+import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -16,6 +17,11 @@ from loop_interfaces.module_path import leave_out_working_directory
 
 STOPPED_BY_SIGNAL = 130
 """Exit code."""
+REFUSED = 1
+"""Exit code."""
+LEAST_ADDRESS_SPACE = 2 * 2**30
+"""Bytes (`ulimit -v`). A node maps 1.4 GB and uses a sixth of it. Where that cannot be had, OpenBLAS
+asks for it for ever, deaf to signals, and other libraries fail in words that do not name the cause."""
 PARENT = "PDELOOP_PARENT"
 """The environment variable with the id of the process that started a node, with which it ends."""
 _PR_SET_PDEATHSIG = 1
@@ -44,6 +50,15 @@ def begin(program: str) -> None:
     """
     leave_out_working_directory()
     _open_streams()
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
+        print(
+            f"{program}: the limit of this process's address space (ulimit -v) is {limit // 2**20} "
+            f"MiB; expected at least {LEAST_ADDRESS_SPACE // 2**20} MiB, most of which stays unused: "
+            "raise it, or limit resident memory instead, with a control group",
+            file=sys.stderr,
+        )
+        sys.exit(REFUSED)
 
     def end(name: str) -> None:
         try:
@@ -110,7 +125,7 @@ def run(node: str) -> int:
         if (needed := what_to_install(error)) is None:
             raise
         print(f"{node}: {needed}", file=sys.stderr)
-        return 1
+        return REFUSED
     code: int = module.main()
     sys.stdout.flush()
     sys.stderr.flush()

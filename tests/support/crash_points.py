@@ -1,14 +1,18 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Trainings that are killed, or refused by the disk, at each call that changes their folder.
+"""Trainings that are killed, or refused by the disk, at each call that concerns their folder.
 
-`python -m tests.support.crash_points FOLDER [KIND ...]` trains a small problem once undisturbed. Then,
-for each n until a training comes to its end, it lets the n-th call fail in each of these ways:
+`python -m tests.support.crash_points [KIND ...] [--every N]` trains a small problem once undisturbed.
+Then, for each n until a training comes to its end, or only for each N-th, it lets the n-th call fail in
+each of these ways:
 
 kill     SIGKILL before the call; the training that continues is killed once more. Not after fsync,
          which changes nothing that a killed process leaves
 torn     SIGKILL in fsync, when half of the file's content is on the disk
-EIO      fsync and rename are refused
+power    a power cut before the call: a real ext4 file system keeps only what was synced (needs root)
+EIO      write, fsync, close and rename are refused
 ENOSPC   open is refused
+again    a training that continues gets EIO at any call, of reading too, from locking to the end
+ESTALE   the same with ESTALE, as from a file server that was started again
 
 and the training is continued until it is done. It prints a line of JSON: how many failures of each way
 there were, and a sentence for each training that did not come to the same policy.
@@ -16,15 +20,16 @@ there were, and a sentence for each training that did not come to the same polic
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import errno
 import gc
-import io
-import itertools
 import json
 import os
 import shutil
 import signal
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -32,59 +37,46 @@ from typing import Any
 
 from pdeloop.cli import DONE, FAILED, main, parser
 from pdeloop.training_run import load_compiled, resolve
+from tests.support.failing_calls import CHANGING, EVERY, FailingCalls
+from tests.support.lossy_disk import LossyDisk
+from tests.support.mounts import mountable
 from tests.support.small import SMALL
 from tuner_node import run_store
 
-CHANGING = ("open", "fsync", "replace", "rename", "unlink", "mkdir")
 KINDS = {
     "kill": CHANGING,
     "torn": ("fsync",),
-    "EIO": ("fsync", "replace", "rename"),
+    "power": CHANGING,
+    "EIO": ("write", "fsync", "close", "replace", "rename"),
     "ENOSPC": ("open",),
+    "again": EVERY,
+    "ESTALE": EVERY,
 }
 """Ways to fail, and the calls that can fail so."""
+MEMORY_DISK = Path("/dev/shm")
+"""There fsync does not wait; what is on the disk at a crash is decided here."""
+CONTINUED = ("again", "ESTALE")
+"""The training that fails so continues one that was killed."""
+CODES = {"EIO": errno.EIO, "ENOSPC": errno.ENOSPC, "again": errno.EIO, "ESTALE": errno.ESTALE}
 
 
 BUDGET = ["--iterations", "1", "--optimizer", "two_point"]
 """What is computed in a training matters little here: what it writes does not depend on it."""
 
 
-class Disk:
-    """Counts this process's calls that change something in `folder`, and fails the n-th."""
+def failing(kind: str, disk: LossyDisk | None) -> Callable[[str, Any], None]:
+    """How a call fails in this way."""
 
-    def __init__(self, folder: Path, fail_at: int, kind: str) -> None:
-        self._folder, self._fail_at, self._kind = str(folder), fail_at, kind
-        self.calls: list[str] = []
-        for name in CHANGING:
-            setattr(os, name, self._counted(getattr(os, name), name))
-        io.open = self._counted(io.open, "open")  # of Path.open
-
-    def _counted(self, call: Callable[..., Any], name: str) -> Callable[..., Any]:
-        def counted(subject: Any, *rest: Any, **more: Any) -> Any:
-            if self._is_ours(subject, name, rest):
-                self.calls.append(name)
-                if len(self.calls) == self._fail_at:
-                    self._fail(name, subject)
-            return call(subject, *rest, **more)
-
-        return counted
-
-    def _is_ours(self, subject: Any, name: str, rest: tuple[Any, ...]) -> bool:
-        if isinstance(subject, int):
-            if name == "open":  # a file object on what is open
-                return False
-            subject = Path(f"/proc/self/fd/{subject}").readlink()
-        if name == "open" and (not rest or rest[0] in ("r", "rb", os.O_RDONLY)):
-            return False
-        return str(subject).startswith(self._folder)
-
-    def _fail(self, name: str, subject: Any) -> None:
-        if self._kind in ("EIO", "ENOSPC"):
-            number = getattr(errno, self._kind)
-            raise OSError(number, os.strerror(number), str(subject))
-        if self._kind == "torn" and Path(f"/proc/self/fd/{subject}").is_file():
+    def fail(name: str, subject: Any) -> None:
+        if kind in CODES:
+            raise OSError(CODES[kind], os.strerror(CODES[kind]), str(subject))
+        if kind == "torn" and Path(f"/proc/self/fd/{subject}").is_file():
             os.ftruncate(subject, os.fstat(subject).st_size // 2)
+        if disk:
+            disk.cut_power()
         os.kill(os.getpid(), signal.SIGKILL)
+
+    return fail
 
 
 def forked(log: Path, task: Callable[[], int]) -> int:
@@ -103,25 +95,27 @@ def forked(log: Path, task: Callable[[], int]) -> int:
         os._exit(code)
 
 
-def training(out: Path, fail_at: int = 0, kind: str = "kill") -> Callable[[], int]:
+def training(
+    out: Path, place: Path, fail_at: int, kind: str, disk: LossyDisk | None
+) -> Callable[[], int]:
     """A training in `out`, begun or continued."""
 
     def task() -> int:
         run_store.CHECKPOINT_PERIOD, run_store.CHECKPOINT_SHARE = 0.0, 1e9
         run_store.RunWriter.keep = seldom(run_store.RunWriter.keep)  # type: ignore[method-assign]
         begun = (out / "parameters.yaml").exists()
-        how = ["--resume", str(out)] if begun else [str(problem(out)), "--out", str(out)]
-        disk = Disk(out, fail_at, kind)
+        how = ["--resume", str(out)] if begun else [str(problem(place)), "--out", str(out)]
+        calls = FailingCalls(out, fail_at, failing(kind, disk))
         code = main(["train", *how, "--in-process", *([] if begun else BUDGET)])
-        (out.parent / "calls").write_text(" ".join(disk.calls))
+        (place / "calls").write_text(" ".join(calls.calls))
         return code
 
     return task
 
 
-def problem(out: Path) -> Path:
+def problem(place: Path) -> Path:
     """The small problem with episodes as short as its model allows: the files are the same."""
-    path = out.parent / "small.yaml"
+    path = place / "small.yaml"
     if not path.exists():
         path.write_text(SMALL.read_text().replace("horizon: 30", "horizon: 12"))
     return path
@@ -140,47 +134,98 @@ def seldom(keep: Callable[..., None]) -> Callable[..., None]:
     return kept
 
 
-def judged(out: Path, n: int, kind: str, policy: bytes) -> str | None:
-    """What is wrong after a failure at the n-th call; None if nothing is."""
-    log = out.parent / "log"
-    log.unlink(missing_ok=True)
-    codes = [forked(log, training(out, n, kind))]
-    while not (out / "result.json").exists() and len(codes) < 4:
-        again = n % 7 + 1 if kind == "kill" and len(codes) == 1 else 0
-        codes.append(forked(log, training(out, again)))
-    where = f"{kind} at call {n}, exit codes {codes}"
-    text = log.read_text()
-    if "Traceback" in text:
-        return f"{where}: a traceback: {text}"
-    if not set(codes) <= {DONE, FAILED, -signal.SIGKILL} or not (out / "result.json").exists():
-        return f"{where}: {text}"
-    if (out / "policy.npz").read_bytes() != policy:
-        return f"{where}: another policy"
-    return None
+class Judge:
+    """Lets trainings in `place` fail, and says what is wrong afterwards."""
 
-
-def run(folder: Path, kinds: tuple[str, ...]) -> dict[str, Any]:
-    """Every failure, one after the other."""
-    parser()  # imports what each training needs
-    out = folder / "run"
-    load_compiled(resolve(str(problem(out)), {}))
-    gc.freeze()  # what a fork touches is copied
-    assert forked(folder / "log", training(out)) == 0, (folder / "log").read_text()
-    policy = (out / "policy.npz").read_bytes()
-    calls = (folder / "calls").read_text().split()
-    failures = [
-        (n, kind)
-        for kind in kinds
-        for n, (before, call) in enumerate(itertools.pairwise(["", *calls]), 1)
-        if call in KINDS[kind] and (kind, before) != ("kill", "fsync")
-    ]
-    wrong = []
-    for n, kind in failures:
+    def __init__(self, place: Path, disk: LossyDisk | None) -> None:
+        """disk: what runs are written to that lose their power."""
+        self._place, self._disk = place, disk
+        self._log = place / "log"
+        out = place / "run"
+        assert self._forked(out) == DONE, self._log.read_text()
+        self._policy = (out / "policy.npz").read_bytes()
+        self.calls = self._calls()
+        # A training that was killed between its checkpoints, and what is called when it continues.
+        self._killed = place / "killed"
         shutil.rmtree(out)
-        if sentence := judged(out, n, kind, policy):
-            wrong.append(sentence)
+        killed_at = self.calls.index("fsync", len(self.calls) // 2)
+        assert self._forked(out, killed_at, "kill") == -signal.SIGKILL
+        shutil.copytree(out, self._killed)
+        assert self._forked(out) == DONE, self._log.read_text()
+        self.calls_continued = self._calls()
+
+    def failures(self, kind: str) -> list[int]:
+        """The numbers of the calls that can fail so."""
+        called = self.calls_continued if kind in CONTINUED else self.calls
+        found, before = [], ""
+        for n, name in enumerate(called, 1):
+            if name in KINDS[kind] and (kind not in ("kill", "power") or before != "fsync"):
+                found.append(n)
+            before = name if name in CHANGING else before
+        return found
+
+    def judged(self, n: int, kind: str) -> str | None:
+        """What is wrong after a failure at the n-th call; None if nothing is."""
+        disk = self._disk if kind == "power" else None
+        out = (disk.folder if disk else self._place) / "run"
+        shutil.rmtree(out, ignore_errors=True)
+        if kind in CONTINUED:
+            shutil.copytree(self._killed, out)
+        self._log.unlink(missing_ok=True)
+        codes = [self._forked(out, n, kind, disk)]
+        while not (out / "result.json").exists() and len(codes) < 4:
+            again = n % 7 + 1 if kind in ("kill", "power") and len(codes) == 1 else 0
+            codes.append(self._forked(out, again, kind, disk))
+        where = f"{kind} at call {n}, exit codes {codes}"
+        text = self._log.read_text()
+        if "Traceback" in text:
+            return f"{where}: a traceback: {text}"
+        if not set(codes) <= {DONE, FAILED, -signal.SIGKILL} or not (out / "result.json").exists():
+            return f"{where}: {text}"
+        if (out / "policy.npz").read_bytes() != self._policy:
+            return f"{where}: another policy"
+        return None
+
+    def _forked(
+        self, out: Path, n: int = 0, kind: str = "kill", disk: LossyDisk | None = None
+    ) -> int:
+        code = forked(self._log, training(out, self._place, n, kind, disk))
+        if disk and code == -signal.SIGKILL:
+            disk.restart()
+        return code
+
+    def _calls(self) -> list[str]:
+        return (self._place / "calls").read_text().split()
+
+
+def run(place: Path, kinds: tuple[str, ...], every: int = 1) -> dict[str, Any]:
+    """The failures, one after the other."""
+    parser()  # imports what each training needs
+    load_compiled(resolve(str(problem(place)), {}))
+    gc.freeze()  # what a fork touches is copied
+    with contextlib.ExitStack() as stack:
+        disk = LossyDisk(place / "disk") if "power" in kinds else None
+        if disk:
+            stack.callback(disk.close)
+        judge = Judge(place, disk)
+        failures = [(n, kind) for kind in kinds for n in judge.failures(kind)[::every]]
+        wrong = [sentence for n, kind in failures if (sentence := judge.judged(n, kind))]
     return {"failures": Counter(kind for _, kind in failures), "wrong": wrong}
 
 
+def command() -> int:
+    """1 if a training did not come to the same policy."""
+    possible = [kind for kind in KINDS if kind != "power" or mountable("mkfs.ext4")]
+    words = argparse.ArgumentParser(prog="python -m tests.support.crash_points")
+    words.add_argument("kinds", nargs="*", default=possible, metavar="KIND", help=", ".join(KINDS))
+    words.add_argument("--every", type=int, default=1, metavar="N", help="only each N-th call")
+    given = words.parse_args()
+    where = MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=where) as place:
+        result = run(Path(place), tuple(given.kinds), given.every)
+    print(json.dumps(result))
+    return int(bool(result["wrong"]))
+
+
 if __name__ == "__main__":
-    print(json.dumps(run(Path(sys.argv[1]), tuple(sys.argv[2:]) or KINDS)))
+    sys.exit(command())

@@ -11,6 +11,7 @@ import json
 import os
 import pty
 import re
+import resource
 import select
 import shlex
 import shutil
@@ -326,6 +327,20 @@ def test_a_node_names_what_is_not_installed(node: str, module: str, extra: str) 
     code = f"import sys; sys.modules[{module!r}] = None; from loop_interfaces.start import run; "
     done = python("-c", f"{code} assert run({node!r}) == 1")
     assert re.fullmatch(rf"{node}: needs {module}: .*'pdeloop\[{extra}\]'\n", done.stderr)
+
+
+@pytest.mark.parametrize("words", [PDELOOP, [sys.executable, "-m", START, "tuner_node"]])
+def test_too_little_address_space_is_one_sentence_before_a_library_waits_for_more(words) -> None:
+    ended = subprocess.run(
+        words,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (400 * 2**20, 400 * 2**20)),
+    )
+    assert ended.returncode == cli.FAILED and ended.stdout == ""
+    assert re.fullmatch(r".*: the limit .*\(ulimit -v\) is 400 MiB; expected .*\n", ended.stderr)
 
 
 def test_too_little_memory_is_one_sentence(monkeypatch, capsys) -> None:
