@@ -32,6 +32,7 @@ PROGRAMS = {
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
     "field_models": "which model of the whole field is believed, and how well it predicts",
+    "choices": "how often the law that a training returns is the wrong one",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
     "scale": "what messages, bags, fits, memory and files cost as the state grows",
     "published": "tasks that others have published figures for, side by side",
