@@ -24,6 +24,8 @@ from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.start import die_with
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
@@ -31,7 +33,8 @@ from tests.support import forked_nodes
 
 ROOT = Path(__file__).resolve().parents[2]
 FORKING = multiprocessing.get_context("forkserver")
-FORKING.set_forkserver_preload(["tests.support.preloaded"])
+PRELOADED = "tests.support.preloaded"
+FORKING.set_forkserver_preload([PRELOADED])
 
 
 def until(condition: Callable[[], object], limit: float, what: str) -> None:
@@ -66,9 +69,7 @@ class Forked:
     ) -> None:
         self.name, self.args, self.log = name, [name, *arguments], log
         log.touch()
-        given = (name, list(arguments), log, dict(environment))
-        self._process = FORKING.Process(target=run_main, args=given)
-        self._process.start()
+        self._process = forked(run_main, name, list(arguments), log, dict(environment))
         assert self._process.pid is not None
         self.pid = self._process.pid
 
@@ -90,6 +91,19 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
+def forked(target: Callable[..., None], *given: Any) -> Any:
+    """A started process that was forked from the one that has everything loaded.
+
+    That one looks for it where PYTHONPATH says. Under PYTHONSAFEPATH it knows no other place, and
+    multiprocessing keeps silent about what it cannot load.
+    """
+    process = FORKING.Process(target=target, args=given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+        process.start()
+    return process
+
+
 def become(log: Path, environment: Mapping[str, str]) -> None:
     """Make a forked process one of a test's own: its session, output, environment and folder.
 
@@ -102,6 +116,7 @@ def become(log: Path, environment: Mapping[str, str]) -> None:
     with log.open("wb") as output, Path(os.devnull).open("rb") as nothing:
         for file, number in ((nothing, 0), (output, 1), (output, 2)):
             os.dup2(file.fileno(), number)
+    assert PRELOADED in sys.modules, "forked from a process that could not load anything"
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(log.parent)

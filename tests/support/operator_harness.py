@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from tests.support import operator_program
-from tests.support.loop_harness import FORKING, Processes, until
+from tests.support.loop_harness import FORKING, Processes, forked, until
 
 LIMIT = 180.0
 SERVICES = [
@@ -22,9 +22,8 @@ class Operator:
 
     def __init__(self, loop: Processes) -> None:
         self._pipe, other = FORKING.Pipe()
-        given = (other, loop.folder / "operator.log", loop.environment)
-        self._process = FORKING.Process(target=operator_program.serve, args=given)
-        self._process.start()
+        log = loop.folder / "operator.log"
+        self._process = forked(operator_program.serve, other, log, loop.environment)
         other.close()
         self.ask(know=SERVICES)
 

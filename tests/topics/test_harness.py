@@ -20,6 +20,7 @@ TESTS = """
 import os, sys, time
 from pathlib import Path
 del os.environ["ROS_DOMAIN_ID"]  # it takes one of its own
+del os.environ["PYTHONPATH"]  # pytest finds the tests without it
 from tests.support.loop_harness import processes, until
 from tests.support.operator_harness import operator
 from tests.support.small import SMALL
@@ -39,6 +40,7 @@ def test_all_that_the_tests_started_dies_with_the_process_that_runs_them(
     loop: Processes, tmp_path: Path
 ) -> None:
     (tmp_path / "inner").mkdir()
+    loop.environment["PYTHONSAFEPATH"] = "1"  # as for `make test`
     worker = loop.program(sys.executable, "-c", TESTS, str(tmp_path / "inner"))
     until(lambda: loop.output(worker).endswith("\n"), LIMIT, "processes")
     started = [int(word) for word in loop.output(worker).split()]
