@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ with processes(folder) as loop, operator(loop) as desk:
     words = "train", str(SMALL), "--iterations", "100000", "--out", str(folder / "run")
     loop.pdeloop(*words)
     until((folder / "run" / "progress.jsonl").exists, 240, "training")
-    print(*loop.left_behind(), desk._process.pid, flush=True)
+    print("started", *loop.left_behind(), desk._process.pid, flush=True)
     time.sleep(600)
 """
 """What a worker of pytest does: a program, a command and its nodes, an operator."""
@@ -42,8 +43,9 @@ def test_all_that_the_tests_started_dies_with_the_process_that_runs_them(
     (tmp_path / "inner").mkdir()
     loop.environment["PYTHONSAFEPATH"] = "1"  # as for `make test`
     worker = loop.program(sys.executable, "-c", TESTS, str(tmp_path / "inner"))
-    until(lambda: loop.output(worker).endswith("\n"), LIMIT, "processes")
-    started = [int(word) for word in loop.output(worker).split()]
+    line = re.compile(r"^started (.*)\n", re.MULTILINE)  # behind what is said of compiling
+    until(lambda: line.search(loop.output(worker)), LIMIT, "processes")
+    started = [int(word) for word in line.findall(loop.output(worker))[0].split()]
     assert len(started) >= 6 and all(map(began, started))
     os.kill(worker.pid, signal.SIGKILL)
     worker.wait()
