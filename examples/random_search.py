@@ -6,18 +6,19 @@ pdeloop train burgers --optimizer random_search.py:RandomSearch --set optimizer_
 
 from dataclasses import dataclass
 
-from loop_method.adapt import Rollout, StepOptimizer
-from loop_method.settings import Settings, setting
+import pdeloop
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomSearchSettings(Settings):
+class RandomSearchSettings(pdeloop.Settings):
     """The constants of the search."""
 
-    size: float = setting(0.05, "size of a change, relative to that of the gains", 1e-6, 10.0)
+    size: float = pdeloop.setting(
+        0.05, "size of a change, relative to that of the gains", 1e-6, 10.0
+    )
 
 
-class RandomSearch(StepOptimizer):
+class RandomSearch(pdeloop.StepOptimizer):
     """Compares the policy with a random neighbour of it on one field, and takes the better one."""
 
     name = "random_search"
@@ -29,7 +30,9 @@ class RandomSearch(StepOptimizer):
         return self.policy + size * self.generator.standard_normal(self.policy.shape)
 
     def rollouts(self):
-        return [Rollout(policy, self.field_seed) for policy in (self.policy, self.neighbour())]
+        return [
+            pdeloop.Rollout(policy, self.field_seed) for policy in (self.policy, self.neighbour())
+        ]
 
     def update(self, results):
         before, after = results

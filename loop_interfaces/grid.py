@@ -84,7 +84,8 @@ class Grid:
     Attributes
     ----------
     axes : tuple of Axis
-        The slowest first, as in the array of `fields`; none: the state is a plain vector.
+        The slowest first, as in the array of `fields`; none: the state is a plain vector. One axis may
+        be given by itself, as may one component.
     components : tuple of str
         Names of the fields, or the one name of a plain vector's numbers.
     unit : str
@@ -95,7 +96,7 @@ class Grid:
     Raises
     ------
     ValueError
-        There are neither axes nor numbers, or both, or no components.
+        There are neither axes nor numbers, or both, or no components; or an axis is of another class.
 
     Examples
     --------
@@ -111,6 +112,12 @@ class Grid:
     numbers: int = 0
 
     def __post_init__(self) -> None:
+        axes = (self.axes,) if isinstance(self.axes, Axis) else tuple(self.axes)
+        named = (self.components,) if isinstance(self.components, str) else tuple(self.components)
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "components", named)
+        if other := [axis for axis in axes if not isinstance(axis, Axis)]:
+            raise ValueError(f"the axes of a grid must be of the class Axis, got {other[0]!r}")
         object.__setattr__(self, "numbers", int(self.numbers))  # NumPy's cannot be written as JSON
         if not self.components:
             raise ValueError("a grid has one component or more, got none")

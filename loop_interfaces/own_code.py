@@ -27,6 +27,8 @@ from typing import Any
 from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.text import shown
 
+_handed_over: dict[tuple[str, str], type] = {}
+"""Classes of this program, by the kind of code and the names that stand for them."""
 _executing: list[Path] = []
 """The files that are being executed, the innermost last."""
 
@@ -66,6 +68,26 @@ class OwnCode:
         os.environ[self.variable] = f"{before},{whole}" if before else whole
         return whole
 
+    def take(self, code: object) -> str:
+        """The name of code that a program gives, by name or as a class, which is thereby allowed.
+
+        Raises
+        ------
+        ValueError
+            It is neither.
+        """
+        if isinstance(code, str):
+            return self.allow(code)
+        if not isinstance(code, type):
+            raise ValueError(
+                f"{self.word} is {shown(code)}; expected a class, or a name like 'file.py:Class'"
+            )
+        name = next((own for own, kind in self.shipped.items() if kind is code), None)
+        if name is None:
+            name = self.allow(name_of(code))
+            _handed_over[self.word, name] = code
+        return name
+
     def configured(self, name: str, environment: Mapping[str, str] = os.environ) -> Any:
         """Load what a problem's parameters name, if it may be run.
 
@@ -98,6 +120,8 @@ class OwnCode:
         """
         if name in self.shipped:
             return self.shipped[name]
+        if (self.word, name) in _handed_over:
+            return _handed_over[self.word, name]
         source, separator, name_in_it = name.rpartition(":")
         if not separator:
             return self._load_entry_point(name)

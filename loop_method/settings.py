@@ -22,7 +22,25 @@ def setting(
     unit: str = "",
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """Declare one constant of a `Settings`: a dataclass field with its range, ends included."""
+    """Declare one constant of a `Settings`.
+
+    Parameters
+    ----------
+    default
+        Its value where none is given; its type is that of the constant.
+    description
+        What it means, for tables and errors.
+    minimum, maximum
+        Its range, ends included; None: unbounded.
+    unit
+        Of its value.
+    choices
+        The values that text may have.
+
+    Returns
+    -------
+    dataclasses.Field
+    """
     limits = {"minimum": minimum, "maximum": maximum, "unit": unit, "choices": choices}
     return field(default=default, metadata={**limits, "description": description})
 

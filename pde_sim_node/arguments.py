@@ -2,6 +2,7 @@
 """Checks of the plant's arguments: the value, or a ValueError that says what is right."""
 
 import math
+import numbers
 import operator
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -44,9 +45,10 @@ def whole(name: str, value: int, minimum: int) -> int:
 
 def positive(name: str, value: float) -> float:
     """A positive, finite number; ValueError otherwise."""
-    if not 0 < value < math.inf:
+    number = value if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
+    if not 0 < number < math.inf:
         raise ValueError(f"{name} must be positive and finite, got {value!r}")
-    return float(value)
+    return float(number)
 
 
 Coefficient: TypeAlias = float | Sequence[float] | Callable[[Array], Array]

@@ -21,6 +21,10 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from loop_interfaces.grid import Axis as Axis
     from loop_interfaces.grid import Grid as Grid
+    from loop_method.adapt.base import Optimizer as Optimizer
+    from loop_method.adapt.base import Rollout as Rollout
+    from loop_method.adapt.base import RolloutResult as RolloutResult
+    from loop_method.adapt.step_optimizer import StepOptimizer as StepOptimizer
     from loop_method.design.lqt import track as track
     from loop_method.design.tracking import track_horizon as track_horizon
     from loop_method.laws.base import Law as Law
@@ -28,6 +32,8 @@ if TYPE_CHECKING:
     from loop_method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
     from loop_method.reduce.order import study_orders as study_orders
     from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
+    from loop_method.settings import Settings as Settings
+    from loop_method.settings import setting as setting
     from pde_sim_node.dynamics import Dynamics as Dynamics
     from pde_sim_node.plant import Plant as Plant
     from pde_sim_node.plants.gymnasium_plant import from_gymnasium as from_gymnasium
@@ -50,11 +56,13 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "loop_method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
+    "loop_method.adapt": ("Optimizer", "Rollout", "RolloutResult", "StepOptimizer"),
     "loop_method.design.lqt": ("track",),
     "loop_method.design.tracking": ("track_horizon",),
     "loop_method.laws.base": ("Law",),
     "loop_method.reduce.order": ("study_orders",),
     "loop_method.reduce.reduced_model": ("ReducedModel",),
+    "loop_method.settings": ("Settings", "setting"),
     "loop_interfaces.grid": ("Axis", "Grid"),
     "pde_sim_node.dynamics": ("Dynamics",),
     "pde_sim_node.plant": ("Plant",),

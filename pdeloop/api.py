@@ -27,7 +27,6 @@ from loop_interfaces.spec import FREE, flatten
 from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.laws.base import Law
 from loop_method.laws.registry import OWN_LAWS
-from loop_method.laws.registry import hand_over as hand_over_law
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant, complete
@@ -151,8 +150,8 @@ def problem(
         like {"output": C, "target": y_r}.
     parameters
         Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
-        one's own ('file.py:Class') is run if it is named here as `equation`, `optimizer` or `law`,
-        which may also be a class derived from `Law`.
+        one's own ('file.py:Class', or the class itself) is run if it is given here as `equation`,
+        `optimizer` or `law`.
 
     Returns
     -------
@@ -227,11 +226,9 @@ def named(
     physical = given.pop("physical", None) or {}
     if not isinstance(physical, Mapping):
         raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
-    if isinstance(law := given.get("law"), type):
-        given["law"] = hand_over_law(law)
     for code in (OWN_EQUATIONS, OWN_OPTIMIZERS, OWN_LAWS):
         if code.word in given:
-            given[code.word] = code.allow(given[code.word])
+            given[code.word] = code.take(given[code.word])
     if (plant := given.pop("plant", None)) is not None:
         given |= _plant_named(plant)
     cost = given.pop("cost", None)

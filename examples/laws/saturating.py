@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 import pdeloop
-from loop_method.settings import Settings, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class SaturatingSettings(Settings):
+class SaturatingSettings(pdeloop.Settings):
     """The constants of the law."""
 
-    limit: float = setting(0.5, "magnitude that no action exceeds", 1e-6, 1e6)
+    limit: float = pdeloop.setting(0.5, "magnitude that no action exceeds", 1e-6, 1e6)
 
 
 class Saturating(pdeloop.Law):

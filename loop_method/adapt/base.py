@@ -48,7 +48,15 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """An episode that an optimiser wants: this policy, theta, from the field of this seed."""
+    """An episode that an optimiser wants.
+
+    Attributes
+    ----------
+    policy : (size,) or (n_a, 2 n_s)
+        The law's parameters theta, of the shape that the optimiser was given.
+    field_seed : int
+        Seed of the initial field.
+    """
 
     policy: Array
     field_seed: int
@@ -56,9 +64,16 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class RolloutResult:
-    """The outcome of a rollout: its mean stage cost, of no meaning if it diverged.
+    """The outcome of a rollout.
 
-    trajectory: required by optimisers that learn from trajectories.
+    Attributes
+    ----------
+    cost : float
+        Its mean stage cost; of no meaning if it diverged.
+    diverged : bool
+        True if the plant's state left its bound.
+    trajectory : Trajectory or None
+        Its states and actions, for optimisers that learn from trajectories.
     """
 
     cost: float
@@ -262,16 +277,55 @@ class Optimizer(Protocol):
         """True once there is nothing more to ask."""
 
     def ask(self) -> list[Rollout]:
-        """The rollouts needed next; the same ones on every call until `tell`, none when done."""
+        """The rollouts needed next.
+
+        Returns
+        -------
+        list of Rollout
+            The same ones on every call until `tell`; none when done.
+        """
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
-        """Take the results of all rollouts of `ask`, in its order; returns a row of the history."""
+        """Take the results of the rollouts that were asked for.
+
+        Parameters
+        ----------
+        results
+            One for each rollout of `ask`, in its order.
+
+        Returns
+        -------
+        dict
+            A row of the history.
+
+        Raises
+        ------
+        ValueError
+            There are more or fewer of them.
+        """
 
     def state(self) -> State:
-        """Everything a checkpoint needs: arrays without objects, as `numpy.savez` stores them."""
+        """Everything a checkpoint needs.
+
+        Returns
+        -------
+        dict of str to array
+            Arrays without objects, as `numpy.savez` stores them.
+        """
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Go on from a `state` of an optimiser that was constructed with the same arguments."""
+        """Continue from the state of an optimiser that was made with the same arguments.
+
+        Parameters
+        ----------
+        state : dict of str to array, (...)
+            As `state` returned it.
+
+        Raises
+        ------
+        ValueError
+            An array is missing, or has another shape or type.
+        """
 
 
 def checked_theta(theta: ArrayLike) -> Array:

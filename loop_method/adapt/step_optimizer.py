@@ -33,7 +33,12 @@ class StepOptimizer(Optimizer):
     """An optimiser all of whose steps want as many rollouts, and improve the policy by their outcome.
 
     A class derived from it has a `name`, and defines `rollouts` and `update`. The budget, the counts,
-    the history and checkpoints are here. Arguments: see `Optimizer`.
+    the history and checkpoints are here.
+
+    Parameters
+    ----------
+    policy0, seed, rollouts, settings, context
+        As of `Optimizer`.
 
     Attributes
     ----------
@@ -66,13 +71,28 @@ class StepOptimizer(Optimizer):
 
     @abstractmethod
     def rollouts(self) -> list[Rollout]:
-        """The rollouts of this step: a function of the policy, `generator`, `field_seed` and `kept`."""
+        """The rollouts of this step.
+
+        Returns
+        -------
+        list of Rollout
+            `step_rollouts` of them, which depend on nothing but `policy`, `generator`, `field_seed` and
+            what is `kept`.
+        """
 
     @abstractmethod
     def update(self, results: Sequence[RolloutResult]) -> Row:
-        """Improve `policy` by the results of `rollouts`, in their order; what the history says of it.
+        """Improve `policy` by the outcome of this step.
 
-        A rollout that is not `usable` diverged: its cost means nothing.
+        Parameters
+        ----------
+        results
+            Those of `rollouts`, in their order. One that is not `usable` diverged.
+
+        Returns
+        -------
+        dict
+            What the history says of this step: JSON numbers, booleans and strings by name.
         """
 
     @classmethod
@@ -106,9 +126,32 @@ class StepOptimizer(Optimizer):
         return (self._tells + 1) * self.step_rollouts > self._budget
 
     def ask(self) -> list[Rollout]:
+        """The rollouts of this step, as of `Optimizer.ask`.
+
+        Returns
+        -------
+        list of Rollout
+        """
         return [] if self.done else self.rollouts()
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the results of this step, as of `Optimizer.tell`.
+
+        Parameters
+        ----------
+        results
+            One for each rollout, in their order.
+
+        Returns
+        -------
+        dict
+            The row of `update`, with the numbers of rollouts and of divergences.
+
+        Raises
+        ------
+        ValueError
+            There are more or fewer results, or `update` returned no dict.
+        """
         require_results(results, 0 if self.done else self.step_rollouts)
         row: Row = {
             "rollouts": (self._tells + 1) * self.step_rollouts,
@@ -123,10 +166,28 @@ class StepOptimizer(Optimizer):
         return row
 
     def state(self) -> State:
+        """What a checkpoint needs: the policy, the number of steps, and what is `kept`.
+
+        Returns
+        -------
+        dict of str to array
+        """
         own = {name: np.array(getattr(self, name)) for name in self.kept}
         return {"policy": self.policy, "tells": np.array(self._tells), **own}
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a state, as of `Optimizer.restore`.
+
+        Parameters
+        ----------
+        state : dict of str to array, (...)
+            As `state` returned it.
+
+        Raises
+        ------
+        ValueError
+            An array is missing, or has another shape or type.
+        """
         policy = taken_theta(state, self._policy)
         tells = int(checked_array(state, "tells", "i", ()))
         own = {

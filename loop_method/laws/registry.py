@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any
 
-from loop_interfaces.own_code import OwnCode, name_of
+from loop_interfaces.own_code import OwnCode
 from loop_interfaces.spec import LAW_SETTINGS
 from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law
@@ -24,9 +24,6 @@ OWN_LAWS = OwnCode(
     "PDELOOP_LAWS",
     MappingProxyType({kind.name: kind for kind in (Affine, FeedForward, Observer)}),
 )
-
-_handed_over: dict[str, type[Law]] = {}
-"""Classes of this program, by the names that stand for them."""
 
 
 def offered() -> list[str]:
@@ -48,22 +45,12 @@ def law_kind(name: str, values: Mapping[str, Any] = MappingProxyType({})) -> typ
         A setting that it does not have, or out of its range.
     """
     OWN_LAWS.require(name)
-    kind = _handed_over.get(name) or complete(name, OWN_LAWS.load(name))
+    kind = complete(name, OWN_LAWS.load(name))
     chosen = settings_from(LAW_SETTINGS, kind.Settings, values, f"law '{name}'")
     if chosen == kind.settings:
         return kind
     own = {"settings": chosen, "name": kind.name, "__module__": kind.__module__}
     return type(kind.__name__, (kind,), own)
-
-
-def hand_over(kind: type[Law]) -> str:
-    """The name of a class of this program, whose code is allowed here and in processes it starts."""
-    complete(getattr(kind, "__name__", repr(kind)), kind)
-    if OWN_LAWS.shipped.get(kind.name) is kind:
-        return str(kind.name)
-    name = OWN_LAWS.allow(name_of(kind))
-    _handed_over[name] = kind
-    return name
 
 
 def complete(name: str, found: object) -> type[Law]:

@@ -50,7 +50,14 @@ def test_places_that_do_not_fit_are_refused(count: int, words: str) -> None:
         Grid((Axis("y", 1.0, 4), Axis("x", 1.0, 4))).equally_spaced(count)
 
 
+def test_one_axis_or_component_may_be_given_by_itself() -> None:
+    axis = Axis("x", 2.0, 5)
+    assert Grid(axis, "height") == Grid((axis,), ("height",)) == Grid([axis], ["height"])  # type: ignore[arg-type]
+
+
 def test_what_is_no_grid_is_refused() -> None:
+    with pytest.raises(ValueError, match="the axes of a grid must be of the class Axis, got 3"):
+        Grid((3,))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="1 or more points"):
         Axis("x", 1.0, 0)
     with pytest.raises(ValueError, match="give one of both"):

@@ -15,7 +15,7 @@ from loop_interfaces.own_code import OwnCodeError
 from loop_method.laws import Affine, FeedForward, Law, Observer
 from loop_method.laws.base import differentiable
 from loop_method.laws.calls import MAX_NUMBER, action, along, laws_of, updated
-from loop_method.laws.registry import OWN_LAWS, hand_over, law_kind, offered
+from loop_method.laws.registry import OWN_LAWS, law_kind, offered
 
 N_Z, N_S, N_A, T = 7, 3, 2, 5
 SHIPPED = list(OWN_LAWS.shipped.values())
@@ -190,12 +190,12 @@ def test_the_registry_knows_ours_and_refuses_what_is_no_law(monkeypatch, tmp_pat
     monkeypatch.setenv(OWN_LAWS.variable, "")
     assert offered()[:3] == [kind.name for kind in SHIPPED]
     assert [law_kind(kind.name) for kind in SHIPPED] == SHIPPED
-    assert hand_over(Affine) == "affine"
+    assert OWN_LAWS.take(Affine) == "affine"
     with pytest.raises(ValueError, match="unknown law 'afine': give one of affine, feedforward"):
         law_kind("afine")
     with pytest.raises(ValueError, match=r"is code, .* name it yourself: --law .*PDELOOP_LAWS="):
         law_kind(f"{__file__}:Own")
-    assert law_kind(hand_over(Own)) is Own
+    assert law_kind(OWN_LAWS.take(Own)) is Own
     (tmp_path / "own.py").write_text("import pdeloop\nclass Half(pdeloop.Law): pass\nNo = dict\n")
     for name, words in (("No", "must be a class derived from"), ("Half", "define action, start")):
         with pytest.raises(ValueError, match=words):

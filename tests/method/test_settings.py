@@ -22,7 +22,7 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.belief import believe
 from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.design.lqg import noise_of
-from loop_method.laws.registry import OWN_LAWS, hand_over, law_kind
+from loop_method.laws.registry import OWN_LAWS, law_kind
 from loop_method.models import FieldModelSettings, Measured, fit_field_model
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.settings import IdentificationSettings
@@ -54,7 +54,7 @@ class Limited(pdeloop.Law):
 
 def test_the_settings_of_a_law_are_given_to_its_class(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(OWN_LAWS.variable, "")
-    name = hand_over(Limited)
+    name = OWN_LAWS.take(Limited)
     assert law_kind(name) is Limited and Limited.settings == LimitSettings()
     other = law_kind(name, {"law_settings.limit": 0.25, "law": name})
     assert other.settings == LimitSettings(limit=0.25) and other.name == Limited.name
@@ -69,7 +69,7 @@ def test_the_settings_of_a_law_are_given_to_its_class(monkeypatch: pytest.Monkey
 
 def test_a_run_records_all_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(OWN_LAWS.variable, "")
-    given = {"law": hand_over(Limited), "optimizer": "two_point"}
+    given = {"law": OWN_LAWS.take(Limited), "optimizer": "two_point"}
     values = training_parameters(
         str(SMALL), {**given, "identification_settings": {"order_folds": 2}}
     )

@@ -45,6 +45,30 @@ def test_it_trains_in_python_and_by_the_command_to_the_same_bits(tmp_path, monke
     assert RunFolder(out).values()["optimizer"] == OWN
 
 
+@pytest.mark.parametrize("over_topics", [False, pytest.param(True, marks=pytest.mark.topics)])
+def test_its_class_may_be_given_in_place_of_its_name(tmp_path: Path, over_topics: bool) -> None:
+    kind = OWN_OPTIMIZERS.load(OWN)
+    run = pdeloop.train(
+        str(SMALL), optimizer=kind, over_topics=over_topics, out=tmp_path / "run", **BUDGET
+    )
+    assert same_bits(run.policies, pdeloop.train(str(SMALL), optimizer=OWN, **BUDGET).policies)
+    assert RunFolder(tmp_path / "run").values()["optimizer"] == OWN
+
+
+def test_what_is_neither_a_class_nor_a_name_is_refused() -> None:
+    for word in ("optimizer", "law", "equation"):
+        with pytest.raises(ValueError, match=f"{word} is 3; expected a class, or a name like"):
+            pdeloop.train(str(SMALL), **{word: 3})
+    with pytest.raises(ValueError, match="HalfDone does not define"):
+        pdeloop.train(str(SMALL), optimizer=HalfDone)
+
+
+class HalfDone(pdeloop.StepOptimizer):
+    """Without the two methods that it needs."""
+
+    name = "half_done"
+
+
 def test_it_keeps_what_costs_less_on_the_same_field() -> None:
     """An accepted change fell: the history of the update agrees with the policy that comes out."""
     kind = OWN_OPTIMIZERS.load(OWN)
