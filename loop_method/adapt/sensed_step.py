@@ -15,7 +15,8 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
 from loop_method.adapt.field_step import COMPARED, EXTRAPOLATION, extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
-from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
+from loop_method.models.sensed import KIND, SHARED, interpolated, sensed_model
+from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # The readings are reproduced up to this share of their sum of squares.

@@ -6,34 +6,23 @@
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i of the
 actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
-unknowns, however fine the grid. The initial fields of the rollouts are unknown as well: a few Fourier
-coefficients each. All of them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
-and to d, the mean of (z - z_r)^2 over all points and steps of each, which its cost tells,
-
-    min  mean over rollouts and steps |y_k^model - y_k|^2 / mean |y_k|^2
-         + mean over rollouts (0.1 (d^model / d - 1))^2 + a small ridge,
-
-by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then
-further. What lies between the sensors is seen, later, where it passes one.
+unknowns, however fine the grid. `loop_method.models.sensed_fit` finds them.
 
 References
 ----------
-Le Dimet, Talagrand, "Variational algorithms for analysis and assimilation of meteorological
-observations", Tellus A 38, 1986 (initial fields from readings: 4D-Var). Raissi, Perdikaris,
-Karniadakis, "Physics-informed neural networks", J. Comput. Phys. 378, 2019 (equation and field from few
-points).
 Lawson, SIAM J. Numer. Anal. 4(3), 1967 (the integrator: Runge-Kutta with the linear part exact).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy  # whose signal processing, half a second of a core, loads when it is used
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_method.models.base import Arrays, numbers_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import substeps_of
@@ -41,43 +30,22 @@ from loop_method.models.spectral_fit import substeps_of
 Spectrum = NDArray[np.complex128]
 
 # p and j of the terms; 1 is added for the constant.
-_TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
-_COEFFICIENTS = len(_TERMS) + 1
+TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
+COEFFICIENTS = len(TERMS) + 1
 # b, x_0, s and w.
 _ACTUATORS = 4
 KIND = "sensed"
-SHARED = _COEFFICIENTS + _ACTUATORS
+SHARED = COEFFICIENTS + _ACTUATORS
 """Unknowns that all rollouts share."""
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
-# Fourier coefficients of an initial field: the mean, and this many cosines and sines.
-_WAVES = 16
+WAVES = 16
+"""Cosines and sines of an initial field, besides its mean."""
 # The least number of grid points.
 _POINTS = 64
 # A linear part that grows faster, in a sampling time, would overflow within an episode.
 _FASTEST_GROWTH = 0.5
-# First values of the dispersion c_13, in its unit: no descent leads from waves that run one way
-# to waves that run the other.
-_DISPERSIONS = (0.0, -20.0, 20.0, -10.0, 10.0, -30.0, 30.0)
-# An error with which none of the others is tried.
-_ENOUGH = 1e-5
-# Shares of the rollouts that are fitted one after the other, and the most steps for each.
-_SHARES = (0.2, 0.4, 1.0)
-_ITERATIONS, _LAST_ITERATIONS = 20, 60
-_COMPARED = 100
-# Ridges, on the readings' scale: of the shared unknowns, of those that move and widen the actuators
-# as long as no equation is known, and of Fourier coefficients, which grows with the wavenumber. With
-# noise there come those of a normal prior, with these standard deviations: of the shared unknowns, and
-# of Fourier coefficients relative to the readings.
-_SHARED_RIDGE, _PLACE_RIDGE = 1e-5, 1e-3
-_FIELD_RIDGE, _FIELD_RIDGE_WAVE = 1e-3, 4.0
-_SHARED_DEVIATION, _FIELD_DEVIATION = 10.0, 0.5
-_DAMPING = (1e-2, 1e-9, 1e4)
-_LEAST_GAIN = 1e-3
-# Weight of the relative error of a distance from the target against that of the readings.
-_DISTANCE = 0.1
-_DIFFERENCE = 1e-5
 
 
 def grid_points(sensors: int) -> int:
@@ -93,13 +61,65 @@ def interpolated(readings: Array) -> Array:
     return np.roll(field, n // (2 * sensors))
 
 
+@dataclass(frozen=True, eq=False)
+class SensedModel(SpectralModel):
+    """The equation on a grid of which every so many points are sensors.
+
+    Attributes
+    ----------
+    shared : (12,) array
+        Its unknowns, in their units.
+    centres : (n_a,) array
+        x_i, as it was declared.
+    sensors : int
+        n_y.
+    noise : float
+        Standard deviation of what the model does not foresee of a reading, its noise included.
+    """
+
+    shared: Array = field(kw_only=True)
+    centres: Array = field(kw_only=True)
+    sensors: int = field(kw_only=True)
+    noise: float = field(default=0.0, kw_only=True)
+
+    def at_sensors(self, rows: Array) -> Array:
+        """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
+        every = self.n_z // self.sensors
+        found = np.zeros((self.n_z, rows.shape[1]))
+        found[every // 2 :: every] = rows
+        return found
+
+    def arrays(self) -> Arrays:
+        own = {
+            "form": np.array("sensed"),
+            "shared": self.shared,
+            "centres": self.centres,
+            "sensors": np.array(self.sensors),
+            "noise": np.array(self.noise),
+        }
+        return super().arrays() | own
+
+    @staticmethod
+    def from_arrays(arrays: Arrays) -> SensedModel:
+        """The model of `arrays`."""
+        whole = SpectralModel.from_arrays(arrays)
+        return SensedModel(
+            **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
+            shared=numbers_of(arrays, "shared"),
+            centres=numbers_of(arrays, "centres"),
+            sensors=int(arrays["sensors"].item()),
+            noise=float(arrays["noise"].item()),
+        )
+
+
 def sensed_model(
     shared: Array,
     sensors: int,
     centres: Array,
     largest: float,
     settings: FieldModelSettings = DEFAULTS,
-) -> SpectralModel:
+    noise: float = 0.0,
+) -> SensedModel:
     """The equation on the grid for this many sensors.
 
     Parameters
@@ -114,11 +134,13 @@ def sensed_model(
         Largest |z| that is simulated; the internal steps follow it.
     settings : FieldModelSettings
         How they do.
+    noise : float
+        As of `SensedModel`.
     """
     n = grid_points(sensors)
-    equation = _Equation(shared, n, centres)
+    equation = SensedEquation(shared, n, centres)
     symbols = np.stack([equation.linear, equation.square, equation.cube])
-    return SpectralModel(
+    return SensedModel(
         KIND,
         equation.linear,
         symbols[1:],
@@ -126,10 +148,14 @@ def sensed_model(
         np.fft.irfft(equation.actuators, n).T,
         np.full(n, equation.constant / n),
         substeps=substeps_of(symbols, largest, settings),
+        shared=shared,
+        centres=centres,
+        sensors=sensors,
+        noise=noise,
     )
 
 
-class _Equation:
+class SensedEquation:
     """The equation in Fourier space, for unknowns of any shape (..., 12)."""
 
     def __init__(self, shared: Array, n: int, centres: Array) -> None:
@@ -138,15 +164,15 @@ class _Equation:
         self._kept = waves < n // 2
         derivative[~self._kept] = 0.0
         symbols = np.zeros((3, *shared.shape[:-1], waves.size), dtype=np.complex128)
-        for i, (p, j) in enumerate(_TERMS):
+        for i, (p, j) in enumerate(TERMS):
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
             symbols[p - 1] += unit * shared[..., i, None] * derivative**j
         linear, self.square, self.cube = symbols
         self.linear = np.minimum(linear.real, _FASTEST_GROWTH) + 1j * linear.imag
         self._half = np.exp(0.5 * self.linear)
         self._whole = self._half**2
-        self.constant = n / _TIME * shared[..., _COEFFICIENTS - 1]
-        b, x_0, s, w = np.moveaxis(shared[..., _COEFFICIENTS:, None, None], -3, 0) / _TIME
+        self.constant = n / _TIME * shared[..., COEFFICIENTS - 1]
+        b, x_0, s, w = np.moveaxis(shared[..., COEFFICIENTS:, None, None], -3, 0) / _TIME
         n_a = len(centres)
         own = np.arange(n_a)[:, None]
         places = centres[:, None] + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
@@ -183,224 +209,9 @@ class _Equation:
         return rate
 
 
-def fit_sensed(
-    readings: Sequence[Array],
-    actions: Sequence[Array],
-    centres: Array,
-    noise: float = 0.0,
-    start: Array | None = None,
-    target: Array | None = None,
-    distances: Array | None = None,
-) -> tuple[Array, Array, float]:
-    """Fit the equation and the initial fields of rollouts.
-
-    Parameters
-    ----------
-    readings, actions : sequences of (T, n_y) and (T, n_a) arrays
-        Of rollouts of one length: y_k and a_k.
-    centres : (n_a,) array
-        Of the actuators, as shares of the domain.
-    noise : float
-        Standard deviation of the noise on every reading.
-    start : (12,) array, optional
-        The shared unknowns to begin with; from several equations, with no actuators, if there are none.
-    target : (n_y,) array, optional
-        z_r at the sensors.
-    distances : (rollouts,) array, optional
-        d of each rollout; NaN where it is not known.
-
-    Returns
-    -------
-    (12,) array, (rollouts, n) array and float
-        The shared unknowns with the least error, the initial fields, and the error: what is minimised,
-        but for the ridge and for what noise has in it.
-    """
-    y, a = np.stack(readings), np.stack(actions)
-    if target is None or distances is None:
-        target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
-    problem = _Problem(y, a, centres, noise, target, distances)
-    fields = problem.interpolated()
-    if start is None:
-        calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
-        acted = [m for m in calmest if a[m].any()]
-        pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
-        shared, fields[pair] = _first_guess(
-            _Problem(y[pair], a[pair], centres, noise, target, distances[pair], _PLACE_RIDGE)
-        )
-    else:
-        shared = start
-    error, shared, fields = problem.fit(shared, fields)
-    n = grid_points(y.shape[2])
-    return shared, np.fft.irfft(_spectrum(fields, n), n), max(error - problem.noise, 0.0)
-
-
-def _first_guess(problem: _Problem) -> tuple[Array, Array]:
-    """The best unknowns of a few rollouts, shared and fields, from several equations."""
-    least, best = np.inf, (np.zeros(SHARED), problem.interpolated())
-    for dispersion in _DISPERSIONS:
-        first = np.zeros(SHARED)
-        first[_TERMS.index((1, 3))] = dispersion
-        error, *unknowns = problem.fit(first, problem.interpolated())
-        if error < least:
-            least, best = error, (unknowns[0], unknowns[1])
-        if least <= _ENOUGH + problem.noise:
-            break
-    return best
-
-
-class _Problem:
-    """The least squares problem: readings y (R, T, n_y), actions a (R, T, n_a), distances (R,).
-
-    target, distances: as in `fit_sensed`. noise becomes what the noise has in the mean square of the
-    readings, as a share of it.
-    """
-
-    def __init__(
-        self,
-        y: Array,
-        a: Array,
-        centres: Array,
-        noise: float,
-        target: Array,
-        distances: Array,
-        place_ridge: float = 0.0,
-    ) -> None:
-        self.y, self.a, self._centres = y, a, centres
-        self._size = float(np.sqrt(np.mean(y * y))) or 1.0
-        self.noise = (noise / self._size) ** 2
-        self._place_ridge = place_ridge
-        sensors = y.shape[2]
-        self._n = grid_points(sensors)
-        waves = np.arange(self._n // 2 + 1)
-        places = (np.arange(sensors) + 0.5) / sensors
-        # Of a transform: the field at the sensors.
-        twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
-        self._read = np.exp(2j * np.pi * waves[:, None] * places) * (twice / self._n)[:, None]
-        self._waves = np.r_[0, 1 : _WAVES + 1, 1 : _WAVES + 1]
-        # Times |transform|^2: the mean square of the field.
-        self._mean_square = twice / self._n**2
-        self._target = np.fft.rfft(interpolated(target))
-        self._distances = distances
-
-    def interpolated(self) -> Array:
-        """Initial fields from the first readings alone, (R, 33)."""
-        sensors = self.y.shape[2]
-        places = (np.arange(sensors) + 0.5) / sensors
-        grid = np.arange(self._n) / self._n
-        fields = np.stack([np.interp(grid, places, y[0], period=1.0) for y in self.y])
-        z = np.fft.rfft(fields)[:, : _WAVES + 1] / self._n
-        return np.hstack([z.real, z.imag[:, 1:]])
-
-    def fit(self, shared: Array, fields: Array) -> tuple[float, Array, Array]:
-        """The error per reading, relative to their size, and the unknowns."""
-        for share in _SHARES:
-            steps = max(2, round(share * self.y.shape[1]))
-            moved = self._descend(shared, fields, steps)
-            # What fits the beginning may overflow later.
-            if np.isfinite(self._error(*moved)):
-                shared, fields = moved
-        return self._error(shared, fields), shared, fields
-
-    def _error(self, shared: Array, fields: Array) -> float:
-        with np.errstate(over="ignore", invalid="ignore"):
-            residuals = self._residuals(shared[None], fields[None], self.y.shape[1])
-            error = float(np.sum(residuals**2))
-        return error if np.isfinite(error) else np.inf
-
-    def _descend(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
-        damping, least, most = _DAMPING
-        ridge = self._ridge(steps)
-        x = np.concatenate([shared, fields.ravel()])
-
-        def parts(x: Array) -> tuple[Array, Array]:
-            return x[:SHARED], x[SHARED:].reshape(fields.shape)
-
-        def objective(x: Array) -> float:
-            shared, fields = parts(x)
-            residual = self._residuals(shared[None], fields[None], steps)
-            total = float(np.sum(residual**2) + np.sum(ridge * x * x))
-            return total if np.isfinite(total) else np.inf
-
-        # Unknowns on the way to a good model may overflow: their error is then infinite.
-        with np.errstate(over="ignore", invalid="ignore"):
-            now = objective(x)
-            for _ in range(_ITERATIONS if steps < self.y.shape[1] else _LAST_ITERATIONS):
-                residual, J = self._linearised(*parts(x), steps)
-                if not np.isfinite(J).all():
-                    break
-                H, g = J @ J.T, J @ residual + ridge * x
-                H[np.diag_indices(x.size)] += ridge
-                before = now
-                while damping < most:
-                    damped = H + np.diag(damping * np.diag(H) + 1e-12)
-                    moved = x - np.linalg.solve(damped, g)
-                    value = objective(moved)
-                    if value < now:
-                        x, now = moved, value
-                        damping = max(damping / 5.0, least)
-                        break
-                    damping *= 5.0
-                if not now < (1.0 - _LEAST_GAIN) * before:
-                    break
-        return parts(x)
-
-    def _ridge(self, steps: int) -> Array:
-        rollouts, _, sensors = self.y.shape
-        weight = self.noise / (len(range(0, steps, self._stride(steps))) * sensors * rollouts)
-        shared = np.full(SHARED, _SHARED_RIDGE**2 + weight / _SHARED_DEVIATION**2)
-        shared[_COEFFICIENTS + 1 :] += self._place_ridge**2
-        field = _FIELD_RIDGE**2 / rollouts + weight / _FIELD_DEVIATION**2
-        rising = (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) ** 2 / self._size**2
-        return np.concatenate([shared, np.tile(field * rising, rollouts)])
-
-    @staticmethod
-    def _stride(steps: int) -> int:
-        """Interval between compared steps, for a given number of steps."""
-        return -(-steps // _COMPARED)
-
-    def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
-        """Errors for unknowns (P, 12) and (P, R, 33), as shares of the whole: (P, R, errors).
-
-        Those of the readings and, over whole rollouts, that of the distance.
-        """
-        stride = self._stride(steps)
-        equation = _Equation(shared[:, None], self._n, self._centres)
-        z = _spectrum(fields, self._n)
-        residuals = []
-        distance = np.zeros(z.shape[:2])
-        for k in range(steps):
-            if k % stride == 0:
-                residuals.append((z @ self._read).real - self.y[:, k])
-            distance += np.abs(z - self._target) ** 2 @ self._mean_square
-            z = equation.step(z, equation.force(self.a[:, k]))
-        whole: Array = np.concatenate(residuals, axis=2)
-        whole /= self._size * np.sqrt(whole[0].size)
-        if steps < self.y.shape[1]:
-            return whole
-        off = distance / (steps * self._distances) - 1.0
-        off = np.where(np.isnan(self._distances), 0.0, off)
-        off *= _DISTANCE / np.sqrt(len(self.y))
-        return np.concatenate([whole, off[..., None]], axis=2)
-
-    def _linearised(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
-        """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
-        rollouts, own = fields.shape
-        count = 1 + SHARED + own
-        all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
-        all_shared[1 : 1 + SHARED] += _DIFFERENCE * np.eye(SHARED)
-        all_fields[1 + SHARED :] += _DIFFERENCE * np.eye(own)[:, None]
-        residuals = self._residuals(all_shared, all_fields, steps)
-        changes = (residuals[1:] - residuals[0]) / _DIFFERENCE
-        J = np.zeros((SHARED + rollouts * own, *residuals[0].shape))
-        J[:SHARED] = changes[:SHARED]
-        for m in range(rollouts):
-            J[SHARED + m * own : SHARED + (m + 1) * own, m] = changes[SHARED:, m]
-        return residuals[0].ravel(), J.reshape(len(J), -1)
-
-
-def _spectrum(fields: Array, n: int) -> Spectrum:
+def spectrum(fields: Array, n: int) -> Spectrum:
     """The transform on n points of Fourier coefficients (..., 33)."""
     z = np.zeros((*fields.shape[:-1], n // 2 + 1), dtype=np.complex128)
-    z[..., : _WAVES + 1] = n * fields[..., : _WAVES + 1]
-    z[..., 1 : _WAVES + 1] += 1j * n * fields[..., _WAVES + 1 :]
+    z[..., : WAVES + 1] = n * fields[..., : WAVES + 1]
+    z[..., 1 : WAVES + 1] += 1j * n * fields[..., WAVES + 1 :]
     return z

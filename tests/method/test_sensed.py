@@ -12,7 +12,8 @@ from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Traj
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.sensed_step import SensedProposals
-from loop_method.models.sensed import fit_sensed, grid_points, interpolated, sensed_model
+from loop_method.models.sensed import grid_points, interpolated, sensed_model
+from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
