@@ -15,11 +15,13 @@ from loop_method.adapt.base import Context, Record, State, part_of
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.adapt.replayed_loop import ReplayedLoop
+from loop_method.adapt.sensed_loop import sensed_loop
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.files import model_of
 from loop_method.models.prediction import pieces
 from loop_method.models.readings import ReadingsModel, fit_readings
+from loop_method.models.sensed import SensedModel
 
 _MODEL = "model."
 
@@ -63,6 +65,8 @@ class Belief:
             seen = self.model.U.T
             of_readings = (seen @ context.U, seen @ context.target, *problem[2:])
             return ReplayedLoop(*of_readings, model=self.model, law=context.law)
+        if isinstance(self.model, SensedModel):
+            return sensed_loop(context, self.model)
         if isinstance(context.law, Observer):
             return ObservedLoop(*problem, **on, law=context.law)
         return ClosedLoop(*problem, **on)

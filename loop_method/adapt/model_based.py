@@ -42,6 +42,7 @@ from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch
 from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
 from loop_method.adapt.renewal import renew
+from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
@@ -119,9 +120,11 @@ class ModelBased(Optimizer):
         """Another one for a law that estimates the state from few readings."""
         # Not at the top: it is derived from this class.
         from loop_method.adapt.model_based_readings import ModelBasedReadings
+        from loop_method.adapt.model_based_sensed import ModelBasedSensed
 
-        few = bool(context.sensors) and isinstance(context.law, Observer)
-        return ModelBasedReadings if few else cls
+        if not (context.sensors and isinstance(context.law, Observer)):
+            return cls
+        return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings
 
     @classmethod
     def first_step(cls, settings: ModelBasedSettings) -> int:
@@ -254,9 +257,7 @@ class ModelBased(Optimizer):
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._last_renewal()
-        before = self._progress.belief
-        kind = "" if before is None else before.model.kind
-        belief = believe(self._context, self._measurements(), kind)
+        before, belief = self._progress.belief, self._believe()
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
@@ -270,6 +271,12 @@ class ModelBased(Optimizer):
             self._without_model(row, final)
         if final and self._progress.stage == RENEWING:
             self._begin_judging()
+
+    def _believe(self) -> Belief | None:
+        """The model that predicts the rollouts, the kind that was believed before tried first."""
+        before = self._progress.belief
+        kind = "" if before is None else before.model.kind
+        return believe(self._context, self._measurements(), kind)
 
     _unpredicted = "no model of the whole field predicts the rollouts"
 

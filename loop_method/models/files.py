@@ -10,6 +10,7 @@ from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
+from loop_method.models.sensed import SensedModel
 from loop_method.models.spectral import SpectralModel
 
 FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
@@ -18,6 +19,7 @@ FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
     "linear": LinearModel.from_arrays,
     "low-rank": LowRankModel.from_arrays,
     "readings": ReadingsModel.from_arrays,
+    "sensed": SensedModel.from_arrays,
 }
 
 

@@ -112,6 +112,44 @@ def fit_sensed(
     return shared, np.fft.irfft(spectrum(fields, n), n), max(error - problem.noise, 0.0)
 
 
+def smoothed_field(
+    shared: Array,
+    readings: Array,
+    actions: Array,
+    centres: Array,
+    noise: float,
+    target: Array,
+    distance: float,
+) -> tuple[Array, float]:
+    """The initial field of a rollout of a known equation.
+
+    Parameters
+    ----------
+    shared : (12,) array
+        The equation's unknowns.
+    readings, actions : (T, n_y) and (T, n_a) arrays
+        y_k and a_k.
+    centres, noise, target
+        As of `fit_sensed`.
+    distance : float
+        d of the rollout; NaN where it is not known.
+
+    Returns
+    -------
+    (n,) array and float
+        The field, and its error, as of `fit_sensed`; infinite where the equation overflows.
+    """
+    # Readings that a law brings to the target say little of the size of the field they began with.
+    first = float(np.sqrt(np.mean(readings[0] ** 2)))
+    problem = _Problem(
+        *(readings[None], actions[None], centres, noise, target, np.array([distance])), least=first
+    )
+    error, _, fields = problem.fit(shared, problem.interpolated(), known=True)
+    n = grid_points(readings.shape[1])
+    field: Array = np.fft.irfft(spectrum(fields, n), n)[0]
+    return field, max(error - problem.noise, 0.0)
+
+
 def _first_guess(problem: _Problem) -> tuple[Array, Array]:
     """The best unknowns of a few rollouts, shared and fields, from several equations."""
     least, best = np.inf, (np.zeros(SHARED), problem.interpolated())
@@ -129,8 +167,8 @@ def _first_guess(problem: _Problem) -> tuple[Array, Array]:
 class _Problem:
     """The least squares problem: readings y (R, T, n_y), actions a (R, T, n_a), distances (R,).
 
-    target, distances: as in `fit_sensed`. noise becomes what the noise has in the mean square of the
-    readings, as a share of it.
+    target, distances: as in `fit_sensed`; least: the least size of the readings that errors are
+    relative to. noise becomes what the noise has in the mean square of the readings, as a share of it.
     """
 
     def __init__(
@@ -142,9 +180,10 @@ class _Problem:
         target: Array,
         distances: Array,
         place_ridge: float = 0.0,
+        least: float = 0.0,
     ) -> None:
         self.y, self.a, self._centres = y, a, centres
-        self._size = float(np.sqrt(np.mean(y * y))) or 1.0
+        self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
         self.noise = (noise / self._size) ** 2
         self._place_ridge = place_ridge
         sensors = y.shape[2]
@@ -169,11 +208,16 @@ class _Problem:
         z = np.fft.rfft(fields)[:, : WAVES + 1] / self._n
         return np.hstack([z.real, z.imag[:, 1:]])
 
-    def fit(self, shared: Array, fields: Array) -> tuple[float, Array, Array]:
-        """The error per reading, relative to their size, and the unknowns."""
+    def fit(
+        self, shared: Array, fields: Array, *, known: bool = False
+    ) -> tuple[float, Array, Array]:
+        """The error per reading, relative to their size, and the unknowns.
+
+        known: the shared ones stay as they are.
+        """
         for share in _SHARES:
             steps = max(2, round(share * self.y.shape[1]))
-            moved = self._descend(shared, fields, steps)
+            moved = self._descend(shared, fields, steps, known)
             # What fits the beginning may overflow later.
             if np.isfinite(self._error(*moved)):
                 shared, fields = moved
@@ -185,13 +229,17 @@ class _Problem:
             error = float(np.sum(residuals**2))
         return error if np.isfinite(error) else np.inf
 
-    def _descend(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
+    def _descend(
+        self, shared: Array, fields: Array, steps: int, known: bool
+    ) -> tuple[Array, Array]:
         damping, least, most = _DAMPING
-        ridge = self._ridge(steps)
-        x = np.concatenate([shared, fields.ravel()])
+        begin = SHARED if known else 0
+        ridge = self._ridge(steps)[begin:]
+        x = np.concatenate([shared, fields.ravel()])[begin:]
 
         def parts(x: Array) -> tuple[Array, Array]:
-            return x[:SHARED], x[SHARED:].reshape(fields.shape)
+            own = shared if known else x[:SHARED]
+            return own, x[SHARED - begin :].reshape(fields.shape)
 
         def objective(x: Array) -> float:
             shared, fields = parts(x)
@@ -203,7 +251,7 @@ class _Problem:
         with np.errstate(over="ignore", invalid="ignore"):
             now = objective(x)
             for _ in range(_ITERATIONS if steps < self.y.shape[1] else _LAST_ITERATIONS):
-                residual, J = self._linearised(*parts(x), steps)
+                residual, J = self._linearised(*parts(x), steps, known)
                 if not np.isfinite(J).all():
                     break
                 H, g = J @ J.T, J @ residual + ridge * x
@@ -260,17 +308,20 @@ class _Problem:
         off *= _DISTANCE / np.sqrt(len(self.y))
         return np.concatenate([whole, off[..., None]], axis=2)
 
-    def _linearised(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
+    def _linearised(
+        self, shared: Array, fields: Array, steps: int, known: bool
+    ) -> tuple[Array, Array]:
         """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
         rollouts, own = fields.shape
-        count = 1 + SHARED + own
+        common = 0 if known else SHARED
+        count = 1 + common + own
         all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
-        all_shared[1 : 1 + SHARED] += _DIFFERENCE * np.eye(SHARED)
-        all_fields[1 + SHARED :] += _DIFFERENCE * np.eye(own)[:, None]
+        all_shared[1 : 1 + common] += _DIFFERENCE * np.eye(SHARED)[:common]
+        all_fields[1 + common :] += _DIFFERENCE * np.eye(own)[:, None]
         residuals = self._residuals(all_shared, all_fields, steps)
         changes = (residuals[1:] - residuals[0]) / _DIFFERENCE
-        J = np.zeros((SHARED + rollouts * own, *residuals[0].shape))
-        J[:SHARED] = changes[:SHARED]
+        J = np.zeros((common + rollouts * own, *residuals[0].shape))
+        J[:common] = changes[:common]
         for m in range(rollouts):
-            J[SHARED + m * own : SHARED + (m + 1) * own, m] = changes[SHARED:, m]
+            J[common + m * own : common + (m + 1) * own, m] = changes[common:, m]
         return residuals[0].ravel(), J.reshape(len(J), -1)

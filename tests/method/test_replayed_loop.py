@@ -64,7 +64,8 @@ def first_law() -> Observer:
 def context(**others: object) -> Context:
     law = first_law()
     first, *further = (Trajectory(r.states, r.actions) for r in explored())
-    given = {"further": further, "noise": SIGMA, "law": law, "sensors": N_Y, **others}
+    given = {"further": further, "noise": SIGMA, "law": law, "sensors": N_Y, "periodic": False}
+    given |= others
     return Context(law.model.U, TARGET, 1.0, 0.3, T, first, **given)
 
 

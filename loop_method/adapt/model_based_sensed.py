@@ -1,0 +1,132 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`model_based` for a law that estimates the state, on a model of the field between few sensors.
+
+Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
+designed and improved on it as on a model of the whole field, from the initial fields that the readings
+tell and draws that are like them. It begins with the cheapest on the model of the present law and
+those of `observer_design`, and is replaced only where it is cheaper on other draws. Once no equation
+reproduces the rollouts, it goes on with a model of the readings (`model_based_readings`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Row
+from loop_method.adapt.belief import Belief, believe
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.initial_fields import mixtures
+from loop_method.adapt.model_based import ModelBased
+from loop_method.adapt.model_based_readings import ModelBasedReadings
+from loop_method.adapt.observer_design import compensators, whole_field_law
+from loop_method.adapt.renewal import mean_and_error
+from loop_method.adapt.sensed_loop import REPRODUCED, SensedLoop, sensed_from, sensed_loop
+from loop_method.models.sensed import SensedModel
+
+DRAWN_STREAM = 0x44524157  # "DRAW"
+
+
+class ModelBasedSensed(ModelBasedReadings):
+    """`ModelBasedReadings`, on a model of the field as long as one reproduces the readings."""
+
+    @property
+    def _sensed(self) -> SensedModel | None:
+        """The model of the field that is believed."""
+        belief = self._progress.belief
+        model = None if belief is None else belief.model
+        return model if isinstance(model, SensedModel) else None
+
+    def _next_renewal(self) -> int:
+        """After one rollout of the first law, then as often as on a model of the whole field."""
+        if not self._records.count:
+            return 1
+        if self._sensed is not None:
+            return ModelBased._next_renewal(self)
+        return super()._next_renewal()
+
+    def _believe(self) -> Belief | None:
+        """In an equation, as long as one reproduces the readings; then in a model of the readings."""
+        measured, model = self._measurements(), self._sensed
+        if model is not None or self._progress.belief is None:
+            found = sensed_from(self._context, measured, None if model is None else model.shared)
+            if found is not None:
+                return Belief(*found, 1)
+        return believe(self._context, measured)
+
+    def _fields(self) -> Array:
+        """Initial fields of the rollouts whose readings the equation reproduces; of all if of none."""
+        if self._sensed is None:
+            return super()._fields()
+        loop = sensed_loop(self._context, self._sensed)
+        found = [loop.smoothed(record) for record in self._data()]
+        good = [field for field, error in found if error <= REPRODUCED]
+        return np.stack(good or [field for field, _ in found])
+
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        """The law that costs least on the model, of the present one and those that it makes."""
+        if not isinstance(belief.model, SensedModel):
+            super()._improve(belief, row, final)
+            return
+        loop, fields = sensed_loop(self._context, belief.model), self._fields()
+        progress, settings, number = self._progress, self._settings, self._records.count
+        drawn, others = (
+            mixtures(
+                fields,
+                settings.mixtures,
+                np.random.default_rng([self._seed, DRAWN_STREAM, number, which]),
+                periodic=self._context.periodic,
+            )
+            for which in range(2)
+        )
+        every, weights = weighted(fields, drawn, settings.measured_share)
+        laws = [loop.theta(progress.policy)]
+        whole = whole_field_law(loop, every, weights, settings)
+        laws += [] if whole is None else compensators(loop, whole)
+        start = cheapest(loop, laws, every, weights)
+        gain = settings.least_gain if final else settings.first_gain
+        found = improve(loop, start, every, weights, curvature_of(loop), settings, gain)
+        if found is None:
+            row["reason"] = "no law is finite on the model; the law stays"
+            return
+        held_out = others if len(others) else fields
+        equal = np.full(len(held_out), 1.0 / len(held_out))
+        theta = cheapest(loop, [laws[0], start, found.theta], held_out, equal)
+        if theta is not laws[0]:
+            progress.policy = loop.policy(theta, self._first)
+        first, none = (
+            loop.costs(law, held_out) for law in (loop.theta(self._first), loop.no_control)
+        )
+        progress.safe = bool(first.mean() < none.mean())
+        with np.errstate(invalid="ignore"):
+            change = loop.costs(theta, held_out) - (first if progress.safe else none)
+        progress.held_out = np.array([1.0, *mean_and_error(change)])
+        row["steps"], row["predicted_change"] = found.steps, float(progress.held_out[1])
+        row["deviation"] = float(progress.held_out[2])
+
+    def _judge(self, row: Row) -> None:
+        """As on a model of the whole field, where there is one."""
+        if self._sensed is None:
+            super()._judge(row)
+        else:
+            ModelBased._judge(self, row)
+
+
+def weighted(fields: Array, drawn: Array, share: float) -> tuple[Array, Array]:
+    """Measured and drawn fields, and their weights: the share of the measured ones."""
+    share = share if len(drawn) else 1.0
+    own = np.full(len(fields), share / len(fields))
+    others = np.full(len(drawn), (1.0 - share) / max(len(drawn), 1))
+    return np.concatenate([fields, drawn]), np.concatenate([own, others])
+
+
+def cheapest(loop: SensedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
+    """The law that is finite from most of the fields, and cheapest where all of those are."""
+    costs = np.array([loop.costs(theta, fields) for theta in laws])
+    lost = ~np.isfinite(costs) @ weights
+    best = lost <= lost.min()
+    common = np.isfinite(costs[best]).all(axis=0)
+    total = np.where(common, costs, 0.0) @ weights
+    return laws[int(np.lexsort((total, lost))[0])]

@@ -1,0 +1,183 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A first law with an observer from a model of the field, by statistical linearisation.
+
+The best law of the whole field on the model, a = K x + b with x = V^T z and V the POD modes of
+simulated fields, goes along with a Kalman filter of the linear model that these simulations obey in
+the mean,
+
+    x_{k+1} = A x_k + B a_k + c + w_k,    y_k = C x_k + d + v_k,
+
+A, c, C, d by least squares, B that of the model at the target. w is what the regression leaves, and a
+share of the initial second moment a step, as a steady filter does not know when an episode begins; v is
+the noise, and what the modes do not show of a reading. A linearisation at the target would have modes
+that grow in directions that no field takes.
+
+The law begins with p_0 = U^T y_0. The coordinates of the compensator are those in which this is the
+best linear estimate of x_0 from the first readings.
+
+References
+----------
+Booton, "Nonlinear control systems with random inputs", IRE Trans. Circuit Theory 1(1), 1954. Gelb
+(ed.), "Applied Optimal Estimation", 1974, section 6.4 (statistical linearisation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.closed_loop import ClosedLoop, Simulation
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.sensed_loop import SensedLoop
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.finite_horizon import finite_horizon
+from loop_method.design.lqg import kalman_filter
+from loop_method.design.lqt import DesignError
+from loop_method.models.sensed import SensedModel
+
+SHARES = (0.1, 1.0)
+"""Shares of the initial second moment that count as process noise over an episode; each makes a law."""
+RIDGE = 1e-6
+"""Of the regressions, relative to the mean square of a mode."""
+TOLD = 1e-2
+"""Least singular value of the estimate of x_0 from readings, relative to the largest."""
+LEAST = 1e-8
+"""Least variance of a noise, relative to the mean square of a reading or a mode."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFieldLaw:
+    """The best law found of the whole field on a model.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+        Its U are the modes V.
+    theta : (n_a, n_s + 1) array
+        [K b].
+    simulation : Simulation
+        Of this law, from the fields that have a finite cost.
+    weights : array
+        Of these fields.
+    """
+
+    loop: ClosedLoop
+    theta: Array
+    simulation: Simulation
+    weights: Array
+
+
+def whole_field_law(
+    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings
+) -> WholeFieldLaw | None:
+    """The best law of as many modes as the law with an observer has; None where none is finite."""
+    model, n = loop.model, loop.model.n_z
+    none = np.zeros(model.n_a)
+    A, B = model.linearise(loop.target, none)
+    drift = model.step(loop.target[None], none[None])[0] - loop.target
+    K, b = finite_horizon(A, B, drift, loop.state_weight, loop.action_weight, loop.horizon)
+    b = b - K @ loop.target
+
+    def under(U: Array) -> ClosedLoop:
+        weight = loop.state_weight, loop.action_weight
+        return ClosedLoop(
+            *(U, loop.target, *weight, loop.horizon, loop.action_limit), model=loop.model
+        )
+
+    first = under(np.eye(n))
+    simulation = first.simulate(np.column_stack([K, b]), fields)
+    seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])
+    modes = linalg.svd(seen, full_matrices=False)[2][: len(loop.law.model.A)]
+    whole = under(modes.T)
+    found = improve(
+        whole, np.column_stack([K @ modes.T, b]), fields, weights, curvature_of(whole), settings
+    )
+    if found is None:
+        return None
+    simulation = whole.simulate(found.theta, fields)
+    known = np.isfinite(simulation.costs)
+    if not known.any():
+        return None
+    simulation = Simulation(
+        simulation.states[:, known], simulation.actions[:, known], simulation.costs[known]
+    )
+    return WholeFieldLaw(whole, found.theta, simulation, weights[known] / weights[known].sum())
+
+
+def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
+    """Theta (`ObservedLoop`) of the law on the estimates of a Kalman filter, for each of `SHARES`."""
+    model = loop.model
+    assert isinstance(model, SensedModel)
+    every = model.n_z // model.sensors
+    z, a = law.simulation.states, law.simulation.actions
+    x, y = z @ law.loop.U, z[..., every // 2 :: every]
+    n_s, steps = x.shape[2], len(a)
+    weights = np.tile(law.weights / steps, steps)
+    before = np.column_stack([x[:-1].reshape(-1, n_s), np.ones(weights.size)])
+    B = law.loop.U.T @ model.linearise(loop.target, np.zeros(model.n_a))[1]
+    moved = (x[1:] - x[:-1]).reshape(-1, n_s) - a.reshape(-1, a.shape[2]) @ B.T
+    A, c, W = _regression(before, moved, weights)
+    A = A + np.eye(n_s)
+    C, d, V = _regression(before, y[:-1].reshape(-1, model.sensors), weights)
+    first = x[0].T @ (law.weights[:, None] * x[0])
+    noise = np.full(model.sensors, max(model.noise**2, LEAST * float(np.mean(y * y))))
+    V = V + np.diag(noise)
+    W = W + LEAST * np.trace(first) / n_s * np.eye(n_s)
+    seen = y[0].T @ (law.weights[:, None] * y[0]) + np.diag(noise)
+    guess = linalg.solve(seen, y[0].T @ (law.weights[:, None] * x[0]), assume_a="pos").T
+    K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
+    for share in SHARES:
+        try:
+            M = kalman_filter(A, C, W + share / steps * first, V).M
+        except DesignError:
+            continue
+        I_MC = np.eye(n_s) - M @ C
+        rows = K @ I_MC, K @ M, b - K @ M @ d
+        after = A @ I_MC, A @ M, c - A @ M @ d
+        yield law_theta(loop, B, guess, rows, after)
+
+
+def _regression(features: Array, wanted: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Matrix and constant of the weighted regression on [x; 1], and the covariance of what is left."""
+    weighted = features * weights[:, None]
+    moment = features.T @ weighted
+    n = len(moment) - 1
+    moment[np.diag_indices(n)] += RIDGE * np.trace(moment[:n, :n]) / n
+    found = linalg.solve(moment, weighted.T @ wanted, assume_a="pos")
+    left = wanted - features @ found
+    return found[:n].T, found[n], left.T @ (weights[:, None] * left)
+
+
+def law_theta(
+    loop: SensedLoop,
+    B: Array,
+    guess: Array,
+    rows: tuple[Array, Array, Array],
+    after: tuple[Array, Array, Array],
+) -> Array:
+    """Theta of a = K x + D y + b, x+ = F x + G y + B a + c, with p in place of x.
+
+    guess (n_s, n_y): x_0 from y_0; rows [K D b]; after [F G c], without B a.
+    """
+    left, values, _ = linalg.svd(loop.law.model.U.T)
+    rank = int(np.sum(values > 1e-9 * values[0]))
+    inside, outside = left[:, :rank], left[:, rank:]
+    readings = linalg.pinv(loop.law.model.U.T)  # of s
+    # Readings that say nothing of x_0 move it a little, so that T has an inverse.
+    turned, told, back = linalg.svd(guess @ readings @ inside, full_matrices=False)
+    own = (turned * np.maximum(told, TOLD * told[0])) @ back
+    other = linalg.svd(own)[0][:, rank:]
+    # p = T x with p_0 = s_0.
+    T = inside @ linalg.pinv(own) + outside @ other.T / told[0]
+    back = linalg.inv(T)
+    (K, D, b), (F, G, c) = rows, after
+    K, D = K @ back, D @ readings
+    F, G = T @ F @ back, T @ G @ readings
+    # The law adds B a with the B of its own model.
+    moved = T @ B - loop.law.model.B
+    F, G, c = F + moved @ K, G + moved @ D, T @ c + moved @ b
+    return np.block([[D, K, b[:, None]], [G, F, c[:, None]]])

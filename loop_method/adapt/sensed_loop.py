@@ -1,0 +1,147 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law with an observer on a model of the field between few sensors.
+
+What a rollout began with is the field that its readings tell (`loop_method.models.sensed_fit`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Context, Record
+from loop_method.adapt.closed_loop import ClosedLoopProblem
+from loop_method.adapt.local_step import LOCAL
+from loop_method.adapt.observed_loop import ObservedLoop
+from loop_method.laws.observer import Observer
+from loop_method.models.sensed import SensedModel, interpolated, sensed_model
+from loop_method.models.sensed_fit import fit_sensed, smoothed_field
+
+REPRODUCED = 0.05
+"""The readings are reproduced up to this share of their sum of squares."""
+MOST_SENSORS = 32
+"""More point sensors than this are taken for a field."""
+NEWEST = 8
+"""The newest rollouts, which the model is fitted to."""
+EXTRAPOLATION = 1.5
+"""Fields that are simulated may be this many times as large as the measured ones."""
+
+_SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
+    WeakKeyDictionary()
+)
+"""Initial fields that were found with a model: functions of both alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensedLoop(ObservedLoop):
+    """Laws with an observer on a `SensedModel`; U and target are those of its grid."""
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """The initial field of each rollout, as its readings tell it."""
+        return np.stack([self.smoothed(record)[0] for record in records])
+
+    def smoothed(self, record: Record) -> tuple[Array, float]:
+        """The initial field of a rollout, and its error."""
+        model = self.model
+        assert isinstance(model, SensedModel)
+        known = _SMOOTHED.setdefault(model, WeakKeyDictionary())
+        if record not in known:  # each renewal and the verdict ask for all rollouts
+            known[record] = self._smooth(model, record)
+        return known[record]
+
+    def _smooth(self, model: SensedModel, record: Record) -> tuple[Array, float]:
+        every = model.n_z // model.sensors
+        steps = len(record.actions)
+        if not steps or not np.isfinite(record.states).all():
+            return interpolated(record.states[0]), np.inf
+        return smoothed_field(
+            model.shared,
+            record.acted_from,
+            record.actions,
+            model.centres,
+            model.noise,
+            self.target[every // 2 :: every],
+            distance(record, self.state_weight * every, self.action_weight, self.horizon),
+        )
+
+
+def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:
+    """Mean of (z - z_r)^2 from the cost of a rollout; NaN where it tells none, as of an exploration.
+
+    state_weight: what a sensor counts.
+    """
+    if not record.usable or len(record.actions) != horizon:
+        return np.nan
+    acting = action_weight * float(np.sum(record.actions**2)) / horizon
+    found = (record.cost - acting) / (state_weight * record.states.shape[1])
+    return found if found > 0.0 else np.nan
+
+
+def can_be_sensed(context: Context) -> bool:
+    """True if the states are one reading of each of a few sensors of one component on a ring."""
+    sensors = context.sensors
+    return context.periodic and sensors == len(context.target) and 0 < sensors <= MOST_SENSORS
+
+
+def sensed_from(
+    context: Context, records: Sequence[Record], start: Array | None
+) -> tuple[SensedModel, float] | None:
+    """The model that reproduces the newest rollouts, and its error; None if it does not.
+
+    start: the equation that was fitted before, the (12,) unknowns.
+    """
+    sensors, n_a = context.sensors, records[0].actions.shape[1]
+    problem = ClosedLoopProblem(
+        *(context.U, context.target, context.state_weight, context.action_weight, context.horizon)
+    )
+    largest_cost = LOCAL * problem.cost_of(records[0])
+    whole = {
+        record.states.tobytes(): record
+        for record in records
+        if len(record.actions) == context.horizon and problem.cost_of(record) <= largest_cost
+    }
+    chosen = list(whole.values())[-NEWEST:]
+    if not chosen:
+        return None
+    centres = context.actuator_centres(n_a)
+    weights = context.state_weight, context.action_weight, context.horizon
+    distances = np.array([distance(record, *weights) for record in chosen])
+    for first in (None,) if start is None else (start, None):
+        shared, fields, error = fit_sensed(
+            [record.acted_from for record in chosen],
+            [record.actions for record in chosen],
+            centres,
+            context.noise,
+            first,
+            context.target,
+            distances,
+        )
+        if error <= REPRODUCED:
+            break
+    else:
+        return None
+    size = float(np.mean([np.mean(record.acted_from**2) for record in chosen]))
+    largest = EXTRAPOLATION * float(np.abs(fields).max())
+    # What the model does not foresee of a reading is noise to a filter.
+    noise = float(np.sqrt(context.noise**2 + error * size))
+    return sensed_model(shared, sensors, centres, largest, context.field_models, noise), error
+
+
+def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
+    """The model under laws with an observer of the readings."""
+    assert isinstance(context.law, Observer)
+    return SensedLoop(
+        model.at_sensors(context.U),
+        interpolated(context.target),
+        context.state_weight * model.sensors / model.n_z,
+        context.action_weight,
+        context.horizon,
+        context.action_limit,
+        model=model,
+        noise=model.noise,
+        law=context.law,
+    )

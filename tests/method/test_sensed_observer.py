@@ -1,0 +1,238 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law with an observer that is designed and improved on a model of the field between sensors."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+import pdeloop
+from loop_interfaces.model_rows import ModelRows
+from loop_method.adapt import (
+    Context,
+    ModelBased,
+    Optimizer,
+    Record,
+    Rollout,
+    RolloutResult,
+    Trajectory,
+)
+from loop_method.adapt.belief import Belief
+from loop_method.adapt.model_based_readings import ModelBasedReadings
+from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, weighted
+from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.lqg import law_of_innovations
+from loop_method.laws import Observer
+from loop_method.models.files import model_of
+from loop_method.models.sensed import (
+    COEFFICIENTS,
+    SHARED,
+    TERMS,
+    SensedModel,
+    interpolated,
+    sensed_model,
+)
+from loop_method.models.sensed_fit import smoothed_field
+from loop_method.reduce.subspace import subspace_model
+from pdeloop.episode import rollout
+from tests.support.small import same_bits
+
+Array = np.ndarray
+SENSORS, N_A, T = 8, 3, 24
+CENTRES = (np.arange(N_A) + 0.5) / N_A
+RNG = np.random.default_rng(17)
+
+
+def equation(**terms: float) -> Array:
+    """Unknowns of an equation with these terms, like z1 for z and z0_x2 for its second derivative."""
+    shared = np.zeros(SHARED)
+    for name, value in terms.items():
+        p, j = (int(part) for part in name[1:].split("_x"))
+        shared[TERMS.index((p, j))] = value
+    shared[COEFFICIENTS] = 5.0  # the strength of the actuators
+    return shared
+
+
+LINEAR = equation(z1_x0=1.5, z1_x1=0.5, z1_x2=0.5)
+CUBIC = equation(z1_x0=5.0, z1_x2=0.5, z3_x0=-5.0)
+
+
+def model_with(shared: Array, noise: float) -> SensedModel:
+    return sensed_model(shared, SENSORS, CENTRES, 4.0, noise=noise)
+
+
+def field(model: SensedModel, seed: int) -> Array:
+    x = np.arange(model.n_z) / model.n_z
+    a, b, c = np.random.default_rng(seed).standard_normal(3)
+    drawn: Array = 0.3 * a + b * np.cos(2 * np.pi * x) + c * np.sin(4 * np.pi * x)
+    return drawn
+
+
+def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
+    """With a law whose coordinates are any, and more than there are sensors."""
+    rng = np.random.default_rng(1)
+    U = rng.standard_normal((SENSORS, n_s))
+    rows = rows_of(n_s, U)
+    target, none = np.zeros(SENSORS), np.zeros((T, N_A))
+    explored = Trajectory(np.zeros((T + 1, SENSORS)), none)
+    context = Context(U, target, 1.0, 0.1, T, explored, sensors=SENSORS, law=Observer(rows, T))
+    return sensed_loop(context, model)
+
+
+def rows_of(n_s: int, U: Array) -> ModelRows:
+    rng = np.random.default_rng(2)
+    A, B = 0.3 * rng.standard_normal((n_s, n_s)), rng.standard_normal((n_s, N_A))
+    gains = np.zeros((N_A, n_s))
+    return ModelRows(A=A, B=B, U=U, K_a=gains, K_b=gains, s_r=np.zeros(n_s))
+
+
+def test_the_initial_field_is_what_the_readings_came_from() -> None:
+    """It moves past the sensors, by three of their distances."""
+    moving = equation(z1_x0=1.0, z1_x1=80.0, z3_x0=-1.0)
+    model = model_with(moving, 0.0)
+    true = field(model, 4)
+    z, actions = true[None], 2.0 * RNG.standard_normal((T, N_A))
+    seen, every = [], model.n_z // SENSORS
+    for a in actions:
+        seen.append(z[0, every // 2 :: every])
+        z = model.step(z, a[None])
+    known = CENTRES, 0.0, np.zeros(SENSORS), np.nan
+    found, error = smoothed_field(moving, np.array(seen), actions, *known)
+    assert error < 1e-6
+    assert np.linalg.norm(found - true) < 0.01 * np.linalg.norm(true)
+
+
+def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:
+    loop, n_s, rng = loop_of(model_with(LINEAR, 0.1)), 10, np.random.default_rng(5)
+    guess, B = rng.standard_normal((n_s, SENSORS)), rng.standard_normal((n_s, N_A))
+    K, D, b = rng.standard_normal((N_A, n_s)), rng.standard_normal((N_A, SENSORS)), np.ones(N_A)
+    F, G, c = (
+        0.2 * rng.standard_normal((n_s, n_s)),
+        rng.standard_normal((n_s, SENSORS)),
+        np.ones(n_s),
+    )
+    law = loop.law
+    theta = law.parts(
+        loop.policy(law_theta(loop, B, guess, (K, D, b), (F, G, c)), np.zeros(law.size))
+    )
+    readings = rng.standard_normal((6, SENSORS))
+    x, memory = guess @ readings[0], law.memory_start()
+    for k, y in enumerate(readings):
+        a = K @ x + D @ y + b
+        np.testing.assert_allclose(law.action(theta, y, memory, k), a, rtol=1e-6, atol=1e-6)
+        memory = law.memory_update(theta, y, memory, a, k)
+        x = F @ x + G @ y + c + B @ a
+
+
+@pytest.mark.parametrize("shared", [LINEAR, CUBIC])
+def test_the_designed_law_is_near_to_that_of_the_whole_field(shared: Array) -> None:
+    """With little noise the readings tell the state, so that the estimate costs little."""
+    model = model_with(shared, 0.02)
+    loop = loop_of(model)
+    fields = np.stack([field(model, seed) for seed in range(6)])
+    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
+    whole = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
+    assert whole is not None
+    best = float(whole.simulation.costs.mean())
+    law = cheapest(loop, list(compensators(loop, whole)), every, weights)
+    none = float(loop.costs(loop.no_control, every).mean())
+    own = float(loop.costs(law, every).mean())
+    assert best < 0.9 * none
+    assert own - best < 0.25 * (none - best)
+
+
+def test_the_model_survives_a_checkpoint() -> None:
+    model = model_with(CUBIC, 0.3)
+    again = Belief.of(Belief(model, 0.01, 1).state())
+    assert again is not None and isinstance(again.model, SensedModel)
+    z, a = field(model, 1)[None], np.ones((1, N_A))
+    assert same_bits(again.model.step(z, a), model.step(z, a))
+    assert same_bits(again.model.shared, CUBIC) and again.model.noise == 0.3
+    assert isinstance(model_of(model.arrays()), SensedModel)
+
+
+@cache
+def small() -> tuple[pdeloop.Problem, Context]:
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16, exploration_variance=4.0)
+    plant = problem.plant()
+    explored = [problem.explore(seed) for seed in (0, 1)]
+    with threadpool_limits(1):
+        seen = [(states, actions) for states, actions in explored]
+        found = subspace_model(seen, order=10)
+        rows = law_of_innovations(
+            found,
+            plant.target,
+            state_weight=plant.state_weight,
+            action_weight=plant.action_weight,
+        )
+        law = Observer(rows, plant.horizon)
+    first, second = (Trajectory(states, actions) for states, actions in explored)
+    context = Context(
+        *(law.model.U, plant.target, plant.state_weight, plant.action_weight, plant.horizon, first),
+        sensors=SENSORS,
+        further=[second],
+        law=law,
+    )
+    return problem, context
+
+
+def measured(asked: Rollout) -> RolloutResult:
+    problem, context = small()
+    law = context.law
+    assert isinstance(law, Observer)
+    theta, memory = law.parts(np.ravel(asked.policy)), law.memory_start()
+
+    def act(k: int, y: Array) -> Array:
+        nonlocal memory
+        a = law.action(theta, y[0], memory, k)
+        memory = law.memory_update(theta, y[0], memory, a, k)
+        return a[None]
+
+    episode = rollout(problem.plant(), act, [asked.field_seed])
+    seen = Trajectory(episode.states[:, 0], episode.actions[:, 0])
+    return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
+
+
+def optimiser() -> Optimizer:
+    _, context = small()
+    kind = ModelBased.for_context(context)
+    assert kind is ModelBasedSensed
+    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=1)
+    law = context.law
+    assert law is not None
+    return kind(law.theta_start, seed=0, rollouts=3, settings=settings, context=context)
+
+
+def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -> None:
+    first, later = optimiser(), optimiser()
+    assert len(first.ask()) == 1
+    row = first.tell([measured(asked) for asked in first.ask()])
+    assert row["model"] == "sensed" and float(row["predicted_change"]) < 0.0
+    later.restore(first.state())
+    rows = []
+    for each in first, later:
+        while not each.done:
+            rows.append(each.tell([measured(asked) for asked in each.ask()]))
+    half = len(rows) // 2
+    assert rows[:half] == rows[half:] and rows[-1]["chosen"] == "adapted"
+    assert same_bits(first.policy, later.policy)
+
+
+def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
+    _, context = small()
+    other = Context(**{**vars(context), "periodic": False})
+    assert ModelBased.for_context(other) is ModelBasedReadings
+
+
+def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> None:
+    loop = loop_of(model_with(CUBIC, 0.0))
+    readings = np.vstack(
+        [np.cos(2 * np.pi * np.arange(SENSORS) / SENSORS), np.full(SENSORS, np.nan)]
+    )
+    lost = Record(np.zeros(1), np.inf, readings, np.zeros((1, N_A)))
+    assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0]))
