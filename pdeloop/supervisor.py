@@ -30,6 +30,8 @@ STEADY = 30.0
 REFUSED, CRASHED = 1, 70
 """Exit codes of a node that was asked for something it cannot do, so that restarting would not help,
 and of one with a bug (loop_interfaces.ros.node_main)."""
+FULL_MEMORY_DISK = "as happens where /dev/shm, which ROS's tracing library maps, or a disk is full"
+"""The cause of a SIGBUS."""
 START = "loop_interfaces.start"
 """The module that runs a node."""
 _WARNING = re.compile(r"\[WARN\] \[([\d.]+)\] (\[.*)")
@@ -188,8 +190,9 @@ class Supervisor:
             self.tell(f"{child.name} {how}; {child.last_line()}")
             return
         if often:
+            why = f", {FULL_MEMORY_DISK}" if code == -signal.SIGBUS else ""
             raise NodeError(
-                f"{child.name} {how} for the {child.deaths}th time; the last line of its log: "
+                f"{child.name} {how} for the {child.deaths}th time{why}; the last line of its log: "
                 f"{child.last_line() or 'none'} (see {child.log})"
             )
         wait = BACK_OFF[child.deaths - 1]

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A machine clock that jumps by days changes nothing: every wait uses the monotonic clock."""
+"""Clocks of machines that jump by days, each differently, change nothing: waits use monotonic ones."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.support.loop_harness import Processes, until
 from tests.support.operator_harness import SLOW, full_speed, operator
 from tests.support.small_loop import (
     LIMIT,
+    PARAMETERS,
     adapted,
     assert_same_training,
     in_process,
-    start_pair,
     start_tuner,
 )
 
@@ -84,26 +84,40 @@ def shared_memory() -> set[str]:
     return {path.name for path in Path("/dev/shm").glob("*faketime_*")}
 
 
-def test_a_clock_that_jumps_forth_and_back_changes_nothing(
+DAYS = {"plant": (-3, 0, 2), "controller": (0, 2, -3), "tuner": (2, -3, 0)}
+"""How far the clock of each node's machine is off, one after the other."""
+
+
+def test_clocks_that_jump_forth_and_back_and_differ_change_nothing(
     faketime: Path, loop: Processes, tmp_path: Path
 ):
-    offset = tmp_path / "offset"
-    offset.write_text("+0d\n")
+    def set_clocks(turn: int) -> None:
+        for name, days in DAYS.items():
+            (tmp_path / name).write_text(f"{days[turn]:+d}d\n")
+
+    def use_clock(name: str) -> None:
+        loop.environment["FAKETIME_TIMESTAMP_FILE"] = str(tmp_path / name)
+
+    set_clocks(2)
     out = tmp_path / "run"
     with operator(loop) as desk:
         loop.forks = False  # the library must be there when a program starts
         loop.environment |= {
             "LD_PRELOAD": str(faketime),
-            "FAKETIME_TIMESTAMP_FILE": str(offset),
             "FAKETIME_CACHE_DURATION": "1",  # a jump is seen within so many seconds
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
             "FAKETIME_DONT_RESET": "1",
         }
-        start_pair(loop, real_time_factor=SLOW)  # until all jumps were seen
+        use_clock("plant")
+        # Slow until all jumps were seen.
+        loop.node("pde_sim_node", *PARAMETERS, "-p", f"real_time_factor:={SLOW}")
+        use_clock("controller")
+        loop.node("controller_node", *PARAMETERS)
+        use_clock("tuner")
         tuner = start_tuner(loop, out, iterations=100)
         until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
-        for days in (2, -3, 0):
-            offset.write_text(f"{days:+d}d\n")
+        for turn, days in enumerate(DAYS["tuner"]):
+            set_clocks(turn)
             wanted = 86400 * days
             until(lambda d=wanted: abs(newest_time(out) - time.time() - d) < 3600, LIMIT, "jump")
         full_speed(desk)

@@ -259,7 +259,7 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
         with held_training(desk, "/stranger"):
             stranger = loop.start("-c", STRANGER, name="stranger")
             # Strangers are looked for from time to time, whether the training is paused or not.
-            for node in (running["plant"], tuner):
+            for node in (*running.values(), tuner):
                 until(
                     lambda node=node: "/stranger" in loop.output(node),
                     LIMIT,
@@ -270,9 +270,13 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     assert "several nodes publish /action: /controller_node, /stranger" in loop.output(
         running["plant"]
     )
+    assert "/stranger publishes /policy so that it does not arrive" in loop.output(
+        running["controller"]
+    )
     told = json.loads((out / "result.json").read_text())["several_publishers"]
     assert told == {
         "/action": ["/controller_node", "/stranger"],
+        "/policy": ["/stranger", "/tuner_node"],
         "/samples": ["/pde_sim_node", "/stranger"],
     }
     stranger.kill()
@@ -285,15 +289,19 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import samples_qos, writer_qos
 from loop_interfaces.topics import ACTION
+from rclpy.qos import QoSProfile
 rclpy.init()
 node = rclpy.create_node("stranger")
+volatile = node.create_publisher(Float64MultiArray, "policy", QoSProfile(depth=1))
 samples = node.create_publisher(UInt8MultiArray, "samples", samples_qos(1))
 publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
 codec = ArrayCodec(ACTION.labels)
 k = 0
 while True:
     k += 1
-    publisher.publish(codec.encode(Frame(1, 2 + k % 50, k % 31, 0.5, np.full((2, 4), 1e3))))
+    said = codec.encode(Frame(1, 2 + k % 50, k % 31, 0.5, np.full((2, 4), 1e3)))
+    publisher.publish(said)
+    volatile.publish(said)
     time.sleep(0.001)
 """
 

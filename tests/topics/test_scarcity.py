@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Nodes with few descriptors: they train, or end with one sentence."""
+"""Nodes with few descriptors and little shared memory: they train, or end with one sentence."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ pytestmark = pytest.mark.topics
 
 
 WITH_LIMIT = """
-import resource, sys
+import contextlib, resource, sys
 from pdeloop.cli import main
+from tests.support.mounts import own_mounts, run
 kind, limit = int(sys.argv[1]), int(sys.argv[2])
+with contextlib.suppress(OSError):  # only root can
+    own_mounts()
+    run("mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", "/dev/shm")
 resource.setrlimit(kind, (limit, limit))  # which the nodes inherit
 sys.argv = ["pdeloop", *sys.argv[3:]]
 sys.exit(main())
@@ -31,7 +35,9 @@ def train(loop: Processes, kind: int, limit: int, out: Path, code: int = 0) -> s
     return loop.wait(started, LIMIT, code)
 
 
-def test_thirty_two_descriptors_are_enough_for_every_node(loop: Processes, tmp_path: Path) -> None:
+def test_thirty_two_descriptors_and_little_shared_memory_are_enough_for_every_node(
+    loop: Processes, tmp_path: Path
+) -> None:
     train(loop, resource.RLIMIT_NOFILE, 32, tmp_path / "run")
     assert_same_training(tmp_path / "run", in_process(iterations=2))
 
