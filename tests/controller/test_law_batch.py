@@ -8,8 +8,11 @@ import pytest
 
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.own_code import OwnCodeError
 from loop_method.laws import Affine, FeedForward, Law, Observer
+from loop_method.laws.base import Parts
 from loop_method.laws.calls import along, laws_of
 from tests.support.small import same_bits
 
@@ -67,7 +70,7 @@ def test_the_affine_law_has_the_bits_of_its_compiled_form() -> None:
     batch, projected = made(Affine), ProjectedLaw([m.U for m in models(2)], TARGET)
     batch.set(policies, index)
     projected.set(policies, index)
-    assert batch.compiled is not None
+    assert batch.compiled is not None and batch.nbytes == 0
     assert same_bits(batch.actions(3, states[0]), projected.actions(states[0]))
 
 
@@ -137,3 +140,20 @@ def test_where_a_model_a_policy_or_a_state_lies_in_memory_does_not_matter(kind: 
     elsewhere.set(moved(policies), index)
     for k, z in enumerate(states):
         assert same_bits(elsewhere.actions(k, moved(z)), here.actions(k, z))
+
+
+def test_a_law_that_changes_its_own_parameters_is_refused() -> None:
+    class Changing(FeedForward):
+        def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+            if k:
+                theta["b"] += 1.0
+            return super().action(theta, z, memory, k)
+
+    policies, index, states = episode(Changing, 3)
+    batch = made(Changing)
+    batch.set(policies, index)
+    batch.actions(0, states[0])
+    with pytest.raises(
+        OwnCodeError, match=r"action fails: .*test_law_batch\.py, line \d+: .*read-only"
+    ):
+        batch.actions(1, states[1])

@@ -38,6 +38,16 @@ ARGUED: dict[tuple[str, str, str], str] = {
         "1 -> 2",
     ): "one of 2^53 texts has the digest 0",
     (
+        "controller_node.law_batch",
+        "self._next = 0",
+        "0 -> 1",
+    ): "it is compared once there is a policy, with which it is set",
+    (
+        "controller_node.law_batch",
+        "self._next = 0",
+        "removed",
+    ): "it is compared once there is a policy, with which it is set",
+    (
         "controller_node.responder",
         "self._served = (-1, -1)",
         "1 -> 2",

@@ -14,6 +14,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START, VOID
 from tests.support.small import dispatcher_of, same_bits
+from tuner_node import targets
 from tuner_node.batch import Batch
 from tuner_node.dispatch import Dispatcher
 from tuner_node.errors import DispatchError
@@ -188,6 +189,21 @@ def test_targets_of_ever_new_plants_fill_no_memory():
     served.cost(0, replace(costs_of(start), plant=3), 1.0)  # the run's plant is known from now on
     for plant in range(30):
         assert served.target(0, Frame(0, 0, 0, 0.0, values, plant), 2.0) == []
+
+
+def test_targets_of_just_the_bytes_that_are_allowed_are_remembered(monkeypatch):
+    monkeypatch.setattr(targets, "MAX_TARGET_BYTES", 32)
+    served = dispatcher()
+    for plant in (1, 2):
+        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), plant), 0.0)
+    with pytest.raises(FrameError, match="expected the targets of at most"):
+        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), 3), 0.0)
+
+
+def test_a_start_is_signed_and_a_policy_is_of_the_plant_that_it_does_not_know():
+    served = dispatcher()
+    sends = {send.topic: send.frame for _, send in served.assign(batch(1), 0.0)}
+    assert sends[POLICY].plant == 0 != sends[START].plant
 
 
 def test_the_target_of_the_run_s_plant_has_room_as_soon_as_that_is_known():

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame
+from loop_interfaces.topics import POLICY, START
 from tests.support.small import dispatcher_of
+from tuner_node.batch import Batch
 from tuner_node.dispatch import PAUSE_LEASE
 from tuner_node.errors import DispatchError
 from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
@@ -36,6 +38,14 @@ def test_the_dispatcher_learns_which_nodes_of_each_pair_are_missing():
     assert [sorted(pair.missing) for pair in dispatcher.pairs] == [["controller"], ["plant"]]
     company.update(Publishers([1, 1], [1, 1], {}, 0), 1.0)
     assert dispatcher.missing() == []
+
+
+def test_what_the_time_asks_for_is_sent_with_what_the_presence_does():
+    company, dispatcher = participants()
+    company.update(there(), 0.0)
+    batch = Batch(np.array([[1.0, -1.0, 0.0, 0.0]]), np.zeros((1, 1, 2)))
+    dispatcher.assign(batch, 0.0)
+    assert {send.topic for _, send in company.update(there(), 9.0)} == {POLICY, START}
 
 
 @pytest.mark.parametrize("recorder", ["start", "required"])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -23,21 +24,30 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @cache
 def values(optimizer: str) -> dict[str, Any]:
-    return parameters(
-        optimizer=optimizer, seeds=2, evaluation_fields=1, horizon=8, n_z=16, **KINDS[optimizer]
-    )
+    small = {"seeds": 2, "evaluation_fields": 1, "horizon": 8, "n_z": 16}
+    return parameters(optimizer=optimizer, **{**small, **KINDS[optimizer]})
 
 
 @cache
 def states(optimizer: str) -> list[Arrays]:
     """After each batch of a training, and before the first."""
-    training, pair = build_training(values(optimizer)), LocalPair(values(optimizer))
-    found = [arrays_of(training)]
+    return list(states_of(values(optimizer)))
+
+
+def states_of(values: dict[str, Any]) -> Iterator[Arrays]:
+    training, pair = build_training(values), LocalPair(values)
+    yield arrays_of(training)
     while (batch := training.next_batch()) is not None:
         training.finish(pair.run(batch))
         pair.follow(training)
-        found.append({name: array.copy() for name, array in arrays_of(training).items()})
-    return found
+        yield {name: array.copy() for name, array in arrays_of(training).items()}
+
+
+def until_adapting(values: dict[str, Any]) -> Iterator[Arrays]:
+    for state in states_of(values):
+        yield state
+        if str(state["phase"]) == "adapt":
+            return
 
 
 def at(optimizer: str, phase: str) -> Arrays:
@@ -60,6 +70,15 @@ def test_every_state_of_a_training_comes_back(optimizer: str) -> None:
         assert equal(arrays_of(training), state)
 
 
+def test_every_state_of_a_training_of_one_seed_that_explores_twice_comes_back() -> None:
+    own = parameters(optimizer="model_based", rollouts=6, horizon=8, n_z=16)
+    for state in until_adapting(own):
+        training = build_training(own)
+        restore(training, state)
+        assert equal(arrays_of(training), state)
+    assert "further0.0.states" in state and "further0.1.states" not in state
+
+
 @pytest.mark.parametrize(
     ("optimizer", "phase", "changes", "words"),
     [
@@ -73,6 +92,7 @@ def test_every_state_of_a_training_comes_back(optimizer: str) -> None:
         ("two_point", "adapt", {"models": None}, "no models"),
         ("two_point", "done", {"evaluation": None}, "no evaluation"),
         ("two_point", "adapt", {"history": np.array(json.dumps([{"a": 1}]))}, "does not fit"),
+        ("two_point", "adapt", {"optimizer0.tells": np.array(-1)}, "does not fit"),
         ("gauss_newton", "adapt", {"target": None}, "no target"),
         ("gauss_newton", "check", {"exploration1": None}, "not all explorations"),
         ("gauss_newton", "adapt", {"target": np.zeros(15)}, "'target'"),
