@@ -61,6 +61,6 @@ def complete(name: str, found: object) -> type[Optimizer]:
     if missing:
         raise ValueError(
             f"optimizer {name!r}: {called} does not define {', '.join(missing)}; see "
-            "loop_method.adapt.base.Optimizer"
+            "pdeloop.Optimizer"
         )
     return found
