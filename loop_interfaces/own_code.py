@@ -139,6 +139,11 @@ class OwnCode:
         for entry in entry_points(group=self.group):
             offered.setdefault(entry.name, []).append(entry)
         found = {entry.value: entry for entry in offered.get(name, [])}
+        if not found and name.endswith(".py"):
+            whole = shown(f"{name}:ClassName")
+            raise ValueError(
+                f"{self.word} {shown(name)} is a file; give the class in it too, as {whole}"
+            )
         if not found:
             known = [*self.shipped, *sorted(set(offered) - set(self.shipped))]
             one_of = f"one of {', '.join(known)}, or " if known else ""

@@ -206,8 +206,13 @@ def check_names(names: Iterable[str], known: Iterable[str]) -> None:
     known = list(known)
     for name in names:
         if name not in known and not name.startswith(FREE):
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+            close = difflib.get_close_matches(name, known, n=1, cutoff=0.7)
+            own = shown(f"physical.{name}")
+            hint = (
+                f"did you mean '{close[0]}'?"
+                if close
+                else f"docs/parameters.md has all; one of the equation or plant is given as {own}"
+            )
             raise ParameterError(f"unknown parameter {shown(name)}; {hint}")
 
 

@@ -46,6 +46,10 @@ def test_any_parameter_can_be_set_and_is_recorded(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("more", "words"),
     [
+        (
+            ("--set", "viscosity=1"),
+            "one of the equation or plant is given as 'physical.viscosity'",
+        ),
         (("--set", "horizn=20"), "unknown parameter 'horizn'; did you mean 'horizon'?"),
         (("--set", "horizon=many"), "'horizon' is 'many'; expected a whole number"),
         (("--set", "iterations=3"), "parameter 'iterations' is given twice; give it once"),

@@ -170,6 +170,13 @@ def test_an_object_of_the_interface_alone_is_refused_wherever_a_plant_is_taken()
             use(Bare())
 
 
+def test_a_file_without_its_class_is_told_what_is_missing(own: Path) -> None:
+    with pytest.raises(
+        ValueError, match=r"own.py' is a file; give the class in it too, as .*own.py:Cl"
+    ):
+        OWN_PLANTS.load(str(own))
+
+
 def test_code_that_only_a_file_names_is_not_run(own: Path, tmp_path: Path, capsys: Any) -> None:
     problem = own.with_name("rod.yaml")
     problem.write_text("/**: {ros__parameters: {plant: 'own.py:Rod', physical: {loss: 0.3}}}")
