@@ -20,7 +20,7 @@ COMMAND = re.compile(r"python -m benchmarks ([^`\n#]+)")
 BLANKS = {"PROBLEM": "burgers", "NAME": "two_point", "N": "4", "DIR": "limits"}
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
 def test_every_benchmark_that_a_page_names_can_be_called(page):
     for command in COMMAND.findall(page.read_text()):
         words = [BLANKS.get(word, word) for word in shlex.split(command.split(" (")[0])]
@@ -39,7 +39,7 @@ def printed(page: Path) -> list[str]:
     return [OPTIONAL.sub("", command.strip()) for command in PRINTED.findall(text)]
 
 
-PAGES = [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"]
+PAGES = [*sorted(DOCS.rglob("*.md")), DOCS.parent / "README.md"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -48,7 +48,10 @@ def test_every_command_that_a_page_prints_is_understood(page):
         assert pdeloop_parser().parse_args(shlex.split(command)[1:]), command
 
 
-@pytest.mark.parametrize("name", ["comparison.md", "appendix.md", "robustness.md", "problems.md"])
+PAGES_OF_COSTS = ("comparison.md", "reference/tables.md", "robustness.md", "problems.md")
+
+
+@pytest.mark.parametrize("name", PAGES_OF_COSTS)
 def test_a_table_of_costs_names_its_command(name):
     sections = re.split(r"^## ", (DOCS / name).read_text(), flags=re.MULTILINE)
     measured = [
@@ -70,7 +73,8 @@ def has_test(name: str, part: str) -> bool:
 
 
 def test_every_fault_that_is_survived_names_a_test_of_it():
-    rows = re.findall(r"^\|.*\|(.*)\|$", (DOCS / "reliability.md").read_text(), re.MULTILINE)[2:]
+    text = (DOCS / "reference" / "faults.md").read_text()
+    rows = re.findall(r"^\|.*\|(.*)\|$", text, re.MULTILINE)[2:]
     for row in rows:
         file, parts = "topics/test_faults.py", 0
         for name, part in NAMED.findall(row):

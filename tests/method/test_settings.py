@@ -187,7 +187,8 @@ def test_the_tables_of_settings_are_those_of_the_classes() -> None:
         rows = [
             [cell.strip(" `") for cell in line.split("|")[1:-1]] for line in section.splitlines()
         ]
-        documented[section.splitlines()[0]] = [tuple(row) for row in rows if len(row) == 4][2:]
+        if settings := [tuple(row) for row in rows if len(row) == 4][2:]:
+            documented[section.splitlines()[0]] = settings
     assert documented == {
         title: [
             (
