@@ -35,6 +35,7 @@ _EXTRAS = {
     "distributed": "cluster",
     "cmaes": "bench",
     "osqp": "bench",
+    "tensorboardX": "tensorboard",
 }
 """Modules that only some commands and nodes need, and the extra that installs them."""
 _ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")

@@ -19,11 +19,11 @@ def add(commands: Commands) -> None:
         commands,
         "export",
         _export,
-        help="a run's law as .npz or C, its curve as .csv",
+        help="a run's law as .npz or C, its curve as .csv or for TensorBoard",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: as "
         ".npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` takes too, or as one "
         "function in C99; of another law its parameters as .npz; and the cost after each step of the "
-        "training as .csv.",
+        "training as .csv or as event files of TensorBoard.",
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )
     add_argument = export.add_argument
@@ -37,6 +37,12 @@ def add(commands: Commands) -> None:
     add_argument(
         "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
     )
+    add_argument(
+        "--tensorboard",
+        type=a_path,
+        metavar="DIR",
+        help="write the curves, and what else the optimiser tells, to this new folder",
+    )
 
 
 def _export(options: argparse.Namespace) -> int:
@@ -45,8 +51,10 @@ def _export(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
-    if options.out is None and options.curve is None:
-        options.refuse("expected --out FILE for the law, --curve FILE for the curve, or both")
+    if options.out is None and options.curve is None and options.tensorboard is None:
+        options.refuse(
+            "expected --out FILE for the law, --curve FILE or --tensorboard DIR for the curve"
+        )
     if options.law is not None:
         print("WARNING: --law of export is called --controller now", file=sys.stderr)
     which = options.controller or options.law
@@ -72,4 +80,9 @@ def _export(options: argparse.Namespace) -> int:
         except OSError as error:
             raise ParameterError(f"cannot write {path}: {error.strerror}") from error
         print(f"written to {path}")
+    if options.tensorboard is not None:
+        from pdeloop.tensorboard import write_events
+
+        write_events(run, options.tensorboard)
+        print(f"written to {options.tensorboard}")
     return 0
