@@ -31,6 +31,9 @@ SKIPS = {
         "needs a C compiler, the command cc (make packages)"
     ],
     "tests/tools/test_layout.py": ["needs two cores"],
+    "tests/tuner/test_crash_points.py": [
+        "mounting an ext4 file system needs root, e2fsprogs and loop devices"
+    ],
     "tests/topics/test_own_plants.py": ["{module} is not installed: extra solvers"],
     "tests/tools/test_other_solvers.py": ["{package} is not installed: extra solvers"],
     "tests/tools/test_stable_baselines.py": ["stable-baselines3 is not installed: extra rl"],
