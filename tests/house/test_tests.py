@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests.support.interpreter import ROOT
 
-FILES = sorted((ROOT / "tests").rglob("*.py"))
-TREES = {file: ast.parse(file.read_text()) for file in FILES}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|assert_")
 SKIPS = {
@@ -46,6 +45,12 @@ SKIPS = {
 JAX, a registry that cannot be reached."""
 
 
+@cache
+def trees() -> dict[Path, ast.Module]:
+    """The tests and their support, parsed."""
+    return {file: ast.parse(file.read_text()) for file in sorted((ROOT / "tests").rglob("*.py"))}
+
+
 def functions(tree: ast.AST) -> list[Function]:
     return [node for node in ast.walk(tree) if isinstance(node, Function)]
 
@@ -69,7 +74,7 @@ def called(node: ast.AST) -> set[str]:
 def helpers() -> dict[str, bool]:
     """The functions of the tests and their support, and whether all of that name check something."""
     every: dict[str, list[Function]] = {}
-    for tree in TREES.values():
+    for tree in trees().values():
         for function in functions(tree):
             every.setdefault(function.name, []).append(function)
     known = {name: all(checks(f) for f in found) for name, found in every.items()}
@@ -91,7 +96,7 @@ def any_of(known: dict[str, bool], names: set[str]) -> bool:
 def test_every_test_can_fail() -> None:
     known = helpers()
     silent = []
-    for file, tree in TREES.items():
+    for file, tree in trees().items():
         own = {function.name: checks(function) for function in functions(tree)}
         for function in functions(tree) if file.name.startswith("test_") else ():
             silence = not own[function.name] and not any_of({**known, **own}, called(function))
@@ -115,7 +120,7 @@ def reasons(tree: ast.Module) -> list[str]:
 
 
 def test_only_what_cannot_be_had_everywhere_is_a_reason_to_skip() -> None:
-    found = {str(file.relative_to(ROOT)): reasons(tree) for file, tree in TREES.items()}
+    found = {str(file.relative_to(ROOT)): reasons(tree) for file, tree in trees().items()}
     other = [
         (name, reason)
         for name, given in found.items()
