@@ -53,6 +53,15 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Workers have to collect the same tests in the same order, and a set has another one in each."""
+    for mark in metafunc.definition.iter_markers("parametrize"):
+        if any(
+            isinstance(values, set | frozenset) for values in (*mark.args, *mark.kwargs.values())
+        ):
+            pytest.fail(f"the parameters of {metafunc.definition.name} are a set: sort them")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Each worker begins with its share of the long tests: so none is left alone with them.
 
