@@ -63,11 +63,6 @@ class LawBatch:
         """Bytes of the stored actions."""
 
     @property
-    def n_a(self) -> int:
-        """Size of an action."""
-        return self._laws[0].n_a
-
-    @property
     def remembers(self) -> bool:
         """True if the law has a memory."""
         return self._laws[0].memory_size > 0

@@ -22,6 +22,8 @@ from pdeloop.finished_run import FinishedRun
 LAWS = ("adapted", "lqt")
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
 """Columns of a curve."""
+FORMULA = tuple("=+-@\t\r")
+"""What a formula begins with in a spreadsheet."""
 _C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
 
 
@@ -87,7 +89,7 @@ class GainLaw:
         (n_z, n_s), n_a = model.U.shape, len(model.K_a)
         constant = model.K_b @ model.s_r
         filled = {
-            "name": " ".join(self.name.replace("*/", "").split()),
+            "name": " ".join(self.name.replace("*/", "* /").split()),
             "sample_time": repr(self.sample_time),
             "n_z": n_z,
             "n_s": n_s,
@@ -149,8 +151,13 @@ def curve_csv(run: FinishedRun) -> bytes:
     text = StringIO()
     writer = csv.DictWriter(text, CURVE, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: row.get(name, "") for name in CURVE} for row in rows)
+    writer.writerows({name: _cell(row.get(name, "")) for name in CURVE} for row in rows)
     return text.getvalue().encode()
+
+
+def _cell(value: Any) -> Any:
+    """A value that no spreadsheet takes for a formula, which a text from a file could be."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA else value
 
 
 def _rows(matrix: Array) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
 from loop_interfaces.own_code import OwnCodeError, called
+from loop_interfaces.text import shown
 from pde_sim_node.definition import Definition, described, source_of
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.batch import BatchPlant
 
 if TYPE_CHECKING:
     from gymnasium import Env
+
+_OUTCOMES = ("reward", "terminated", "truncated")
+_STEP = f"observation, {', '.join(_OUTCOMES)}, info"
+"""What a step returns."""
 
 
 def from_gymnasium(
@@ -65,7 +71,12 @@ def from_gymnasium(
     """
     import gymnasium
 
-    made: Env[Any, Any] = gymnasium.make(env) if isinstance(env, str) else env
+    try:
+        made: Env[Any, Any] = gymnasium.make(env) if isinstance(env, str) else env
+    except gymnasium.error.Error as error:
+        raise ValueError(f"Gymnasium makes no environment {shown(env)}: {error}") from error
+    if not isinstance(made, gymnasium.Env):
+        raise ValueError(f"env must be a gymnasium.Env or the id of one, got {shown(made)}")
     limit = made.spec.max_episode_steps if made.spec is not None else None
     for what, space in (("observation", made.observation_space), ("action", made.action_space)):
         if not isinstance(space, gymnasium.spaces.Box):
@@ -122,7 +133,7 @@ class GymnasiumPlant(BatchPlant):
         given = np.asarray(seeds)
         states = super().reset(seeds)
         while len(self._envs) < len(states):
-            self._envs.append(copy.deepcopy(self._first))
+            self._envs.append(called(f"a deep copy of {self._first}", copy.deepcopy, self._first))
         for m, seed in enumerate(given.tolist()):
             self._begin(self._envs[m], seed)
         return states
@@ -144,14 +155,41 @@ class GymnasiumPlant(BatchPlant):
 
     def _begin(self, env: Env[Any, Any], seed: int) -> Array:
         own = partial(env.reset, seed=0 if seed == MEAN_FIELD else seed)
-        observation, _ = called(f"{self._first}.reset", own)
+        observation, _ = self._returned("reset", own, names="observation, info")
         state = self._numbers("reset", observation)
         if not np.isfinite(state).all():
             raise OwnCodeError(f"{self._first}.reset returned NaN or infinity")
         return state
 
+    def _returned(
+        self, method: str, function: Callable[..., Any], *given: Any, names: str
+    ) -> tuple[Any, ...]:
+        """What a method returns: the values of these names."""
+        found = called(f"{self._first}.{method}", function, *given)
+        if not isinstance(found, tuple) or len(found) != len(names.split()):
+            size = f" of {len(found)}" if isinstance(found, tuple) else ""
+            raise OwnCodeError(
+                f"{self._first}.{method} returned a {type(found).__name__}{size}; expected the tuple "
+                f"({names})"
+            )
+        return found
+
+    def _number(self, name: str, value: Any) -> float:
+        try:
+            return float(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise OwnCodeError(
+                f"{self._first}.step returned the {name} {shown(value)}; expected a number"
+            ) from error
+
     def _numbers(self, method: str, observation: Any) -> Array:
-        numbers = np.array(observation, dtype=np.float64)  # a copy: it may be reused for the next
+        try:
+            numbers = np.array(observation, dtype=np.float64)  # a copy: it may be reused
+        except (TypeError, ValueError, OverflowError) as error:
+            raise OwnCodeError(
+                f"{self._first}.{method} returned the observation {shown(observation)}; expected "
+                f"{self.n_z} numbers"
+            ) from error
         if numbers.size != self.n_z:
             raise OwnCodeError(
                 f"{self._first}.{method} returned an observation of shape {numbers.shape}; expected "
@@ -164,15 +202,21 @@ class GymnasiumPlant(BatchPlant):
         np.clip(self.actions, low, high, out=self.actions)
         for m in np.flatnonzero(self.diverged_step < 0):
             action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
-            observation, reward, terminated, truncated, _ = called(
-                f"{self._first}.step", self._envs[m].step, action
+            observation, *rest = self._returned(
+                "step",
+                self._envs[m].step,
+                action,
+                names=_STEP,
+            )
+            reward, terminated, truncated = (
+                self._number(name, value) for name, value in zip(_OUTCOMES, rest[:3], strict=True)
             )
             if truncated and self.step_index + 1 < self.horizon:
                 raise OwnCodeError(
                     f"{self._first} ends an episode after {self.step_index + 1} steps, and its horizon "
                     f"is {self.horizon}: give a horizon of {self.step_index + 1} or less"
                 )
-            cost = -float(reward)
+            cost = -reward
             if self.quadratic:
                 error_squared = np.square(self.states[m] - self.target).sum()
                 cost = self.state_weight * float(error_squared)

@@ -88,3 +88,79 @@ def test_an_optimiser_that_needs_a_target_is_refused_without_one(
     assert main([*words, "--optimizer", "two_point", *budget, "--out", str(tmp_path / "run")]) == 0
     done = main(["evaluate", str(tmp_path / "run"), "--plant", f"{NAME}:rewarded"])
     assert done in (0, COSTLIER)  # on other fields the law of few rollouts may cost more than none
+
+
+class Misbehaving(gymnasium.Env[Any, Any]):
+    """Returns what it is told to."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, reset: Any = ([0.0, 0.0], {}), step: Any = None) -> None:
+        self.returned = {"reset": reset, "step": step}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.returned["reset"]
+
+    def step(self, action: Any) -> Any:
+        return self.returned["step"]
+
+    def __str__(self) -> str:
+        return "env"
+
+
+class Uncopiable(Misbehaving):
+    """Cannot be copied."""
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        raise TypeError("cannot pickle a lock")
+
+
+NOTHING = np.zeros(2)
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        (
+            Misbehaving(NOTHING),
+            r"reset returned a ndarray; expected the tuple \(observation, info\)",
+        ),
+        (Misbehaving((NOTHING, 0.0, {})), "reset returned a tuple of 3; expected"),
+        (Misbehaving(({"a": 1}, {})), r"reset returned the observation .*; expected 2 numbers"),
+        (Misbehaving(([[1.0], [1.0, 2.0]], {})), r"the observation .*; expected 2 numbers"),
+        (Misbehaving((np.zeros(3), {})), r"observation of shape \(3,\); expected 2 numbers"),
+        (Misbehaving(([np.nan, 0.0], {})), "reset returned NaN or infinity"),
+        (
+            Misbehaving(step=(NOTHING, 0.0, False, {})),
+            r"step returned a tuple of 4; expected the tuple",
+        ),
+        (Misbehaving(step=None), "step returned a NoneType; expected the tuple"),
+        (Misbehaving(step=(NOTHING, None, False, False, {})), "the reward None; expected a number"),
+        (
+            Misbehaving(step=(NOTHING, 10**400, False, False, {})),
+            "the reward a number of more than 300 digits; expected",
+        ),
+        (
+            Misbehaving(step=(NOTHING, 0, NOTHING, False, {})),
+            r"the terminated .*; expected a number",
+        ),
+        (
+            Misbehaving(step=("ab", 0.0, False, False, {})),
+            "the observation 'ab'; expected 2 numbers",
+        ),
+        (Uncopiable(), "a deep copy of env fails: .*cannot pickle a lock"),
+    ],
+)
+def test_an_environment_that_misbehaves_is_told_in_a_sentence(env: Any, said: str) -> None:
+    plant = pdeloop.from_gymnasium(env, horizon=3)
+    with pytest.raises(OwnCodeError, match=said) as error:
+        pdeloop.rollout(plant, lambda k, z: np.zeros((1, 1)), [0])
+    assert len(str(error.value)) < 300
+
+
+def test_what_is_no_environment_is_refused() -> None:
+    with pytest.raises(ValueError, match="Gymnasium makes no environment 'Nowhere-v1'"):
+        pdeloop.from_gymnasium("Nowhere-v1")
+    with pytest.raises(ValueError, match=r"must be a gymnasium\.Env"):
+        pdeloop.from_gymnasium(object())  # type: ignore[arg-type]

@@ -9,13 +9,17 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.model_rows import ModelRows
 from pdeloop.cli import FAILED, main
 from pdeloop.comparison import compare
+from pdeloop.export import GainLaw, curve_csv
 from pdeloop.finished_run import load_run
 from tests.support.small import SMALL
 
@@ -141,6 +145,19 @@ def test_the_former_name_of_a_flag_is_understood(
         assert ("called --controller now" in capsys.readouterr().err) == (flag == "--law")
     old, new = (np.load(path) for path in files.values())
     assert np.array_equal(old["K_a"], new["K_a"])
+
+
+def test_texts_of_a_file_become_neither_a_formula_nor_the_end_of_a_comment() -> None:
+    row = {"event": "adapted", "seed": 0, "rollouts": 3, "cost": -1.5, "role": '=HYPERLINK("x")'}
+    run: Any = SimpleNamespace(result={"history": [row]})
+    (_, line) = curve_csv(run).decode().splitlines()
+    (cells,) = csv.reader([line])
+    assert cells[2:4] == ["-1.5", '\'=HYPERLINK("x")']
+    own = ModelRows(
+        **{name: np.ones((1, 1)) for name in ("A", "B", "U", "K_a", "K_b")}, s_r=np.ones(1)
+    )
+    code = GainLaw(own, 0.0, 0.1, "a **// system(0); /*").c().decode()
+    assert code.index("*/") == code.index(" */\n") + 1
 
 
 def test_the_curve_is_that_of_the_history(
