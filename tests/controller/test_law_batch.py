@@ -89,6 +89,40 @@ def test_what_is_asked_for_twice_is_answered_from_what_was_answered() -> None:
         assert same_bits(twice.actions(k, z), expected[k])
 
 
+def test_a_law_without_memory_answers_any_step_and_keeps_nothing() -> None:
+    policies, index, states = episode(FeedForward, 3)
+    batch = made(FeedForward)
+    batch.set(policies, index)
+    late = batch.actions(3, states[3])
+    for k in range(3):
+        batch.actions(k, states[k])
+    assert same_bits(batch.actions(3, states[3]), late) and batch.nbytes == 0
+
+
+class Counting(FeedForward):
+    """Adds how many steps it remembers to its actions, where theta is not zero."""
+
+    memory_size = 1
+
+    def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+        return super().action(theta, z, memory, k) + memory[0] * theta["b"][0]
+
+    def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
+        return memory + 1.0
+
+
+def test_answers_count_in_bytes_and_a_begun_episode_begins_with_the_first_memory() -> None:
+    policies, index, states = episode(Counting, 3)
+    batch = made(Counting)
+    batch.set(policies, index)
+    expected = [batch.actions(k, z) for k, z in enumerate(states)]
+    assert batch.nbytes == 8 * T * 3 * N_A
+    batch.forget_answers()
+    assert batch.nbytes == 8 * 3 * N_A
+    again = [batch.actions(k, z) for k, z in enumerate(states)]
+    assert all(map(same_bits, again, expected)) and batch.nbytes == 8 * T * 3 * N_A
+
+
 def test_a_memory_that_is_not_known_is_never_made_up() -> None:
     policies, index, states = episode(Observer, 3)
     batch = made(Observer)
