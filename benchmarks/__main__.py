@@ -39,6 +39,7 @@ PROGRAMS = {
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
     "estimator": "what an estimator with the true plant reaches with few sensors and noise",
+    "few_sensors": "trainings with few sensors and noise, each seed by itself",
     "linearised": "what the LQR law of the exact linearisation at the target costs",
     "environments": "steps a second of the Gymnasium environments",
     "participants": "memory and processor time of many idle nodes that know each other",

@@ -40,12 +40,13 @@ class ModelBasedSensed(ModelBasedReadings):
         return model if isinstance(model, SensedModel) else None
 
     def _next_renewal(self) -> int:
-        """After one rollout of the first law, then as often as on a model of the whole field."""
-        if not self._records.count:
-            return 1
-        if self._sensed is not None:
-            return ModelBased._next_renewal(self)
-        return super()._next_renewal()
+        """After as many rollouts of the first law as judge one, then after twice as many."""
+        own, last = self._records.count, self._last_renewal()
+        if own < self._settings.judging:
+            return min(self._settings.judging, last)
+        if self._sensed is None:
+            return super()._next_renewal()
+        return 2 * own if 4 * own <= last else last
 
     def _believe(self) -> Belief | None:
         """In an equation, as long as one reproduces the readings; then in a model of the readings."""
@@ -96,15 +97,14 @@ class ModelBasedSensed(ModelBasedReadings):
         theta = cheapest(loop, [laws[0], start, found.theta], held_out, equal)
         if theta is not laws[0]:
             progress.policy = loop.policy(theta, self._first)
-        first, none = (
-            loop.costs(law, held_out) for law in (loop.theta(self._first), loop.no_control)
-        )
+        first = loop.costs(loop.theta(self._first), held_out)
+        none = loop.costs(loop.no_control, held_out)
         progress.safe = bool(first.mean() < none.mean())
-        with np.errstate(invalid="ignore"):
-            change = loop.costs(theta, held_out) - (first if progress.safe else none)
-        progress.held_out = np.array([1.0, *mean_and_error(change)])
-        row["steps"], row["predicted_change"] = found.steps, float(progress.held_out[1])
-        row["deviation"] = float(progress.held_out[2])
+        change, deviation = gained(loop.costs(theta, held_out), first if progress.safe else none)
+        progress.held_out = np.array([1.0, change, deviation])
+        row["steps"] = found.steps
+        if np.isfinite(change):
+            row["predicted_change"], row["deviation"] = change, deviation
 
     def _judge(self, row: Row) -> None:
         """As on a model of the whole field, where there is one."""
@@ -120,6 +120,15 @@ def weighted(fields: Array, drawn: Array, share: float) -> tuple[Array, Array]:
     own = np.full(len(fields), share / len(fields))
     others = np.full(len(drawn), (1.0 - share) / max(len(drawn), 1))
     return np.concatenate([fields, drawn]), np.concatenate([own, others])
+
+
+def gained(costs: Array, base: Array) -> tuple[float, float]:
+    """The mean change against the costs of another law and its standard error, where both are finite.
+
+    NaN where neither ever is.
+    """
+    known = np.isfinite(costs) & np.isfinite(base)
+    return mean_and_error(costs[known] - base[known]) if known.any() else (np.nan, np.nan)
 
 
 def cheapest(loop: SensedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:

@@ -22,7 +22,7 @@ from loop_method.adapt import (
 )
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, weighted
+from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
 from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
@@ -236,3 +236,9 @@ def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> Non
     )
     lost = Record(np.zeros(1), np.inf, readings, np.zeros((1, N_A)))
     assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0]))
+
+
+def test_a_change_is_that_of_the_fields_from_which_both_laws_are_finite() -> None:
+    change, deviation = gained(np.array([1.0, np.inf, 3.0]), np.array([2.0, np.inf, 5.0]))
+    assert change == -1.5 and deviation == pytest.approx(0.5)
+    assert np.isnan(gained(np.array([np.inf]), np.array([1.0]))[0])

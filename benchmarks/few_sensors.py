@@ -1,0 +1,120 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks few_sensors`: trainings with few sensors and noise, each seed by itself.
+
+Costs are those of the closing evaluation on ten held-out fields, the same for all seeds and for
+`python -m benchmarks estimator`, which gives the bound. Finished trainings are kept in a folder, so
+that an interrupted run continues where it stood.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pdeloop
+from benchmarks.general import number
+from loop_interfaces.files import make_folder, read_json
+from pdeloop.study.executors import processes
+
+__all__ = ["run", "text"]
+
+Task = tuple[str, int, float, str, int]
+"""Problem, sensors, noise, law and seed."""
+
+
+def run(
+    problems: Sequence[str] = ("burgers", "allen-cahn", "kdv"),
+    *,
+    sensors: Sequence[int] = (8, 16),
+    noise: Sequence[float] = (0.0, 0.03, 0.1),
+    laws: Sequence[str] = ("observer",),
+    first: int = 2000,
+    seeds: int = 6,
+    rollouts: int = 20,
+    jobs: int | None = None,
+    folder: Path = Path("runs/few-sensors"),
+) -> list[dict[str, Any]]:
+    """Train with few sensors.
+
+    Parameters
+    ----------
+    problems
+        Names, or files.
+    sensors
+        How many there are.
+    noise
+        Standard deviations of a reading.
+    laws
+        Names of laws.
+    first
+        The first seed.
+    seeds
+        Trainings of each case.
+    rollouts
+        Of each, explorations and checks among them.
+    jobs
+        Processes; one a core if not given.
+    folder
+        Where finished trainings are kept.
+    """
+    own = range(first, first + seeds)
+    tasks = list(itertools.product(problems, sensors, noise, laws, own))
+    make_folder(folder)
+    rows = []
+    with processes(jobs) as pool:
+        work = partial(train, rollouts=rollouts, folder=folder.resolve())
+        for row in pool.map(work, tasks):
+            rows.append(row)
+            print(f"{line([row])} ({len(rows)} of {len(tasks)})", file=sys.stderr, flush=True)
+    return rows
+
+
+def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
+    """One training; its costs on the held-out fields, or the error that ended it."""
+    problem, sensors, noise, law, seed = task
+    label = f"{Path(problem).stem}-{sensors}-{noise:g}-{law}-{seed}-{rollouts}"
+    path = folder / f"{label}.json"
+    if path.exists():
+        found: dict[str, Any] = read_json(path)
+        return found
+    row: dict[str, Any] = {"problem": problem, "sensors": sensors, "noise": noise, "law": law}
+    row["seed"] = seed
+    given: dict[str, Any] = {"sensors": sensors, "measurement_noise": noise, "law": law}
+    try:
+        done = pdeloop.train(problem, rollouts=rollouts, seed=seed, **given)
+        row |= {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
+    except (ValueError, RuntimeError) as error:
+        row["error"] = " ".join(str(error).split())
+    path.write_text(json.dumps(row))
+    return row
+
+
+def line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A row of the table from the trainings of one case, the costs of the seeds in their order."""
+    one = rows[0]
+    cells = [one["problem"], str(one["sensors"]), f"{one['noise']:g}", one["law"]]
+    known = [row for row in rows if "error" not in row]
+    cells.append(number(known[0]["none"]) if known else "-")
+    for key in ("lqt", "adapted"):
+        cells.append(", ".join(number(row.get(key)) for row in rows))
+    return f"| {' | '.join(cells)} |"
+
+
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A Markdown table with a row for each case, and the errors."""
+    head = ["problem", "sensors", "noise", "law", "no control", "first law", "adapted"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    cases: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        case = tuple(row[key] for key in ("problem", "sensors", "noise", "law"))
+        cases.setdefault(case, []).append(row)
+    lines += [line(own) for own in cases.values()]
+    lines += [
+        f"{row['problem']}, seed {row['seed']}: {row['error']}" for row in rows if "error" in row
+    ]
+    return "\n".join(lines)
