@@ -51,20 +51,26 @@ def positive(name: str, value: float) -> float:
     return float(number)
 
 
-Coefficient: TypeAlias = float | Sequence[float] | Callable[[Array], Array]
-"""A number, the values at the points of a grid, or a function of x that gives them."""
+Coefficient: TypeAlias = float | Sequence[float] | Array | Callable[..., Array]
+"""A number, the values at the points of a grid, or a function of x, or x and y, that gives them."""
 
 
-def values_at(name: str, given: Coefficient, x: Array) -> Array:
-    """A coefficient at points x (n,); ValueError where it has not as many finite values.
+def values_at(name: str, given: Coefficient, x: Array, *further: Array) -> Array:
+    """A coefficient at points, in the shape of x; ValueError where it has not as many finite values.
+
+    x, further: coordinates of the points, all of one shape; values may also come in a row.
 
     >>> values_at("growth", lambda x: 1.0 - x, np.array([0.0, 0.5]))
     array([1. , 0.5])
     """
-    values = float_array(name, given(x.copy()) if callable(given) else given)
+    places = (x, *further)
+    values = float_array(name, given(*map(np.copy, places)) if callable(given) else given)
+    if values.shape == (x.size,):
+        values = values.reshape(x.shape)
     if values.shape not in ((), x.shape) or not np.isfinite(values).all():
         raise ValueError(
-            f"{name} must be a finite number, {len(x)} of them or a function of x that gives as many, "
+            f"{name} must be a finite number, {x.size} of them or a function of "
+            f"{' and '.join('xyz'[: len(places)])} that gives as many, "
             f"got {'NaN or infinity' if values.shape in ((), x.shape) else f'shape {values.shape}'}"
         )
     return np.broadcast_to(values, x.shape).copy()

@@ -20,14 +20,17 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from pde_sim_node.arguments import positive
+from pde_sim_node.arguments import Coefficient, positive, values_at
 from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion
+from pde_sim_node.plants.variable_diffusion import VariableDiffusion
 
 
 class Plate(ReactionDiffusion):
-    """u_t = D (u_xx + u_yy) + r u - b u^3 on a rectangle: heat for r = b = 0.
+    """u_t = div(D grad u) + r u - b u^3 on a rectangle: heat for r = b = 0.
 
-    With r > 0 rest is unstable: without flux through the walls for all waves with D |k|^2 < r.
+    With r > 0 rest is unstable: without flux through the walls for all waves with D |k|^2 < r. D, r and
+    b are numbers, functions of x and y, or values at the points, row by row. Where D is not a number,
+    diffusion is solved as in `pde_sim_node.plants.variable_diffusion` in place of exact waves.
     """
 
     horizon, sample_time = 50, 0.1
@@ -39,16 +42,18 @@ class Plate(ReactionDiffusion):
         ny: int = 24,
         width: float = 1.5,
         height: float = 1.0,
-        diffusivity: float = 0.05,
-        growth: float = 1.0,
-        saturation: float = 1.0,
+        diffusivity: Coefficient = 0.05,
+        growth: Coefficient = 1.0,
+        saturation: Coefficient = 1.0,
         walls: str = "neumann",
         across: int = 2,
         up: int = 2,
         spread: float = 0.5,
         step_time: float = 0.02,
     ) -> None:
-        self._D, self._r, self._b = positive("diffusivity", diffusivity), growth, saturation
+        self._D = diffusivity
+        if isinstance(diffusivity, int | float):
+            self._D = positive("diffusivity", float(diffusivity))
         super().__init__(
             points=(ny, nx),
             lengths=(height, width),
@@ -56,6 +61,11 @@ class Plate(ReactionDiffusion):
             actuators=(up, across),
             spread=spread,
             step_time=step_time,
+        )
+        y, x = np.meshgrid(*(axis.points for axis in self.grid.axes), indexing="ij")
+        self._r, self._b = (
+            given if isinstance(given, int | float) else values_at(name, given, x, y)
+            for name, given in (("growth", growth), ("saturation", saturation))
         )
 
     @property
@@ -65,8 +75,18 @@ class Plate(ReactionDiffusion):
 
     @property
     def diffusion(self) -> Array:
-        """D."""
-        return np.array([[self._D]])
+        """D; its mean where it depends on the place."""
+        return np.array([[self._D if self._variable is None else self._variable.at_points.mean()]])
+
+    def _propagate(self) -> Array:
+        self._variable: VariableDiffusion | None = None
+        if isinstance(self._D, float):
+            return super()._propagate()
+        self._variable = VariableDiffusion(self.grid, self.walls, self._D, self._dt)
+        return np.empty(0)
+
+    def _diffused(self, w: Array) -> Array:
+        return super()._diffused(w) if self._variable is None else self._variable.step(w)
 
     def reaction(self, w: Array) -> Array:
         """r u - b u^3."""

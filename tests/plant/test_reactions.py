@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,79 @@ def test_a_plane_wave_of_ginzburg_landau_travels_exactly() -> None:
     np.testing.assert_allclose(z, wave(2.0), atol=1e-5)
 
 
+# u = exp(-t) m(x, y) is exact for any D where r = -(div(D grad m))/m - 1, so m is any positive field,
+# or one that is 0 at the walls where D is flat there.
+WIDTH, HEIGHT, MEAN = 1.5, 1.0, 0.05
+
+
+def manufactured(walls: str) -> tuple[Any, Any, Any]:
+    """m, D and r as functions of x and y, by derivatives taken by hand."""
+    kx, ky = (2 if walls == "periodic" else 1) * np.pi / np.array([WIDTH, HEIGHT])
+    qx, qy = 2 * np.pi / np.array([WIDTH, HEIGHT])
+    shift = 0.0 if walls == "dirichlet" else 2.0
+    f, df = (np.sin, np.cos) if walls == "dirichlet" else (np.cos, lambda s: -np.sin(s))
+
+    def m(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return shift + f(kx * x) * f(ky * y)
+
+    def d(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return MEAN * (1 + 0.4 * np.cos(qx * x) * np.cos(qy * y))
+
+    def r(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        D_x = -MEAN * 0.4 * qx * np.sin(qx * x) * np.cos(qy * y)
+        D_y = -MEAN * 0.4 * qy * np.cos(qx * x) * np.sin(qy * y)
+        m_x, m_y = kx * df(kx * x) * f(ky * y), ky * f(kx * x) * df(ky * y)
+        bend = -(kx**2 + ky**2) * f(kx * x) * f(ky * y)
+        return -(d(x, y) * bend + D_x * m_x + D_y * m_y) / m(x, y) - 1.0
+
+    return m, d, r
+
+
+@pytest.mark.parametrize("values", ["functions", "values at the points"])
+@pytest.mark.parametrize("walls", WAVES)
+def test_diffusion_that_depends_on_the_place_has_an_exact_solution_of_second_order(
+    walls: str, values: str
+) -> None:
+    m, D, r = manufactured(walls)
+    errors = []
+    for level in (1, 2):
+        nx, ny = 12 * level, 8 * level
+        axes = Plate(nx, ny, WIDTH, HEIGHT, walls=walls).grid.axes
+        y, x = np.meshgrid(*(axis.points for axis in axes), indexing="ij")
+        given = {"diffusivity": D, "growth": r}
+        if values != "functions":  # in a row, as a file has them
+            given = {name: own(x, y).ravel().tolist() for name, own in given.items()}
+        how = {"saturation": 0.0, "walls": walls, "step_time": 0.1 / (2 * level)}
+        plant = Plate(nx, ny, WIDTH, HEIGHT, **given, **how)  # type: ignore[arg-type]
+        z = m(x, y).reshape(1, -1)
+        for _ in range(5):
+            z = plant.step(z, np.zeros((1, plant.n_a)))
+        errors.append(float(np.abs(z - np.exp(-0.5) * m(x, y).ravel()).max()))
+    assert errors[0] < 0.05 and errors[0] / errors[1] == pytest.approx(4.0, rel=0.2), errors
+
+
+def test_a_constant_given_at_each_point_leads_to_the_same_heat_and_conserves_it() -> None:
+    """Without flux through the walls the mean stays; exact waves are the limit of small cells."""
+    exact, cells = (
+        Plate(24, 16, diffusivity=D, growth=0.0, saturation=0.0) for D in (0.05, [0.05] * (24 * 16))
+    )
+    z = exact.initial_state(np.random.default_rng(3))[None]
+    none = np.zeros((1, exact.n_a))
+    one, other = exact.step(z, none), cells.step(z, none)
+    np.testing.assert_allclose(other, one, atol=2e-3)
+    assert np.mean(other) == pytest.approx(np.mean(z), abs=1e-14)
+    again = pickle.loads(pickle.dumps(cells))
+    assert np.array_equal(again.step(z, none), other)
+
+
+def test_a_batch_on_a_plate_of_variable_diffusivity_has_the_bits_of_one() -> None:
+    D = manufactured("neumann")[1]
+    plant = Plate(12, 8, diffusivity=D)
+    z = np.stack([plant.initial_state(np.random.default_rng(seed)) for seed in range(4)])
+    a = np.random.default_rng(9).standard_normal((4, plant.n_a))
+    assert np.array_equal(plant.step(z, a)[2], plant.step(z[2:3], a[2:3])[0])
+
+
 @pytest.mark.parametrize("kind", ALL)
 def test_a_batch_has_the_bits_of_one(kind: type[ReactionDiffusion]) -> None:
     plant, alone = DynamicsPlant(kind()), DynamicsPlant(kind())
@@ -114,5 +188,9 @@ def test_walls_and_sizes_that_do_not_fit_are_refused() -> None:
         Plate(walls="open")
     with pytest.raises(ValueError, match="allow no state but u = 1, v = 0"):
         GrayScott(feed=0.04, kill=0.08)
+    with pytest.raises(ValueError, match="diffusivity must be positive, got -"):
+        Plate(diffusivity=lambda x, y: x - 0.5)
+    with pytest.raises(ValueError, match=r"growth must be .* 768 of them or a function of x and y"):
+        Plate(growth=[1.0, 2.0])
     with pytest.raises(ValueError, match="points must be at least 4"):
         Plate(nx=2)
