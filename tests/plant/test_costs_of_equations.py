@@ -139,6 +139,38 @@ def test_a_run_keeps_it_and_evaluates_with_it(tmp_path: Any) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "small"),
+    [
+        ("allen-cahn", {"n_a": 4, "horizon": 30, "reduced_order": 6}),
+        ("kdv", {"n_a": 6, "horizon": 40, "reduced_order": 8, "length": 10.0}),
+    ],
+)
+def test_a_law_that_is_trained_for_it_costs_less_than_one_for_the_plain_cost(
+    name: str, small: dict[str, Any]
+) -> None:
+    """Weights of an output, a target of it, and a terminal weight, on fields of neither training."""
+    waves = np.array([np.cos(2 * np.pi * i * np.arange(N_Z) / N_Z) for i in range(3)]) / N_Z
+    cost = {
+        "output": waves,
+        "target": [0.2, 0.1, 0.0],
+        "state_weight": np.array([100.0, 50.0, 20.0]),
+        "action_weight": np.full(small["n_a"], 0.01),
+        "terminal_weight": np.full(3, 10.0),
+    }
+    general, plain = (
+        pdeloop.problem(name, n_z=N_Z, **small, **given) for given in ({"cost": cost}, {})
+    )
+    plant = general.plant(4)
+    found = {}
+    for which, own in (("general", general), ("plain", plain)):
+        run = pdeloop.train(own, rollouts=8, evaluation_fields=2)
+        law = pdeloop.projected_law(plant, run.models[0].U, run.policies[0])
+        found[which] = pdeloop.rollout(plant, law, [100, 101, 102, 103]).costs.mean.mean()
+    none = pdeloop.rollout(plant, lambda k, z: np.zeros((4, plant.n_a)), [100, 101, 102, 103])
+    assert found["general"] < min(0.98 * found["plain"], 0.9 * none.costs.mean.mean())
+
+
 def test_states_that_run_away_cost_what_a_divergence_costs() -> None:
     plant = pdeloop.problem("burgers", n_z=N_Z, horizon=T, cost={"terminal_weight": 1.0}).plant(2)
     wild = np.array([np.zeros(6), np.full(6, 1e200)])
