@@ -21,11 +21,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.documents import parse_json
+from loop_interfaces.text import shown
 
 _SEMIDEFINITE = 1e-10
 """An eigenvalue of a weight below minus this, relative to the largest, is negative."""
 _LINE = 8000
 """Characters of one text; a YAML file takes no much longer ones."""
+MAX_ARRAY_BYTES = 2**29
+"""Most bytes of an array in a text: a weight of 8,192 x 8,192."""
 _ARRAYS = ("state_weight", "action_weight", "target", "output", "action_target", "terminal_weight")
 
 
@@ -186,10 +190,17 @@ class Cost:
         if not text:
             return None
         try:
-            n_z, n_a, horizon, packed = json.loads(text)
+            n_z, n_a, horizon, packed = parse_json(text)
             arrays = {str(name): _unpacked(value) for name, value in packed.items()}
             return cls(int(n_z), int(n_a), int(horizon), **arrays)
-        except (AttributeError, KeyError, TypeError, ValueError, zlib.error) as error:
+        except (
+            ArithmeticError,
+            AttributeError,
+            KeyError,
+            TypeError,
+            ValueError,
+            zlib.error,
+        ) as error:
             raise ValueError(f"{text[:80]!a} is not a cost: {error}") from error
 
 
@@ -301,9 +312,13 @@ def _packed(array: Array) -> Any:
 
 def _unpacked(value: Any) -> Array:
     shape = tuple(int(size) for size in value["shape"])
-    if "number" in value:
-        return np.full(shape, float(value["number"]))
     wanted = 8 * math.prod(shape)
+    if "number" in value:
+        if wanted != 8:
+            raise ValueError(f"an array of shape {shown(shape)} is given as one number")
+        return np.full(shape, float(value["number"]))
+    if wanted > MAX_ARRAY_BYTES:
+        raise ValueError(f"an array has {wanted} bytes; expected at most {MAX_ARRAY_BYTES}")
     raw = zlib.decompressobj().decompress(base64.b85decode(value["data"]), wanted + 1)
     if len(raw) != wanted:
         raise ValueError(f"an array of shape {shape} has {wanted} bytes, got {len(raw)}")

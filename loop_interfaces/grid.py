@@ -13,6 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.documents import parse_json
+from loop_interfaces.text import shown
+
+MAX_NUMBERS = 2**24
+"""Most numbers of a state that a text can tell of: no message holds more."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +122,14 @@ class Grid:
         object.__setattr__(self, "axes", axes)
         object.__setattr__(self, "components", named)
         if other := [axis for axis in axes if not isinstance(axis, Axis)]:
-            raise ValueError(f"the axes of a grid must be of the class Axis, got {other[0]!r}")
-        object.__setattr__(self, "numbers", int(self.numbers))  # NumPy's cannot be written as JSON
+            raise ValueError(f"the axes of a grid must be of the class Axis, got {shown(other[0])}")
+        object.__setattr__(self, "numbers", operator.index(self.numbers))  # NumPy's is not JSON
         if not self.components:
             raise ValueError("a grid has one component or more, got none")
-        if bool(self.axes) == bool(self.numbers):
+        if self.numbers < 0 or bool(self.axes) == bool(self.numbers):
             raise ValueError(
-                "a state has axes, or is a plain vector of a number of numbers: give one of both"
+                "a state has axes, or is a plain vector of a positive number of numbers: give one of "
+                "both"
             )
 
     @classmethod
@@ -204,8 +210,8 @@ class Grid:
         True
         """
         try:
-            axes, components, unit, numbers = json.loads(text)
-            return cls(
+            axes, components, unit, numbers = parse_json(text)
+            grid = cls(
                 tuple(
                     Axis(str(name), float(length), int(size), bool(periodic), bool(walls), str(own))
                     for name, length, size, periodic, walls, own in axes
@@ -214,7 +220,10 @@ class Grid:
                 str(unit),
                 int(numbers),
             )
-        except (TypeError, ValueError) as error:
+            if grid.size > MAX_NUMBERS:
+                raise ValueError(f"it has more than {MAX_NUMBERS} numbers")
+            return grid
+        except (ArithmeticError, TypeError, ValueError) as error:
             raise ValueError(f"{text[:200]!a} does not describe a grid: {error}") from error
 
     @property

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.documents import parse_json
 from loop_interfaces.grid import Axis, Grid
 
 MOST = 256
@@ -110,7 +111,7 @@ def parse(text: str) -> list[Box]:
     try:
         boxes = [
             Box(int(component), tuple((float(low), float(high)) for low, high in sides))
-            for component, *sides in json.loads(text)[:MOST]
+            for component, *sides in parse_json(text)[:MOST]
         ]
     except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise ValueError(f"{text[:200]!a} tells of no actuators: {error}") from error

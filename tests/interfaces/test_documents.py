@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces import documents
+from loop_interfaces import documents, places
+from loop_interfaces.cost import Cost
 from loop_interfaces.documents import MAX_DEPTH, MAX_YAML_NODES, parse_json, parse_yaml
+from loop_interfaces.grid import Grid
 from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.spec import ParameterError, Spec
@@ -253,3 +257,36 @@ def test_data_that_make_a_matrix_singular_get_their_own_sentence(tmp_path, capsy
     assert main(["identify", "--data", str(data)]) == FAILED
     (line,) = capsys.readouterr().err.splitlines()
     assert "slice" not in line and len(line) < 500
+
+
+ZEROS = base64.b85encode(zlib.compress(bytes(2**27), 9)).decode()
+"""Text that stands for a thousand times its length."""
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (Cost.parse, "[" * 20_000),
+        (Cost.parse, "[1e999, 1, 9, {}]"),
+        (Cost.parse, '[2, 1, 9, {"target": {"shape": [1e999], "number": 1}}]'),
+        (Cost.parse, '[2, 1, 9, {"target": {"shape": [30000, 30000], "number": 1}}]'),
+        (Cost.parse, f'[2, 1, 9, {{"target": {{"shape": [{2**30}], "data": "{ZEROS}"}}}}]'),
+        (Cost.parse, f'[2, 1, 9, {{"target": {{"shape": [3], "data": "{ZEROS}"}}}}]'),
+        (Cost.parse, "{}"),
+        (Grid.parse, "[" * 20_000),
+        (Grid.parse, '[[["x", 1.0, 1e999, true, true, "m"]], ["u"], "", 0]'),
+        (Grid.parse, '[[["x", 1.0, 1e300, true, true, "m"]], ["u"], "", 0]'),
+        (Grid.parse, '[[["y", 1, 9999, 0, 0, "m"], ["x", 1, 9999, 0, 0, "m"]], "u", "", 0]'),
+        (Grid.parse, '[[], ["u"], "", -3]'),
+        (Grid.parse, '[[], ["u"], "", 1e999]'),
+        (places.parse, "[" * 20_000),
+        (places.parse, "[[1e999, [0, 1]]]"),
+        (places.parse, '{"a": 1}'),
+    ],
+)
+def test_a_hostile_text_of_a_parameter_is_refused_in_one_short_sentence(
+    parse: Callable[[Any], object], text: str
+) -> None:
+    with limited(seconds=20, megabytes=300), pytest.raises(ValueError) as error:
+        parse([text] if parse == Cost.parse else text)
+    assert len(str(error.value)) < 400
