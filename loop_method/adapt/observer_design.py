@@ -39,8 +39,10 @@ from loop_method.design.lqg import kalman_filter
 from loop_method.design.lqt import DesignError
 from loop_method.models.sensed import SensedModel
 
-SHARES = (0.1, 1.0)
-"""Shares of the initial second moment that count as process noise over an episode; each makes a law."""
+SHARES = (0.01, 0.1, 1.0)
+"""Shares of the initial second moment that count as process noise over an episode; each makes laws."""
+ESTIMATED = (1.0, 0.5, 0.0)
+"""Shares of the action that follow the filter's estimate; the rest follows the newest readings."""
 RIDGE = 1e-6
 """Of the regressions, relative to the mean square of a mode."""
 TOLD = 1e-2
@@ -109,7 +111,11 @@ def whole_field_law(
 
 
 def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
-    """Theta (`ObservedLoop`) of the law on the estimates of a Kalman filter, for each of `SHARES`."""
+    """Theta (`ObservedLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
+
+    One for each of `SHARES` and `ESTIMATED`: where few readings tell little of a nonlinear plant, a law
+    on the filter's estimate alone may run away.
+    """
     model = loop.model
     assert isinstance(model, SensedModel)
     every = model.n_z // model.sensors
@@ -129,6 +135,8 @@ def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
     W = W + LEAST * np.trace(first) / n_s * np.eye(n_s)
     seen = y[0].T @ (law.weights[:, None] * y[0]) + np.diag(noise)
     guess = linalg.solve(seen, y[0].T @ (law.weights[:, None] * x[0]), assume_a="pos").T
+    read = np.column_stack([y[:-1].reshape(-1, model.sensors), np.ones(weights.size)])
+    D, own, _ = _regression(read, a.reshape(weights.size, -1), weights, np.append(noise, 0.0))
     K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
     for share in SHARES:
         try:
@@ -136,17 +144,26 @@ def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
         except DesignError:
             continue
         I_MC = np.eye(n_s) - M @ C
-        rows = K @ I_MC, K @ M, b - K @ M @ d
         after = A @ I_MC, A @ M, c - A @ M @ d
-        yield law_theta(loop, B, guess, rows, after)
+        for part in ESTIMATED:
+            rows = part * K @ I_MC, part * K @ M, part * (b - K @ M @ d)
+            rest = (1.0 - part) * D, (1.0 - part) * own
+            mixed = rows[0], rows[1] + rest[0], rows[2] + rest[1]
+            yield law_theta(loop, B, guess, mixed, after)
 
 
-def _regression(features: Array, wanted: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Matrix and constant of the weighted regression on [x; 1], and the covariance of what is left."""
+def _regression(
+    features: Array, wanted: Array, weights: Array, noise: Array | float = 0.0
+) -> tuple[Array, Array, Array]:
+    """Matrix and constant of the weighted regression on [x; 1], and the covariance of what is left.
+
+    noise: variances of what will be added to the features.
+    """
     weighted = features * weights[:, None]
     moment = features.T @ weighted
     n = len(moment) - 1
     moment[np.diag_indices(n)] += RIDGE * np.trace(moment[:n, :n]) / n
+    moment[np.diag_indices(n + 1)] += noise
     found = linalg.solve(moment, weighted.T @ wanted, assume_a="pos")
     left = wanted - features @ found
     return found[:n].T, found[n], left.T @ (weights[:, None] * left)

@@ -1,13 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law with an observer on a model of the field between few sensors.
 
-What a rollout began with is the field that its readings tell (`loop_method.models.sensed_fit`).
+What a rollout began with is the field that its readings tell (`loop_method.models.sensed_smoothing`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,7 +19,8 @@ from loop_method.adapt.local_step import LOCAL
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.laws.observer import Observer
 from loop_method.models.sensed import SensedModel, interpolated, sensed_model
-from loop_method.models.sensed_fit import fit_sensed, smoothed_field
+from loop_method.models.sensed_fit import fit_sensed
+from loop_method.models.sensed_smoothing import Smoothing
 
 REPRODUCED = 0.05
 """The readings are reproduced up to this share of their sum of squares."""
@@ -58,15 +59,10 @@ class SensedLoop(ObservedLoop):
         steps = len(record.actions)
         if not steps or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
-        return smoothed_field(
-            model.shared,
-            record.acted_from,
-            record.actions,
-            model.centres,
-            model.noise,
-            self.target[every // 2 :: every],
-            distance(record, self.state_weight * every, self.action_weight, self.horizon),
-        )
+        target, weight = self.target[every // 2 :: every], self.state_weight * every
+        smoothing = Smoothing(model.shared, model.centres, model.noise, target, model.spread)
+        known = distance(record, weight, self.action_weight, self.horizon)
+        return smoothing.field(record.acted_from, record.actions, known)
 
 
 def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:
@@ -128,7 +124,15 @@ def sensed_from(
     largest = EXTRAPOLATION * float(np.abs(fields).max())
     # What the model does not foresee of a reading is noise to a filter.
     noise = float(np.sqrt(context.noise**2 + error * size))
-    return sensed_model(shared, sensors, centres, largest, context.field_models, noise), error
+    smoothing = Smoothing(shared, centres, noise, context.target).learned(
+        [
+            (record.acted_from, record.actions, known)
+            for record, known in zip(chosen, distances, strict=True)
+        ]
+    )
+    model = sensed_model(shared, sensors, centres, largest, context.field_models, noise)
+    assert smoothing.spread is not None
+    return replace(model, spread=smoothing.spread), error
 
 
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:

@@ -75,12 +75,15 @@ class SensedModel(SpectralModel):
         n_y.
     noise : float
         Standard deviation of what the model does not foresee of a reading, its noise included.
+    spread : (33,) array
+        Standard deviations of the Fourier coefficients of an initial field: its mean, cosines, sines.
     """
 
     shared: Array = field(kw_only=True)
     centres: Array = field(kw_only=True)
     sensors: int = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
+    spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
 
     def at_sensors(self, rows: Array) -> Array:
         """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
@@ -96,6 +99,7 @@ class SensedModel(SpectralModel):
             "centres": self.centres,
             "sensors": np.array(self.sensors),
             "noise": np.array(self.noise),
+            "spread": self.spread,
         }
         return super().arrays() | own
 
@@ -109,6 +113,7 @@ class SensedModel(SpectralModel):
             centres=numbers_of(arrays, "centres"),
             sensors=int(arrays["sensors"].item()),
             noise=float(arrays["noise"].item()),
+            spread=numbers_of(arrays, "spread"),
         )
 
 

@@ -9,8 +9,7 @@ over all points and steps of each, which its cost tells,
          + mean over rollouts (0.1 (d^model / d - 1))^2 + a small ridge,
 
 by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then
-further. What lies between the sensors is seen, later, where it passes one. With the equation known,
-each initial field is found by itself in the same way (`smoothed_fields`).
+further. What lies between the sensors is seen, later, where it passes one.
 
 References
 ----------
@@ -96,14 +95,14 @@ def fit_sensed(
     y, a = np.stack(readings), np.stack(actions)
     if target is None or distances is None:
         target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
-    problem = _Problem(y, a, centres, noise, target, distances)
+    problem = SensedProblem(y, a, centres, noise, target, distances)
     fields = problem.interpolated()
     if start is None:
         calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
         acted = [m for m in calmest if a[m].any()]
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
         shared, fields[pair] = _first_guess(
-            _Problem(y[pair], a[pair], centres, noise, target, distances[pair], _PLACE_RIDGE)
+            SensedProblem(y[pair], a[pair], centres, noise, target, distances[pair], _PLACE_RIDGE)
         )
     else:
         shared = start
@@ -112,45 +111,7 @@ def fit_sensed(
     return shared, np.fft.irfft(spectrum(fields, n), n), max(error - problem.noise, 0.0)
 
 
-def smoothed_field(
-    shared: Array,
-    readings: Array,
-    actions: Array,
-    centres: Array,
-    noise: float,
-    target: Array,
-    distance: float,
-) -> tuple[Array, float]:
-    """The initial field of a rollout of a known equation.
-
-    Parameters
-    ----------
-    shared : (12,) array
-        The equation's unknowns.
-    readings, actions : (T, n_y) and (T, n_a) arrays
-        y_k and a_k.
-    centres, noise, target
-        As of `fit_sensed`.
-    distance : float
-        d of the rollout; NaN where it is not known.
-
-    Returns
-    -------
-    (n,) array and float
-        The field, and its error, as of `fit_sensed`; infinite where the equation overflows.
-    """
-    # Readings that a law brings to the target say little of the size of the field they began with.
-    first = float(np.sqrt(np.mean(readings[0] ** 2)))
-    problem = _Problem(
-        *(readings[None], actions[None], centres, noise, target, np.array([distance])), least=first
-    )
-    error, _, fields = problem.fit(shared, problem.interpolated(), known=True)
-    n = grid_points(readings.shape[1])
-    field: Array = np.fft.irfft(spectrum(fields, n), n)[0]
-    return field, max(error - problem.noise, 0.0)
-
-
-def _first_guess(problem: _Problem) -> tuple[Array, Array]:
+def _first_guess(problem: SensedProblem) -> tuple[Array, Array]:
     """The best unknowns of a few rollouts, shared and fields, from several equations."""
     least, best = np.inf, (np.zeros(SHARED), problem.interpolated())
     for dispersion in _DISPERSIONS:
@@ -164,7 +125,7 @@ def _first_guess(problem: _Problem) -> tuple[Array, Array]:
     return best
 
 
-class _Problem:
+class SensedProblem:
     """The least squares problem: readings y (R, T, n_y), actions a (R, T, n_a), distances (R,).
 
     target, distances: as in `fit_sensed`; least: the least size of the readings that errors are
@@ -184,8 +145,9 @@ class _Problem:
     ) -> None:
         self.y, self.a, self._centres = y, a, centres
         self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
-        self.noise = (noise / self._size) ** 2
+        self.noise: float = (noise / self._size) ** 2
         self._place_ridge = place_ridge
+        self.spread: Array | None = None
         sensors = y.shape[2]
         self._n = grid_points(sensors)
         waves = np.arange(self._n // 2 + 1)
@@ -222,6 +184,28 @@ class _Problem:
             if np.isfinite(self._error(*moved)):
                 shared, fields = moved
         return self._error(shared, fields), shared, fields
+
+    def refined(self, shared: Array, fields: Array) -> Array:
+        """The fields that fit best next to these, with the shared unknowns as they are."""
+        return self._descend(shared, fields, self.y.shape[1], known=True)[1]
+
+    def variances(self, shared: Array, fields: Array) -> Array:
+        """Those of the coefficients of the field of the only rollout, (33,), given its readings."""
+        steps = self.y.shape[1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            J = self._linearised(shared, fields, steps, known=True)[1]
+        if not np.isfinite(J).all():
+            return np.zeros(len(J))
+        inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)[SHARED:]))
+        found: Array = self._weight(steps) * np.diag(inverse)
+        return found
+
+    @property
+    def suggested(self) -> Array:
+        """Standard deviations of the coefficients of a field, (33,), from its size alone."""
+        falling = 1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2
+        found: Array = _FIELD_DEVIATION * self._size / falling
+        return found
 
     def _error(self, shared: Array, fields: Array) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -271,13 +255,21 @@ class _Problem:
         return parts(x)
 
     def _ridge(self, steps: int) -> Array:
-        rollouts, _, sensors = self.y.shape
-        weight = self.noise / (len(range(0, steps, self._stride(steps))) * sensors * rollouts)
+        rollouts, weight = len(self.y), self._weight(steps)
         shared = np.full(SHARED, _SHARED_RIDGE**2 + weight / _SHARED_DEVIATION**2)
         shared[COEFFICIENTS + 1 :] += self._place_ridge**2
-        field = _FIELD_RIDGE**2 / rollouts + weight / _FIELD_DEVIATION**2
         rising = (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) ** 2 / self._size**2
-        return np.concatenate([shared, np.tile(field * rising, rollouts)])
+        if self.spread is None:
+            field = (_FIELD_RIDGE**2 / rollouts + weight / _FIELD_DEVIATION**2) * rising
+        else:
+            field = _FIELD_RIDGE**2 / rollouts * rising + weight / self.spread**2
+        return np.concatenate([shared, np.tile(field, rollouts)])
+
+    def _weight(self, steps: int) -> float:
+        """The variance of the noise on a residual."""
+        rollouts, _, sensors = self.y.shape
+        compared = len(range(0, steps, self._stride(steps)))
+        return float(self.noise / (compared * sensors * rollouts))
 
     @staticmethod
     def _stride(steps: int) -> int:

@@ -7,7 +7,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_limits
 
 import pdeloop
 from loop_interfaces.model_rows import ModelRows
@@ -26,7 +25,6 @@ from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gai
 from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.design.lqg import law_of_innovations
 from loop_method.laws import Observer
 from loop_method.models.files import model_of
 from loop_method.models.sensed import (
@@ -37,8 +35,7 @@ from loop_method.models.sensed import (
     interpolated,
     sensed_model,
 )
-from loop_method.models.sensed_fit import smoothed_field
-from loop_method.reduce.subspace import subspace_model
+from loop_method.models.sensed_smoothing import Smoothing
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
 
@@ -84,10 +81,11 @@ def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
     return sensed_loop(context, model)
 
 
-def rows_of(n_s: int, U: Array) -> ModelRows:
+def rows_of(n_s: int, U: Array, n_a: int = N_A) -> ModelRows:
+    """Of a law that does nothing."""
     rng = np.random.default_rng(2)
-    A, B = 0.3 * rng.standard_normal((n_s, n_s)), rng.standard_normal((n_s, N_A))
-    gains = np.zeros((N_A, n_s))
+    A, B = 0.3 * rng.standard_normal((n_s, n_s)), rng.standard_normal((n_s, n_a))
+    gains = np.zeros((n_a, n_s))
     return ModelRows(A=A, B=B, U=U, K_a=gains, K_b=gains, s_r=np.zeros(n_s))
 
 
@@ -101,10 +99,33 @@ def test_the_initial_field_is_what_the_readings_came_from() -> None:
     for a in actions:
         seen.append(z[0, every // 2 :: every])
         z = model.step(z, a[None])
-    known = CENTRES, 0.0, np.zeros(SENSORS), np.nan
-    found, error = smoothed_field(moving, np.array(seen), actions, *known)
+    smoothing = Smoothing(moving, CENTRES, 0.0, np.zeros(SENSORS))
+    found, error = smoothing.field(np.array(seen), actions, np.nan)
     assert error < 1e-6
     assert np.linalg.norm(found - true) < 0.01 * np.linalg.norm(true)
+
+
+def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
+    """From eight sensors with noise, whose short waves would otherwise be those of the noise."""
+    model, sigma, rng = model_with(CUBIC, 0.0), 0.2, np.random.default_rng(6)
+    every, seen, true = model.n_z // SENSORS, [], []
+    for seed in range(4):
+        z, actions, rows = field(model, seed)[None], rng.standard_normal((T, N_A)), []
+        true.append(z[0])
+        for a in actions:
+            rows.append(z[0, every // 2 :: every] + sigma * rng.standard_normal(SENSORS))
+            z = model.step(z, a[None])
+        seen.append((np.array(rows), actions, np.nan))
+    first = Smoothing(CUBIC, CENTRES, sigma, np.zeros(SENSORS))
+    learned = first.learned(seen)
+    assert learned.spread is not None
+    # Means of 0.3, and waves of half of 1 at the first two wavenumbers.
+    assert learned.spread[1] > 0.25 and learned.spread[8] < 0.1 * learned.spread[1]
+    off = [
+        sum(np.sum((each.field(*own)[0] - z) ** 2) for own, z in zip(seen, true, strict=True))
+        for each in (learned, first)
+    ]
+    assert off[0] < 0.7 * off[1]
 
 
 def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:
@@ -158,19 +179,11 @@ def test_the_model_survives_a_checkpoint() -> None:
 
 @cache
 def small() -> tuple[pdeloop.Problem, Context]:
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16, exploration_variance=4.0)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=10, exploration_variance=4.0)
     plant = problem.plant()
     explored = [problem.explore(seed) for seed in (0, 1)]
-    with threadpool_limits(1):
-        seen = [(states, actions) for states, actions in explored]
-        found = subspace_model(seen, order=10)
-        rows = law_of_innovations(
-            found,
-            plant.target,
-            state_weight=plant.state_weight,
-            action_weight=plant.action_weight,
-        )
-        law = Observer(rows, plant.horizon)
+    U = np.random.default_rng(3).standard_normal((SENSORS, 10))
+    law = Observer(rows_of(10, U, plant.n_a), plant.horizon)
     first, second = (Trajectory(states, actions) for states, actions in explored)
     context = Context(
         *(law.model.U, plant.target, plant.state_weight, plant.action_weight, plant.horizon, first),

@@ -1,0 +1,111 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Initial fields of rollouts of which few readings are known, with the equation of the field known.
+
+Each is found by itself, as in `loop_method.models.sensed_fit`. What readings do not tell of it is as
+large as the other rollouts say: its Fourier coefficients are normal with the standard deviations that
+make all readings likeliest, by the fixed point of MacKay, sigma_k^2 = sum x_k^2 / sum (1 - C_kk /
+sigma_k^2) with C the covariance of a coefficient given the readings.
+
+References
+----------
+MacKay, "Bayesian interpolation", Neural Computation 4(3), 1992.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.models.sensed import WAVES, grid_points, spectrum
+from loop_method.models.sensed_fit import SensedProblem
+
+# Steps towards the likeliest spread, the least share of a rollout that counts as told, and the least
+# spread, relative to the largest.
+_LEARNING_STEPS, _LEAST_TOLD, _LEAST_SPREAD = 5, 0.05, 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothing:
+    """Initial fields of rollouts of a known equation, each found by itself.
+
+    Attributes
+    ----------
+    shared : (12,) array
+        The equation's unknowns.
+    centres : (n_a,) array
+        Of the actuators, as shares of the domain.
+    noise : float
+        Standard deviation of the noise on every reading.
+    target : (n_y,) array
+        z_r at the sensors.
+    spread : (33,) array, optional
+        Standard deviations of the Fourier coefficients of a field; those that readings of any size
+        suggest if there are none.
+    """
+
+    shared: Array
+    centres: Array
+    noise: float
+    target: Array
+    spread: Array | None = None
+
+    def field(self, readings: Array, actions: Array, distance: float) -> tuple[Array, float]:
+        """The initial field (n,) and its error, as of `fit_sensed`; infinite where nothing is finite.
+
+        readings, actions (T, n_y) and (T, n_a); distance: d, NaN where it is not known.
+        """
+        problem = self._problem(readings, actions, distance)
+        error, _, fields = problem.fit(self.shared, problem.interpolated(), known=True)
+        n = grid_points(readings.shape[1])
+        field: Array = np.fft.irfft(spectrum(fields, n), n)[0]
+        return field, max(error - problem.noise, 0.0)
+
+    def learned(self, rollouts: Sequence[tuple[Array, Array, float]]) -> Smoothing:
+        """With the spread that makes these rollouts likeliest: readings, actions and distance of each.
+
+        What readings do not tell of a field is then as large as it is likely, and not as noise has it.
+        """
+        problems = [self._problem(*rollout) for rollout in rollouts]
+        found = [p.fit(self.shared, p.interpolated(), known=True)[2] for p in problems]
+        spread: Array = np.mean([problem.suggested for problem in problems], axis=0)
+        for _ in range(_LEARNING_STEPS):
+            size, told = np.zeros(len(spread)), np.zeros(len(spread))
+            for problem, fields in zip(problems, found, strict=True):
+                size += fields[0] ** 2
+                told += 1.0 - problem.variances(self.shared, fields) / spread**2
+            spread = _falling(size, np.maximum(told, _LEAST_TOLD * len(problems)))
+            for i, problem in enumerate(problems):
+                problem.spread = spread
+                found[i] = problem.refined(self.shared, found[i])
+        return replace(self, spread=spread)
+
+    def _problem(self, readings: Array, actions: Array, distance: float) -> SensedProblem:
+        # Readings that a law brings to the target say little of the size of the field before.
+        first = float(np.sqrt(np.mean(readings[0] ** 2)))
+        problem = SensedProblem(
+            *(readings[None], actions[None], self.centres, self.noise, self.target),
+            np.array([distance]),
+            least=first,
+        )
+        problem.spread = self.spread
+        return problem
+
+
+def _falling(size: Array, told: Array) -> Array:
+    """The square root of size / told, alike for cosine and sine, and not rising with the wavenumber.
+
+    Between sensors a short wave looks like a long one, which is the likelier one.
+    """
+    squares, weights = (
+        np.mean([part[1 : WAVES + 1], part[WAVES + 1 :]], axis=0) for part in (size, told)
+    )
+    # Not at the top: a node that smooths no readings has no need of it.
+    from scipy.optimize import isotonic_regression
+
+    waves = isotonic_regression(squares / weights, weights=weights, increasing=False).x
+    variances = np.concatenate([size[:1] / told[:1], waves, waves])
+    found: Array = np.sqrt(np.maximum(variances, _LEAST_SPREAD**2 * variances.max()))
+    return found
