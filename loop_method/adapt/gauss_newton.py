@@ -69,7 +69,7 @@ class GaussNewtonSettings(Settings):
 
     fields: int = setting(
         3,
-        "initial fields M that judge a policy in the beginning; they grow to twice as many",
+        "initial fields M that judge a policy at first; they grow to twice as many",
         1,
         1000,
     )

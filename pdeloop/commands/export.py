@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
         "--tensorboard",
         type=a_path,
         metavar="DIR",
-        help="write the curves, and what else the optimiser tells, to this new folder",
+        help="write the curves and the optimiser's other numbers to this new folder",
     )
 
 
