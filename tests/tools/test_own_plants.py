@@ -213,17 +213,21 @@ def test_an_installed_package_offers_plants_by_name(
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [(LINEAR, {"radius": 0.9}), (PLATE, {"nx": 6, "ny": 4})]
+    ("name", "given", "method"),
+    [
+        (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
+        (PLATE, {"nx": 6, "ny": 4}, {}),
+    ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(
-    name: str, given: dict[str, Any], tmp_path: Path, capsys: Any
+    name: str, given: dict[str, Any], method: dict[str, Any], tmp_path: Path, capsys: Any
 ) -> None:
     problem = tmp_path / "own.yaml"
-    problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given}}}))
+    problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given, **method}}}))
     assert (
         main(["train", str(problem), "--plant", name, *BUDGET, "--out", str(tmp_path / "a")]) == 0
     )
-    how = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
+    how = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6, **method}
     by_name = pdeloop.train(plant=name, **{f"physical.{k}": v for k, v in given.items()}, **how)
     made = vars(loading.OWN_PLANTS._load_file(name.partition(":")[0]))[name.rpartition(":")[2]]
     by_object = pdeloop.train(plant=made(**given), **how, out=tmp_path / "b")
