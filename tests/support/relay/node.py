@@ -14,6 +14,7 @@ import time
 from functools import partial
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64MultiArray
@@ -67,6 +68,11 @@ class Direction:
         self.passed += len(found)
         return found
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a message waits until it is due."""
+        return bool(self._queue)
+
 
 class RelayNode:
     """Passes raw messages on; it never looks into them."""
@@ -91,15 +97,22 @@ class RelayNode:
             take = partial(self._take, direction, publisher)
             node.create_subscription(Float64MultiArray, sent, take, qos, raw=True)
             self._publishers[topic] = publisher
-        loop.every(TICK, self._pass_on)
+        # It runs while a message waits: always, it would take half a core.
+        self._timer = node.create_timer(
+            TICK, self._pass_on, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def _pass_on(self) -> None:
         for topic, publisher in self._publishers.items():
             self._send(self._directions[topic], publisher)
+        if not any(direction.waiting for direction in self._directions.values()):
+            self._timer.cancel()
 
     def _take(self, direction: Direction, publisher: Publisher, message: bytes) -> None:
         direction.put(message)
         self._send(direction, publisher)
+        if direction.waiting and self._timer.is_canceled():
+            self._timer.reset()
 
     def _send(self, direction: Direction, publisher: Publisher) -> None:
         for message in direction.due():
