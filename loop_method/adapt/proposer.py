@@ -23,7 +23,8 @@ from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.proposal import Proposal
-from loop_method.adapt.sensed_step import MOST_SENSORS, SensedProposals
+from loop_method.adapt.sensed_loop import can_be_sensed
+from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import cleaned
 from loop_method.models.denoising import denoised
@@ -78,7 +79,7 @@ class Proposer:
         self._periodic = context.periodic
         self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
-        if self._periodic and context.sensors == target.size and target.size <= MOST_SENSORS:
+        if can_be_sensed(context):
             centres = context.actuator_centres(n_a)
             largest_cost = local_step.LOCAL * self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(

@@ -77,6 +77,18 @@ def distance(record: Record, state_weight: float, action_weight: float, horizon:
     return found if found > 0.0 else np.nan
 
 
+def whole_rollouts(
+    problem: ClosedLoopProblem, records: Sequence[Record], largest_cost: float
+) -> list[Record]:
+    """Whole rollouts, the newest, each once, and none whose readings went far away."""
+    whole = {
+        record.states.tobytes(): record
+        for record in records
+        if len(record.actions) == problem.horizon and problem.cost_of(record) <= largest_cost
+    }
+    return list(whole.values())[-NEWEST:]
+
+
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring."""
     sensors = context.sensors
@@ -94,13 +106,7 @@ def sensed_from(
     problem = ClosedLoopProblem(
         *(context.U, context.target, context.state_weight, context.action_weight, context.horizon)
     )
-    largest_cost = LOCAL * problem.cost_of(records[0])
-    whole = {
-        record.states.tobytes(): record
-        for record in records
-        if len(record.actions) == context.horizon and problem.cost_of(record) <= largest_cost
-    }
-    chosen = list(whole.values())[-NEWEST:]
+    chosen = whole_rollouts(problem, records, LOCAL * problem.cost_of(records[0]))
     if not chosen:
         return None
     centres = context.actuator_centres(n_a)

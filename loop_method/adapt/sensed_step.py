@@ -13,16 +13,12 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
-from loop_method.adapt.field_step import COMPARED, EXTRAPOLATION, extrapolated_fields, improved
+from loop_method.adapt.field_step import EXTRAPOLATION, extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
+from loop_method.adapt.sensed_loop import REPRODUCED, distance, whole_rollouts
 from loop_method.models.sensed import KIND, SHARED, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
-
-# The readings are reproduced up to this share of their sum of squares.
-_REPRODUCED = 0.05
-# More point sensors than this are taken for a field.
-MOST_SENSORS = 32
 
 
 class SensedProposals:
@@ -61,11 +57,11 @@ class SensedProposals:
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""
-        rollouts = self._chosen(data)
+        rollouts = whole_rollouts(self._loop, data, self._largest_cost)
         starts = (self.equation, None) if self.equation.any() else (None,)
         for start in starts:
             shared, fields, error = self._fit(rollouts, start)
-            if error <= _REPRODUCED:
+            if error <= REPRODUCED:
                 break
         else:
             return None
@@ -94,29 +90,14 @@ class SensedProposals:
         candidate = between.policy(found[0], policy)
         return Proposal(candidate, found[1], 1, 0.0, error, KIND)
 
-    def _chosen(self, records: Sequence[Record]) -> list[Record]:
-        """Whole rollouts, the newest, each once, and none that went far away."""
-        loop = self._loop
-        whole = {
-            record.states.tobytes(): record
-            for record in records
-            if len(record.actions) == loop.horizon and loop.cost_of(record) <= self._largest_cost
-        }
-        return list(whole.values())[-COMPARED:]
-
     def _fit(self, rollouts: Sequence[Record], start: Array | None) -> tuple[Array, Array, float]:
         """The shared unknowns, the initial fields, and the relative error of the readings."""
+        loop = self._loop
         readings = [record.acted_from for record in rollouts]
         actions = [record.actions for record in rollouts]
+        weights = loop.state_weight, loop.action_weight, loop.horizon
         return fit_sensed(
             *(readings, actions, self._centres, self._noise, start),
-            self._loop.target,
-            np.array([self._distance(record) for record in rollouts]),
+            loop.target,
+            np.array([distance(record, *weights) for record in rollouts]),
         )
-
-    def _distance(self, record: Record) -> float:
-        """Mean of (z - z_r)^2, from the cost; NaN where it tells none, as after the exploration."""
-        loop = self._loop
-        acting = loop.action_weight * float(np.sum(record.actions**2)) / len(record.actions)
-        distance = (record.cost - acting) / (loop.state_weight * len(loop.target))
-        return distance if record.usable and distance > 0.0 else np.nan
