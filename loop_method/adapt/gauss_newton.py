@@ -46,6 +46,7 @@ from loop_method.adapt.base import (
 )
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.trajectories import Records
+from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, size_of
 from loop_method.seeds import field_seed
 from loop_method.settings import Settings, setting
 
@@ -60,6 +61,7 @@ _MEMORY = 40
 # than how much fields differ, so more of them have to judge.
 _SMALL = 0.02
 _NONE = -1
+_CONFIRMING = 0x434F4E46  # "CONF": of the fields that are drawn for the verdict
 _STAMPS = ("fields", "incumbents", "trials", "compared")
 
 
@@ -160,6 +162,9 @@ class GaussNewton(Optimizer):
         accepted step that gains less than 2 % of the cost: a short step needs more to be judged.
     first_field : int
         Number of the first of these fields: a law can have been made on those before.
+    verdict : bool
+        Whether the law found is compared with the first one at the end, where a model of the whole
+        field can tell without rollouts.
     """
 
     name = "gauss_newton"
@@ -178,6 +183,7 @@ class GaussNewton(Optimizer):
         settings: GaussNewtonSettings | None = None,
         context: Context | None = None,
         first_field: int = 0,
+        verdict: bool = True,
     ) -> None:
         require_positive(rollouts=rollouts)
         if context is None:
@@ -187,6 +193,9 @@ class GaussNewton(Optimizer):
         self._now = SearchState.begin(policy, settings.fields, first_field)
         self._proposer = Proposer(context, self._now.policy)
         self._sensors = context.sensors
+        self._first = policy
+        # With sensors the first law was compared with no control by rollouts.
+        self._verdict = verdict and not context.sensors
         # One field says little with few sensors: the law has to beat no control on all of them.
         if self._sensors and self._now.policy.any():
             self._now.policy[:] = 0.0
@@ -257,6 +266,8 @@ class GaussNewton(Optimizer):
         row["damping"] = now.damping
         if decided and not now.missing.size and not now.proposed:
             self._propose(row)
+        if self._verdict and now.believed and self.done:
+            self._compare(row)
         return row
 
     def state(self) -> State:
@@ -339,6 +350,26 @@ class GaussNewton(Optimizer):
             oldest = int(np.argmin(now.fields))
             now.fields[oldest] = now.fields.max() + 1
             now.compared[oldest] = now.incumbents[oldest] = _NONE
+
+    def _compare(self, row: Row) -> None:
+        """Move from the first law only as far as fields that were left out confirm."""
+        now = self._now
+        if np.array_equal(now.policy, self._first):
+            row["chosen"] = FIRST
+            return
+        rng = np.random.default_rng([self._seed, _CONFIRMING])
+        with threadpool_limits(limits=1):
+            found = self._proposer.confirmed(self._records.all(), self._first, now.believed, rng)
+        if found is None:
+            return
+        row["fraction"], change, deviation = found
+        row["chosen"], row["reason"] = FIRST, NO_OTHER
+        if found[0]:
+            row["chosen"], row["reason"] = ADAPTED, size_of(ADAPTED, FIRST, change, deviation)
+            row["predicted_change"], row["deviation"] = change, deviation
+        if found[0] < 1.0:
+            first, own = (self._proposer.loop.theta(law) for law in (self._first, now.policy))
+            now.policy = self._proposer.loop.policy(first + found[0] * (own - first), self._first)
 
     def _propose(self, row: Row) -> None:
         now = self._now

@@ -164,6 +164,7 @@ class LocalSearch:
             rollouts=self._budget - self._compared - self._settings.judging,
             context=replace(self._context, measured=known),
             first_field=len(self._records),
+            verdict=False,
         )
         self.stage = SEARCHING
 

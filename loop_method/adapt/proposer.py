@@ -22,7 +22,9 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
+from loop_method.adapt.initial_fields import initial_fields, is_chaotic
 from loop_method.adapt.proposal import Proposal
+from loop_method.adapt.renewal import confirmed_fraction
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
@@ -76,7 +78,6 @@ class Proposer:
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
         self._measured = [exploration, *context.measured]
         self._before = [self._clean(record) for record in self._measured]
-        self._periodic = context.periodic
         self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
         if can_be_sensed(context):
@@ -131,7 +132,7 @@ class Proposer:
         level = loop.mean_cost_of(incumbents)
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         believed = ""
-        if self._periodic and first is not None:
+        if first is not None:
             belief, whole = field_step.field_model(self._context, measured, first, self._believed)
             if belief is not None:
                 believed = belief.model.kind
@@ -148,6 +149,36 @@ class Proposer:
             *(loop, data, shares, incumbents, compared), damping=damping, accepted=accepted
         )
         return proposal and replace(proposal, believed=believed)
+
+    def confirmed(
+        self, records: Sequence[Record], first: Array, believed: str, rng: np.random.Generator
+    ) -> tuple[float, float, float] | None:
+        """How far from the first law fields that were left out confirm a way (`confirmed_fraction`).
+
+        None where no model predicts the rollouts as a whole, the plant is chaotic, or the first law is
+        no better than no control on the model, so that it is nothing to stay near to.
+        """
+        measured = [r for r in (*self._measured, *records) if len(r.states) > 1]
+        belief, whole = field_step.field_model(self._context, measured, believed, self._believed)
+        if belief is None or not whole:
+            return None
+        loop = belief.loop(self._context)
+        known = cleaned(measured, self._noise) if self._noise else measured
+        fields = initial_fields(known)
+        theta, none = loop.theta(first), loop.no_control
+        if is_chaotic(loop, fields) or not (
+            loop.costs(theta, fields).mean() < loop.costs(none, fields).mean()
+        ):
+            return None
+        return confirmed_fraction(
+            loop,
+            theta,
+            fields,
+            rng,
+            field_step.SETTINGS,
+            components=belief.components,
+            periodic=self._context.periodic,
+        )
 
     def _clean(self, record: Record) -> Record:
         """The rollout without what of its noise can be told from the fields."""

@@ -17,7 +17,7 @@ Cochran, "Sampling Techniques", 3rd ed., Wiley 1977, chapter 6 (ratio estimators
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -119,18 +119,61 @@ def renew(
             return None
         before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, found[0]))
         return Renewal(found[0], found[0], [], 1.0, after - before, 0.0, found[1])
-    part_of = np.arange(len(fields)) % settings.folds
-    steps, made = 0, []
-    for part, start in enumerate(parts or [first] * settings.folds):
-        found = descend([first, start], fields[part_of != part], few)
-        made.append(start if found is None else found[0])
-        steps += 0 if found is None else found[1]
+    made, steps = _of_parts(descend, first, parts or [first] * settings.folds, fields, few)
     found = descend([first, improved], fields, settings.mixtures if final else few)
     if found is None:
         return None
     fraction, change, deviation = held_out_fraction(loop, first, made, fields, settings)
     theta = first + fraction * (found[0] - first)
     return Renewal(theta, found[0], made, fraction, change, deviation, steps + found[1])
+
+
+def confirmed_fraction(
+    loop: ClosedLoop,
+    first: Array,
+    fields: Array,
+    rng: np.random.Generator,
+    settings: ModelBasedSettings,
+    *,
+    components: int = 1,
+    periodic: bool = True,
+) -> tuple[float, float, float]:
+    """Fraction, change and deviation of a `Renewal`, for a law that was made in another way.
+
+    What a descent on some of the fields is worth on the others, for which alone it is made here.
+    """
+    if len(fields) < 2:
+        return 1.0, 0.0, 0.0
+    descend = partial(
+        _improved,
+        loop,
+        curvature=curvature_of(loop),
+        rng=rng,
+        settings=settings,
+        components=components,
+        periodic=periodic,
+        least_gain=settings.first_gain,
+    )
+    starts = [first] * settings.folds
+    made, _ = _of_parts(descend, first, starts, fields, settings.mixtures // 2)
+    return held_out_fraction(loop, first, made, fields, settings)
+
+
+def _of_parts(
+    descend: Callable[[Sequence[Array], Array, int], tuple[Array, int] | None],
+    first: Array,
+    starts: Sequence[Array],
+    fields: Array,
+    drawn: int,
+) -> tuple[list[Array], int]:
+    """For each part of the fields the law that the others make, and all steps of L-BFGS."""
+    part_of = np.arange(len(fields)) % len(starts)
+    steps, made = 0, []
+    for part, start in enumerate(starts):
+        found = descend([first, start], fields[part_of != part], drawn)
+        made.append(start if found is None else found[0])
+        steps += 0 if found is None else found[1]
+    return made, steps
 
 
 def held_out_fraction(

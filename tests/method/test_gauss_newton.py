@@ -54,8 +54,8 @@ class Plant:
         noise = 0.3 * np.random.default_rng(1).standard_normal((T, N_A))
         exploration = self.run(np.zeros((N_A, 2 * N_S)), 77, noise).trajectory
         assert exploration is not None
-        # No field on a ring, of which models of the whole field are tried.
-        return Context(self.U, self.target, Q, R, T, exploration, periodic=False)
+        # No field on an axis, of which many models would be tried.
+        return Context(self.U, self.target, Q, R, T, exploration, periodic=False, line=False)
 
 
 def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
@@ -105,6 +105,27 @@ def test_improves_a_plant_that_is_not_linear() -> None:
     while not optimizer.done:
         optimizer.tell(measure(plant, optimizer.ask()))
     assert mean_cost(plant, optimizer.policy) < 0.95 * start
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 1.0])
+def test_the_law_moves_only_as_far_as_fields_left_out_confirm(
+    fraction: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = Plant()
+    whole = make(plant, rollouts=9, verdict=False)
+    optimizer = make(plant, rollouts=9)
+    monkeypatch.setattr(Proposer, "confirmed", lambda *_: (fraction, -0.5 * fraction, 0.1))
+    for each in (whole, optimizer):
+        while not each.done:
+            row = each.tell(measure(plant, each.ask()))
+    first = 0.6 * plant.best
+    moved = whole.policy - first
+    assert np.abs(moved).max() > 1e-3
+    np.testing.assert_allclose(optimizer.policy - first, fraction * moved, atol=1e-12)
+    assert row["chosen"] == ("adapted" if fraction else "first") and row["reason"]
+    again = make(plant, rollouts=9)
+    again.restore(optimizer.state())
+    assert again.done and same_state(again, optimizer)
 
 
 @pytest.mark.parametrize(
