@@ -53,8 +53,6 @@ FAMILIES = (
     "kdv-modes",
     "benjamin-ono",
     "kawahara",
-    "sine-gordon",
-    "allen-cahn with V(x)",
 )
 OF_FRACTIONS = 2
 """Rows of a table before those of the fractions of the way: no control and the first law."""
@@ -104,7 +102,7 @@ class Table:
 def run(
     cases: Sequence[str] = FAMILIES,
     *,
-    seeds: int = 6,
+    seeds: int = 4,
     rollouts: int = 20,
     fields: int = 300,
     draws: int = 2000,
