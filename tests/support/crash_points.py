@@ -13,6 +13,7 @@ EIO      write, fsync, close and rename are refused
 ENOSPC   open is refused
 again    a training that continues gets EIO at any call, of reading too, from locking to the end
 ESTALE   the same with ESTALE, as from a file server that was started again
+often    one training is killed and continued two hundred times, each time at another call
 
 and the training is continued until it is done. It prints a line of JSON: how many failures of each way
 there were, and a sentence for each training that did not come to the same policy.
@@ -51,10 +52,12 @@ KINDS = {
     "ENOSPC": ("open",),
     "again": EVERY,
     "ESTALE": EVERY,
+    "often": (),
 }
 """Ways to fail, and the calls that can fail so."""
 MEMORY_DISK = Path("/dev/shm")
 """There fsync does not wait; what is on the disk at a crash is decided here."""
+RESUMES = 200
 CONTINUED = ("again", "ESTALE")
 """The training that fails so continues one that was killed."""
 CODES = {"EIO": errno.EIO, "ENOSPC": errno.ENOSPC, "again": errno.EIO, "ESTALE": errno.ESTALE}
@@ -156,6 +159,8 @@ class Judge:
 
     def failures(self, kind: str) -> list[int]:
         """The numbers of the calls that can fail so."""
+        if kind == "often":
+            return [RESUMES]
         called = self.calls_continued if kind in CONTINUED else self.calls
         found, before = [], ""
         for n, name in enumerate(called, 1):
@@ -172,11 +177,15 @@ class Judge:
         if kind in CONTINUED:
             shutil.copytree(self._killed, out)
         self._log.unlink(missing_ok=True)
-        codes = [self._forked(out, n, kind, disk)]
+        kills = n if kind == "often" else 0
+        codes = [self._forked(out, k % len(self.calls_continued) // 2 + 1) for k in range(kills)]
+        codes.append(self._forked(out, 0 if kills else n, kind, disk))
         while not (out / "result.json").exists() and len(codes) < 4:
             again = n % 7 + 1 if kind in ("kill", "power") and len(codes) == 1 else 0
             codes.append(self._forked(out, again, kind, disk))
-        where = f"{kind} at call {n}, exit codes {codes}"
+        where = f"{kind} at call {n}, exit codes {codes[-4:]}"
+        if kills and codes[:kills].count(-signal.SIGKILL) < kills:
+            return f"{where}: it was killed {codes.count(-signal.SIGKILL)} times only"
         text = self._log.read_text()
         if "Traceback" in text:
             return f"{where}: a traceback: {text}"

@@ -31,7 +31,7 @@ def failures(kinds: Sequence[str], every: int) -> dict[str, int]:
 
 
 def test_a_training_comes_to_the_same_policy_after_a_failure_at_any_call():
-    kinds = [kind for kind in KINDS if kind != POWER]
+    kinds = [kind for kind in KINDS if kind not in (POWER, "often")]
     counts = failures(kinds, 5)
     assert all(counts[kind] >= 3 for kind in kinds)
 
