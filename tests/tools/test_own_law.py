@@ -265,6 +265,22 @@ def test_a_law_of_ones_own_declares_that_it_has_a_filter_gain(
         pdeloop.train(str(SMALL), **own | {"identification": "subspace"}, **BUDGET)
 
 
+def test_a_model_for_a_law_of_ones_own_is_identified_with_its_filter_gain(tmp_path: Path) -> None:
+    """From measurements, by the command; the file alone names the class."""
+    (tmp_path / "own.py").write_text(
+        "import pdeloop\n\n\nclass Own(pdeloop.Law):\n    filtered = True\n\n"
+        "    def start(self):\n        return {'K': self.model.K_a @ self.model.L}\n\n"
+        "    def action(self, theta, z, memory, k):\n        return theta['K'] @ self.reduced(z)\n"
+    )
+    words = ["identify", "--data", str(ROOT / "examples" / "measurements.csv"), "--order", "3"]
+    held = {}
+    for law in ("affine", f"{tmp_path / 'own.py'}:Own"):
+        assert main([*words, "--law", law, "--out", str(tmp_path / "model.npz")]) == 0
+        with np.load(tmp_path / "model.npz") as model:
+            held[law] = "L" in model
+    assert list(held.values()) == [False, True]
+
+
 def test_parameters_for_each_step_fit_one_horizon(tmp_path: Path) -> None:
     run = pdeloop.train(str(SMALL), law="feedforward", out=tmp_path / "run", **BUDGET)
     assert run.policies.shape == (1, N_A * N_S + 30 * N_A)
