@@ -191,10 +191,6 @@ class ModelBased(Optimizer):
         """Rollouts that judge the final law."""
         return max(1, min(self._settings.judging, self._budget // 2))
 
-    @property
-    def _left(self) -> int:
-        return self._budget - self._records.count
-
     def _next_renewal(self) -> int:
         """Own rollouts after which the law is renewed next."""
         known, last = len(self._before), self._last_renewal()
@@ -353,7 +349,7 @@ class ModelBased(Optimizer):
         self._progress.policy = laws[verdict.chosen].copy()
         row["chosen"] = verdict.chosen
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
-        early = self._left > 0
+        early = self._records.count < self._budget
         known = len(self._fields())
         self._end(row, verdict.reason + f"; more than {known} fields would not change it" * early)
 

@@ -26,7 +26,7 @@ def run(*command: str) -> None:
 
 
 def mountable(*commands: str) -> bool:
-    """Whether a process can have mounts of its own here, and these commands are there."""
+    """True if a process can have mounts of its own here, and these commands are there."""
     try:
         run("unshare", "--mount", "mount", "--make-rprivate", "/")
         for command in commands:

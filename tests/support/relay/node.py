@@ -70,7 +70,7 @@ class Direction:
 
     @property
     def waiting(self) -> bool:
-        """Whether a message waits until it is due."""
+        """True while a message waits until it is due."""
         return bool(self._queue)
 
 
