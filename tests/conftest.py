@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
 import signal
@@ -47,10 +48,26 @@ def pytest_collection() -> Generator[None, object, object]:
     """
     gc.disable()
     try:
-        return (yield)
+        with _first_alone():
+            return (yield)
     finally:
         gc.enable()
         gc.freeze()
+
+
+@contextlib.contextmanager
+def _first_alone() -> Iterator[None]:
+    """One worker comes before the others, who find what it has compiled to bytecode."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    with Path(__file__).open() as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fcntl.flock(lock, fcntl.LOCK_SH)  # once the first one is done, all of them have it
+            fcntl.flock(lock, fcntl.LOCK_UN)
+        yield
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
