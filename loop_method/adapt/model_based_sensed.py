@@ -40,12 +40,10 @@ class ModelBasedSensed(ModelBasedReadings):
         return model if isinstance(model, SensedModel) else None
 
     def _next_renewal(self) -> int:
-        """After as many rollouts of the first law as judge one, then after twice as many."""
+        """After as many rollouts as judge a law; on a model of the field later after twice as many."""
         own, last = self._records.count, self._last_renewal()
-        if own < self._settings.judging:
-            return min(self._settings.judging, last)
         if self._sensed is None:
-            return super()._next_renewal()
+            return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last
 
     def _believe(self) -> Belief | None:
