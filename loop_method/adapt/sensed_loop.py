@@ -28,6 +28,8 @@ MOST_SENSORS = 32
 """More point sensors than this are taken for a field."""
 NEWEST = 8
 """The newest rollouts, which the model is fitted to."""
+AGAIN = 2
+"""Times that the model is fitted again with noise, when it is known how large short waves are."""
 EXTRAPOLATION = 1.5
 """Fields that are simulated may be this many times as large as the measured ones."""
 
@@ -112,32 +114,36 @@ def sensed_from(
     centres = context.actuator_centres(n_a)
     weights = context.state_weight, context.action_weight, context.horizon
     distances = np.array([distance(record, *weights) for record in chosen])
+    readings = [record.acted_from for record in chosen]
+    actions = [record.actions for record in chosen]
+    seen = readings, actions, centres, context.noise
     for first in (None,) if start is None else (start, None):
-        shared, fields, error = fit_sensed(
-            [record.acted_from for record in chosen],
-            [record.actions for record in chosen],
-            centres,
-            context.noise,
-            first,
-            context.target,
-            distances,
-        )
+        shared, fields, error = fit_sensed(*seen, first, context.target, distances)
         if error <= REPRODUCED:
             break
     else:
         return None
-    size = float(np.mean([np.mean(record.acted_from**2) for record in chosen]))
-    largest = EXTRAPOLATION * float(np.abs(fields).max())
-    # What the model does not foresee of a reading is noise to a filter.
-    noise = float(np.sqrt(context.noise**2 + error * size))
-    smoothing = Smoothing(shared, centres, noise, context.target).learned(
-        [
-            (record.acted_from, record.actions, known)
-            for record, known in zip(chosen, distances, strict=True)
-        ]
-    )
-    model = sensed_model(shared, sensors, centres, largest, context.field_models, noise)
+    known = list(zip(readings, actions, distances.tolist(), strict=True))
+    size = float(np.mean([np.mean(own**2) for own in readings]))
+
+    def learned() -> Smoothing:
+        # What the model does not foresee of a reading is noise to a filter.
+        noise = float(np.sqrt(context.noise**2 + error * size))
+        return Smoothing(shared, centres, noise, context.target).learned(known)
+
+    smoothing = learned()
+    # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
+    for _ in range(AGAIN if context.noise else 0):
+        again = fit_sensed(*seen, shared, context.target, distances, smoothing.spread)
+        if again[2] > REPRODUCED:
+            break
+        shared, fields, error = again
+        smoothing = learned()
     assert smoothing.spread is not None
+    largest = EXTRAPOLATION * float(np.abs(fields).max())
+    model = sensed_model(
+        shared, sensors, centres, largest, context.field_models, noise=smoothing.noise
+    )
     return replace(model, spread=smoothing.spread), error
 
 

@@ -68,6 +68,7 @@ def fit_sensed(
     start: Array | None = None,
     target: Array | None = None,
     distances: Array | None = None,
+    spread: Array | None = None,
 ) -> tuple[Array, Array, float]:
     """Fit the equation and the initial fields of rollouts.
 
@@ -85,6 +86,9 @@ def fit_sensed(
         z_r at the sensors.
     distances : (rollouts,) array, optional
         d of each rollout; NaN where it is not known.
+    spread : (33,) array, optional
+        Standard deviations of the Fourier coefficients of an initial field; those that readings of any
+        size suggest if there are none.
 
     Returns
     -------
@@ -96,6 +100,7 @@ def fit_sensed(
     if target is None or distances is None:
         target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
     problem = SensedProblem(y, a, centres, noise, target, distances)
+    problem.spread = spread
     fields = problem.interpolated()
     if start is None:
         calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()

@@ -35,6 +35,7 @@ from loop_method.models.sensed import (
     interpolated,
     sensed_model,
 )
+from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
@@ -110,7 +111,7 @@ def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
     model, sigma, rng = model_with(CUBIC, 0.0), 0.2, np.random.default_rng(6)
     every, seen, true = model.n_z // SENSORS, [], []
     for seed in range(4):
-        z, actions, rows = field(model, seed)[None], rng.standard_normal((T, N_A)), []
+        z, actions, rows = field(model, seed)[None], 10.0 * rng.standard_normal((T, N_A)), []
         true.append(z[0])
         for a in actions:
             rows.append(z[0, every // 2 :: every] + sigma * rng.standard_normal(SENSORS))
@@ -126,6 +127,16 @@ def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
         for each in (learned, first)
     ]
     assert off[0] < 0.7 * off[1]
+    # So does the equation.
+    readings, taken = [own[0] for own in seen], [own[1] for own in seen]
+    known = np.zeros(SENSORS), np.full(len(seen), np.nan)
+    off = [
+        np.linalg.norm(
+            fit_sensed(readings, taken, CENTRES, sigma, CUBIC, *known, spread)[1] - np.array(true)
+        )
+        for spread in (learned.spread, None)
+    ]
+    assert off[0] < 0.5 * off[1]
 
 
 def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:
