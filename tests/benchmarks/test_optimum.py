@@ -15,6 +15,7 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.cli import run
 from pdeloop.gradients import Gradients
+from tests.support.made_once import made_once
 from tests.support.plants import Advection, plant_of
 from tests.support.small import SMALL
 
@@ -75,9 +76,13 @@ def test_a_descent_goes_round_where_rollouts_diverge_and_says_when_it_was_cut_of
 @pytest.fixture(scope="module")
 def limits(tmp_path_factory) -> tuple[Path, dict]:
     """The limits of the small problem with two seeds, as the command line saves them."""
-    folder = tmp_path_factory.mktemp("limits")
-    (result,) = optimum.run([str(SMALL)], **GIVEN, seeds=2, evaluation_fields=FIELDS, save=folder)
-    return folder, result
+
+    def make(folder: Path) -> tuple[Path, dict]:
+        given = {**GIVEN, "evaluation_fields": FIELDS}
+        (result,) = optimum.run([str(SMALL)], **given, seeds=2, save=folder)
+        return folder, result
+
+    return made_once(tmp_path_factory, "limits", make)
 
 
 def values_of(**changes):

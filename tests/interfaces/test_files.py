@@ -35,6 +35,7 @@ from pdeloop.cli import FAILED, main
 from pdeloop.commands import new
 from pdeloop.report.data import gather
 from pdeloop.training_run import unused
+from tests.support.made_once import made_once
 from tests.support.small import SMALL, parameters
 from tuner_node import checkpoint, training_state
 from tuner_node.build import build_training
@@ -48,10 +49,14 @@ by_both = pytest.mark.parametrize("finished", ["two_point", "gauss_newton"], ind
 def finished(request, tmp_path_factory) -> Path:
     """The folder of a finished run of the small problem, by two_point or by the optimizer asked for."""
     optimizer = getattr(request, "param", "two_point")
-    out: Path = tmp_path_factory.mktemp(optimizer) / "run"
-    options = ["--in-process", "--optimizer", optimizer, "--rollouts", "25", "--out", str(out)]
-    assert main(["train", str(SMALL), *options]) == 0
-    return out
+
+    def make(folder: Path) -> Path:
+        out = folder / "run"
+        options = ["--in-process", "--optimizer", optimizer, "--rollouts", "25", "--out", str(out)]
+        assert main(["train", str(SMALL), *options]) == 0
+        return out
+
+    return made_once(tmp_path_factory, f"run-by-{optimizer}", make)
 
 
 @pytest.fixture

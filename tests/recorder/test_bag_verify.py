@@ -25,6 +25,7 @@ from pdeloop.identification import identify_bag
 from recorder_node.bag import BagError
 from recorder_node.sources import PARAMETERS_TOPIC, source_of
 from tests.support.interpreter import python
+from tests.support.made_once import made_once
 from tests.support.recorded_here import (
     PART,
     change_metadata,
@@ -41,9 +42,12 @@ EPISODES = 1 + 1 + 3 + 3
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run with its bag."""
-    folder: Path = tmp_path_factory.mktemp("recorded") / "run"
-    record_run(folder)
-    return folder
+
+    def make(folder: Path) -> Path:
+        record_run(folder / "run")
+        return folder / "run"
+
+    return made_once(tmp_path_factory, "verified", make)
 
 
 @pytest.fixture
