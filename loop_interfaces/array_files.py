@@ -14,7 +14,12 @@ from loop_interfaces.files import FileError, open_ordinary
 MAX_ARRAY_BYTES = 2**30
 """Most bytes of all arrays in a file of policies or models."""
 Arrays = Mapping[str, NDArray[Any]]
-_TYPES: Mapping[str, type] = {"f": np.float64, "i": np.int64, "b": np.bool_}
+_TYPES: Mapping[str, type] = {
+    "f": np.float64,
+    "c": np.complex128,
+    "i": np.int64,
+    "b": np.bool_,
+}
 """The type in which each NumPy kind is stored; others would change results or cannot be stored."""
 
 
@@ -76,6 +81,6 @@ def checked_array(
             f"expected '{name}' of type {expected_type} and shape {shape}, "
             f"got {array.dtype} and {array.shape}"
         )
-    if kind == "f" and (not np.isfinite(array).all() if finite else np.isnan(array).any()):
+    if kind in "fc" and (not np.isfinite(array).all() if finite else np.isnan(array).any()):
         raise FileError(f"'{name}' is not finite")
     return array

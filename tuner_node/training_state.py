@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces import model_rows
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.documents import parse_json
+from loop_interfaces.frames import MAX_ID
 from loop_interfaces.text import shown
 from loop_method.adapt import calls
 from loop_method.adapt.trajectories import (
@@ -26,6 +27,8 @@ from tuner_node.results import check_history
 from tuner_node.training import Training
 
 PHASES = (*PURPOSES, "done")
+_LARGEST = 1e150
+"""Largest number of a model."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -77,6 +80,8 @@ def _fill(training: Training, arrays: Arrays) -> None:
     training.law_seen = bool(checked_array(arrays, "law_seen", "b", ()))
     training.plant = int(checked_array(arrays, "plant", "i", ()))
     training.steps = int(checked_array(arrays, "steps", "i", ()))
+    if not 0 <= training.steps < MAX_ID:
+        raise ValueError("its number of steps is out of range")
     training.attempts = checked_array(arrays, "attempts", "i", (seeds,)).tolist()
     training.pending = checked_array(arrays, "pending", "i", (None,)).tolist()
     training.history = parse_json(str(checked_array(arrays, "history", "U", ())))
@@ -84,6 +89,8 @@ def _fill(training: Training, arrays: Arrays) -> None:
     n_z = None
     if "models" in arrays:
         training.models = checked_array(arrays, "models", "f", (seeds, None, None))
+        if np.abs(training.models).max(initial=0.0) > _LARGEST:
+            raise ValueError("its models have numbers whose products are infinite")
         n_z = len(model_rows.unpack(training.models[0], n_a, training.settings.law.filtered).U)
     if "target" in arrays:
         training.target = checked_array(arrays, "target", "f", (n_z,))

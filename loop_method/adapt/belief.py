@@ -49,6 +49,14 @@ class Belief:
         error = float(checked_array(state, "error", "f", ()))
         return cls(model, error, int(checked_array(state, "components", "i", ())))
 
+    def check(self, context: Context) -> None:
+        """A ValueError if the model is of another plant's size: what is compiled does not look."""
+        n_a = context.exploration.actions.shape[1]
+        known, expected = (self.model.n_z, self.model.n_a), (len(context.target), n_a)
+        own_state = isinstance(self.model, (ReadingsModel, SensedModel))
+        if known[1] != n_a or (not own_state and known != expected):
+            raise ValueError(f"its model has sizes {known}; expected {expected}")
+
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""
         problem = (

@@ -393,6 +393,8 @@ class ModelBased(Optimizer):
         """Continue from a checkpoint of an optimiser with the same arguments."""
         n_z, shape = len(self._context.U), self._first.shape
         self._progress = Progress.of(state, shape)
+        if self._progress.belief is not None:
+            self._progress.belief.check(self._context)
         self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
         self._local = None
         if local := part_of(state, _LOCAL):

@@ -15,6 +15,8 @@ from loop_method.adapt.base import State
 from loop_method.adapt.belief import Belief
 
 RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
+LARGEST = 1e150
+"""Largest number of what fields that were left out say."""
 _STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
 
 
@@ -90,8 +92,15 @@ class Progress:
             belief=Belief.of(state),
             improved=laws[0] if laws else None,
             parts=laws[1:],
-            held_out=checked_array(state, "held_out", "f", (3,), finite=False).copy(),
+            held_out=_held_out(checked_array(state, "held_out", "f", (3,), finite=False)),
             begun=int(checked_array(state, "begun", "i", ())),
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
         )
+
+
+def _held_out(numbers: Array) -> Array:
+    """A copy; ValueError for numbers whose squares are infinite, unless they are themselves."""
+    if (np.abs(numbers[np.isfinite(numbers)]) > LARGEST).any():
+        raise ValueError(f"'held_out' has a number beyond {LARGEST:g}")
+    return numbers.copy()

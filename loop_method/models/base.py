@@ -10,8 +10,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 
+MAX_SUBSTEPS = 2000
+"""Most internal steps of a sampling time: twice what `FieldModelSettings` can ask for."""
 Arrays = dict[str, NDArray[np.generic]]
 Law = Callable[[int, Array], Array]
 """(k, z_k of shape (M, n_z)) -> a_k of shape (M, n_a)."""
@@ -163,9 +166,20 @@ def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, A
     return model.pull_back(states, actions, eye)
 
 
-def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> Array:
-    """Real numbers among arrays."""
-    return np.asarray(arrays[name], dtype=np.float64)
+def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str, *shape: int | None) -> Array:
+    """Finite real numbers of this shape among arrays; ValueError for anything else.
+
+    What is compiled does not look where an array ends.
+    """
+    return checked_array(arrays, name, "f", shape)
+
+
+def steps_of(arrays: Mapping[str, NDArray[np.generic]]) -> int:
+    """The internal steps of a sampling time among arrays; ValueError for none or too many."""
+    steps = int(checked_array(arrays, "substeps", "i", ()))
+    if not 1 <= steps <= MAX_SUBSTEPS:
+        raise ValueError(f"a model has {steps} internal steps; expected 1 to {MAX_SUBSTEPS}")
+    return steps
 
 
 def text_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> str:

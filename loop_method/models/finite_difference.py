@@ -17,9 +17,11 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.jit.cache import cached_njit, jit
-from loop_method.models.base import Arrays, linearised, numbers_of, text_of
+from loop_interfaces.text import shown
+from loop_method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
 
 Feature = tuple[tuple[int, ...], int]
 """A monomial, as its components, and the order of its derivative."""
@@ -121,14 +123,19 @@ class FiniteDifferenceModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> FiniteDifferenceModel:
         """The model of `arrays`."""
-        table = np.asarray(arrays["table"]).tolist()
-        features = tuple((tuple(row[1 : 1 + row[0]]), row[-1]) for row in table)
-        coefficients, B, constant = (
-            numbers_of(arrays, name) for name in ("coefficients", "B", "constant")
-        )
-        substeps = int(arrays["substeps"].item())
+        table = checked_array(arrays, "table", "i", (None, MOST_FACTORS + 2))
+        coefficients = numbers_of(arrays, "coefficients", len(table), None, None)
+        _, components, n_x = coefficients.shape
+        features = tuple((tuple(row[1 : 1 + row[0]]), row[-1]) for row in table.tolist())
+        if known := set(features) - set(features_of(components, MOST_FACTORS)):
+            raise ValueError(f"a model has terms that no model has: {shown(sorted(known))}")
         return FiniteDifferenceModel(
-            text_of(arrays, "kind"), features, coefficients, B, constant, substeps
+            text_of(arrays, "kind"),
+            features,
+            coefficients,
+            numbers_of(arrays, "B", components * n_x, None),
+            numbers_of(arrays, "constant", components * n_x),
+            steps_of(arrays),
         )
 
     def _arrays(self) -> tuple[Array, Array, Array]:

@@ -67,7 +67,9 @@ class LinearModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> LinearModel:
         """The model of `arrays`."""
-        A, B, constant = (numbers_of(arrays, name) for name in ("A", "B", "constant"))
+        constant = numbers_of(arrays, "constant", None)
+        n_z = len(constant)
+        A, B = numbers_of(arrays, "A", n_z, n_z), numbers_of(arrays, "B", n_z, None)
         return LinearModel(text_of(arrays, "kind"), A, B, constant)
 
 

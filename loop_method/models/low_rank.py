@@ -62,8 +62,12 @@ class LowRankModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> LowRankModel:
         """The model of `arrays`."""
-        numbers = (numbers_of(arrays, name) for name in ("V", "A", "B", "constant"))
-        return LowRankModel(text_of(arrays, "kind"), *numbers)
+        constant = numbers_of(arrays, "constant", None)
+        r = len(constant)
+        V, A = numbers_of(arrays, "V", None, r), numbers_of(arrays, "A", r, r)
+        return LowRankModel(
+            text_of(arrays, "kind"), V, A, numbers_of(arrays, "B", r, None), constant
+        )
 
 
 def _products(rows: Array, matrix: Array) -> Array:

@@ -76,9 +76,17 @@ class ReadingsModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> ReadingsModel:
         """The model of `arrays`."""
-        names = ("A", "B", "C", "G", "U", "innovations")
-        A, B, C, G, U, innovations = (numbers_of(arrays, name) for name in names)
-        return ReadingsModel(A, B, C, G, U, innovations, text_of(arrays, "kind"))
+        G = numbers_of(arrays, "G", None, None)
+        n, r = G.shape
+        return ReadingsModel(
+            numbers_of(arrays, "A", n, n),
+            numbers_of(arrays, "B", n, None),
+            numbers_of(arrays, "C", r, n),
+            G,
+            numbers_of(arrays, "U", None, r),
+            numbers_of(arrays, "innovations", r, r),
+            text_of(arrays, "kind"),
+        )
 
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""

@@ -21,6 +21,7 @@ import numpy as np
 import scipy  # whose signal processing, half a second of a core, loads when it is used
 from numpy.typing import NDArray
 
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Arrays, numbers_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
@@ -106,14 +107,19 @@ class SensedModel(SpectralModel):
     @staticmethod
     def from_arrays(arrays: Arrays) -> SensedModel:
         """The model of `arrays`."""
-        whole = SpectralModel.from_arrays(arrays)
+        whole, sensors = (
+            SpectralModel.from_arrays(arrays),
+            int(checked_array(arrays, "sensors", "i", ())),
+        )
+        if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
+            raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         return SensedModel(
             **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
-            shared=numbers_of(arrays, "shared"),
-            centres=numbers_of(arrays, "centres"),
-            sensors=int(arrays["sensors"].item()),
-            noise=float(arrays["noise"].item()),
-            spread=numbers_of(arrays, "spread"),
+            shared=numbers_of(arrays, "shared", SHARED),
+            centres=numbers_of(arrays, "centres", whole.n_a),
+            sensors=sensors,
+            noise=float(checked_array(arrays, "noise", "f", ())),
+            spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
         )
 
 

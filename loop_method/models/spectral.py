@@ -18,8 +18,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
-from loop_method.models.base import Arrays, linearised, numbers_of, text_of
+from loop_method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
 from spectral_solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
@@ -140,14 +141,26 @@ class SpectralModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> SpectralModel:
         """The model of `arrays`."""
+        constant = numbers_of(arrays, "constant", None)
+        n_z, modes = len(constant), len(constant) // 2 + 1
+        multipliers = _spectrum_of(arrays, "multipliers", None, modes)
+        substeps, fewer = steps_of(arrays), numbers_of(arrays, "fewer", None, 2)
+        if ((fewer[:, 1] < 1) | (fewer[:, 1] > substeps)).any():
+            raise ValueError(
+                f"a model has other than 1 to {substeps} internal steps for some fields"
+            )
         return SpectralModel(
             text_of(arrays, "kind"),
-            np.asarray(arrays["linear"], dtype=np.complex128),
-            np.asarray(arrays["multipliers"], dtype=np.complex128),
-            numbers_of(arrays, "polynomials"),
-            numbers_of(arrays, "B"),
-            numbers_of(arrays, "constant"),
-            substeps=int(arrays["substeps"].item()),
-            clip=float(arrays["clip"].item()),
-            fewer=numbers_of(arrays, "fewer"),
+            _spectrum_of(arrays, "linear", modes),
+            multipliers,
+            numbers_of(arrays, "polynomials", len(multipliers), None),
+            numbers_of(arrays, "B", n_z, None),
+            constant,
+            substeps=substeps,
+            clip=float(checked_array(arrays, "clip", "f", (), finite=False)),
+            fewer=fewer,
         )
+
+
+def _spectrum_of(arrays: Arrays, name: str, *shape: int | None) -> Spectrum:
+    return checked_array(arrays, name, "c", shape)

@@ -1,0 +1,111 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models of the field come back from their arrays, or not at all: compiled code looks at no length."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.models import FieldModel
+from loop_method.models.base import MAX_SUBSTEPS
+from loop_method.models.files import FORMS, model_of
+from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.linear import LinearModel
+from loop_method.models.low_rank import LowRankModel
+from loop_method.models.readings import ReadingsModel
+from loop_method.models.sensed import SHARED, SensedModel, grid_points
+from loop_method.models.spectral import SpectralModel
+
+N_Z, N_A = 8, 2
+RNG = np.random.default_rng(0)
+
+
+def numbers(*shape: int) -> np.ndarray:
+    return RNG.standard_normal(shape)
+
+
+def spectral(n_z: int) -> dict[str, object]:
+    modes = n_z // 2 + 1
+    return {
+        "kind": "k",
+        "linear": numbers(modes) + 0j,
+        "multipliers": numbers(2, modes) + 0j,
+        "polynomials": numbers(2, 1),
+        "B": numbers(n_z, N_A),
+        "constant": numbers(n_z),
+        "substeps": 4,
+        "fewer": np.array([[1.0, 2.0]]),
+    }
+
+
+SENSORS = 4
+MODELS: dict[str, FieldModel] = {
+    "spectral": SpectralModel(**spectral(N_Z)),  # type: ignore[arg-type]
+    "finite-difference": FiniteDifferenceModel(
+        "k",
+        features_of(1),
+        numbers(len(features_of(1)), 1, N_Z),
+        numbers(N_Z, N_A),
+        numbers(N_Z),
+        4,
+    ),
+    "linear": LinearModel("k", numbers(N_Z, N_Z), numbers(N_Z, N_A), numbers(N_Z)),
+    "low-rank": LowRankModel(
+        "k", numbers(N_Z, 3), numbers(3, 3), numbers(3, N_A), constant=numbers(3)
+    ),
+    "readings": ReadingsModel(
+        *(numbers(3, 3), numbers(3, N_A), numbers(2, 3), numbers(3, 2), numbers(N_Z, 2)),
+        innovations=np.eye(2),
+    ),
+    "sensed": SensedModel(
+        **spectral(grid_points(SENSORS)),  # type: ignore[arg-type]
+        shared=numbers(SHARED),
+        centres=numbers(N_A),
+        sensors=SENSORS,
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_model_comes_back_from_its_arrays(form: str) -> None:
+    arrays = MODELS[form].arrays()
+    again = model_of(arrays).arrays()
+    assert again.keys() == arrays.keys()
+    assert all(np.array_equal(again[name], arrays[name]) for name in arrays)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
+    arrays = MODELS[form].arrays()
+    # Axes that nothing else tells the length of; the sensed model has a centre for each actuator.
+    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, **({} if form == "sensed" else {"B": 1})}
+    for name, array in arrays.items():
+        for axis in range(array.ndim):
+            if free.get(name) != axis:
+                with pytest.raises(ValueError):
+                    model_of(arrays | {name: np.concatenate([array, array], axis=axis)})
+        if array.dtype.kind in "fc":
+            with pytest.raises(ValueError):
+                model_of(arrays | {name: np.full_like(array, np.nan)})
+        with pytest.raises(ValueError):
+            model_of(arrays | {name: np.zeros((2,) * (array.ndim + 1), array.dtype)})
+
+
+@pytest.mark.parametrize(
+    ("form", "name", "value"),
+    [
+        ("spectral", "substeps", np.array(0)),
+        ("spectral", "substeps", np.array(MAX_SUBSTEPS + 1)),
+        ("spectral", "fewer", np.array([[1.0, 5.0]])),
+        ("spectral", "fewer", np.array([[1.0, 0.0]])),
+        ("finite-difference", "substeps", np.array(2**62)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 7), 9)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 7), -9)),
+        ("sensed", "sensors", np.array(-1)),
+        ("sensed", "sensors", np.array(SENSORS + 1)),
+        ("linear", "form", np.array("quantum")),
+    ],
+)
+def test_numbers_that_no_model_has_are_refused(form: str, name: str, value: np.ndarray) -> None:
+    with pytest.raises(ValueError):
+        model_of(MODELS[form].arrays() | {name: value})
