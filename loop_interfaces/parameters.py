@@ -73,7 +73,7 @@ ACTUATORS = _section(
 
 IDENTIFICATION = Spec(
     "identification",
-    "regression",
+    "field",
     choices=("field", "regression", "subspace", "dmdc"),
     nodes="CT",
     group="budget and method",
@@ -81,7 +81,7 @@ IDENTIFICATION = Spec(
     "regression: least squares in reduced coordinates; field: a linearised model of the whole field, "
     "where its law is better; subspace: a model in innovation form with its filter, from measurements "
     "alone, for the law observer; dmdc: the paper's truncated DMDc. An optimizer may have a default of "
-    "its own: model_based has field, two_point dmdc, and the law observer has subspace with few sensors"
+    "its own: gauss_newton has regression, two_point dmdc, the law observer subspace with few sensors"
 )
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -163,8 +163,7 @@ class GaussNewton(Optimizer):
     first_field : int
         Number of the first of these fields: a law can have been made on those before.
     verdict : bool
-        Whether the law found is compared with the first one at the end, where a model of the whole
-        field can tell without rollouts.
+        Compare the law found with the first one, where a model of the whole field can.
     """
 
     name = "gauss_newton"
@@ -173,6 +172,7 @@ class GaussNewton(Optimizer):
     needs_affine_law = True
     in_coordinates = True
     compares_first_law = True
+    preferences: ClassVar[Mapping[str, Any]] = {"identification": "regression"}  # as it was tuned
 
     def __init__(
         self,

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,7 +83,6 @@ class ModelBased(Optimizer):
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"
-    preferences: ClassVar[Mapping[str, Any]] = {"identification": "field"}
 
     def __init__(
         self,
