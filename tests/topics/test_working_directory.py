@@ -45,7 +45,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "monitor": ("monitor", "--port", "0"),
     "reproduce": ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "5", "--out", "paper"),
     "report": ("report", "run"),
-    "animate": ("animate", "run", "--out", "run.gif"),
+    "animate": ("animate", "run", "--out", "run.gif", "--seconds", "1"),
     "compare": ("compare", "run", "run"),
     "export": ("export", "run", "--out", "law.npz"),
     "study": ("study", "study.yaml", "--out", "study"),
