@@ -138,7 +138,7 @@ def test_identify_from_a_bag_equals_the_live_model(recorded):
 def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_path):
     own = [m for m in messages_of(recorded / "bag") if m.topic != PARAMETERS_TOPIC]
     copy = write(tmp_path / "bag", [own])
-    found = identify_bag(copy, {"reduced_order": 4}, environment=0)
+    found = identify_bag(copy, {"reduced_order": 4, "identification": "regression"}, environment=0)
     with np.load(recorded / "policy.npz") as live:
         assert same_bits(pack(found.model), live["model"][0])
     suggested = identify_bag(copy, {})  # the bag does not say which order it had
