@@ -58,9 +58,9 @@ audit: setup .venv/supply
 run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
-# Three workers a core: tests over topics wait a good part of their time. Each has a ROS domain of its own.
+# Four workers for two cores: tests over topics wait a part of their time. Each has a ROS domain of its own.
 test: setup packages
-	$(BIN)/python -m pytest -n 6 --dist worksteal
+	$(BIN)/python -m pytest -n 4 --dist worksteal
 
 # The tests without topics, with what they cover of the pure modules (pyproject.toml).
 coverage: setup packages
