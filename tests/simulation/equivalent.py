@@ -57,5 +57,10 @@ ARGUED: dict[tuple[str, str, str], str] = {
         "self._served = (-1, -1)",
         "1 -> 2",
     ): "no run and no plant has either number",
+    (
+        "tuner_node.training_state",
+        "if np.abs(training.models).max(initial=0.0) > _LARGEST:",
+        "Gt -> GtE",
+    ): "no model has a number that is the bound itself",
 }
 """By module, line and change."""
