@@ -256,13 +256,17 @@ class TunerNode:
 
         status = self._full_name("", topics.RECORDER_STATUS)
         recorders = {process_of(there) for there in self._node.get_publishers_info_by_topic(status)}
-        starts = [senders[topics.START.name].publisher for senders in self._senders]
+        unmatched = set[bytes]()
+        if self._participants.awaits_recorder:
+            for senders in self._senders:
+                publisher = senders[topics.START.name].publisher
+                unmatched |= recorders - matched_processes(self._node, publisher)
         return Publishers(
             plants=[there for _, there in count(topics.COST.name)],
             controllers=[there for _, there in count(topics.MODEL_IDENTIFIED.name)],
             tuners=dict(count(topics.START.name)),
             recorders=len(recorders),
-            unmatched=max(len(recorders - matched_processes(self._node, own)) for own in starts),
+            unmatched=len(unmatched),
         )
 
     def _report(self, row: Mapping[str, Any]) -> None:

@@ -19,7 +19,7 @@ class Publishers:
 
     plants, controllers: of `episode/cost` and `model/identified`, by pair; tuners: of each
     `episode/start`, this tuner's own among them; recorders: of `recorder/status`; unmatched: those of
-    them that do not yet read every `episode/start` of this tuner.
+    them that do not yet read every `episode/start` of this tuner, as long as one is awaited.
     """
 
     plants: Sequence[int]
@@ -41,13 +41,19 @@ class Participants:
         self._second_tuner = ConditionTimer()
         self._paused: list[int] = []
 
+    @property
+    def awaits_recorder(self) -> bool:
+        """True until a recorder was there from which no start of an episode can be lost."""
+        return self._recorder != "none" and not self._recorder_seen
+
     def update(self, there: Publishers, now: float) -> list[PairPublication]:
         """The messages to send now that these publishers are present (now: monotonic s).
 
         DispatchError where a required recorder has gone, or another tuner publishes.
         """
         self._refuse_second_tuner(there.tuners, now)
-        absent = ["recorder"] if self._awaits_recorder(there) else []
+        self._look_for_recorder(there)
+        absent = ["recorder"] if self.awaits_recorder else []
         publications = []
         for pair, counts in enumerate(zip(there.plants, there.controllers, strict=True)):
             roles = zip(("plant", "controller"), counts, strict=True)
@@ -67,20 +73,17 @@ class Participants:
         which = f" of pair {', '.join(map(str, paused))}" if len(dispatcher.pairs) > 1 else ""
         return f"the plant{which} is paused"
 
-    def _awaits_recorder(self, there: Publishers) -> bool:
-        """True until a recorder was there from which no start of an episode can be lost.
+    def _look_for_recorder(self, there: Publishers) -> None:
+        """Note a recorder that misses nothing; DispatchError where a required one has gone.
 
-        A recorder may be discovered before its subscriptions are.
+        One may be discovered before its subscriptions are.
         """
-        if self._recorder == "none":
-            return False
         if self._recorder == "required" and self._recorder_seen and not there.recorders:
             raise DispatchError(
                 "the recorder is gone, and this training is required to be recorded; "
                 "it can be continued from its folder with resume:=true"
             )
         self._recorder_seen |= there.recorders > there.unmatched
-        return not self._recorder_seen
 
     def _refuse_second_tuner(self, tuners: Mapping[str, int], now: float) -> None:
         """DispatchError if another tuner publishes, unless a pair serves this one and refuses it."""
