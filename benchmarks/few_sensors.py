@@ -18,7 +18,7 @@ from typing import Any
 
 import pdeloop
 from benchmarks.general import number
-from loop_interfaces.files import make_folder, read_json
+from loop_interfaces.files import make_folder, read_json, write_atomically
 from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]
@@ -90,7 +90,7 @@ def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
         row |= {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
     except (ValueError, RuntimeError) as error:
         row["error"] = " ".join(str(error).split())
-    path.write_text(json.dumps(row))
+    write_atomically(path, json.dumps(row).encode())
     return row
 
 
