@@ -16,6 +16,7 @@ J. Sci. Comput. 16, 1995 (the implementation).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -185,6 +186,15 @@ def _descend(
         },
     )
     return Improvement(best.theta, before, best.after, len(values) - 1)
+
+
+def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
+    """The law that is finite from most of the fields, and cheapest where all of those are."""
+    costs = np.array([loop.costs(theta, fields) for theta in laws])
+    lost = ~np.isfinite(costs) @ weights
+    common = np.isfinite(costs[lost <= lost.min()]).all(axis=0)
+    total = np.where(common, costs, 0.0) @ weights
+    return laws[int(np.lexsort((total, lost))[0])]
 
 
 def curvature_of(loop: ClosedLoop) -> Array:

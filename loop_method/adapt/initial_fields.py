@@ -121,6 +121,14 @@ def mixtures(
     return drawn
 
 
+def weighted(fields: Array, drawn: Array, share: float) -> tuple[Array, Array]:
+    """Measured and drawn fields, and their weights, of which the measured ones have this share."""
+    share = share if len(drawn) else 1.0
+    own = np.full(len(fields), share / len(fields))
+    others = np.full(len(drawn), (1.0 - share) / max(len(drawn), 1))
+    return np.concatenate([fields, drawn]), np.concatenate([own, others])
+
+
 def invariant_share(fields: Array, components: int = 1) -> float:
     """rho of the fields (n, n_z), between 0 and 1; 1 of two fields, which do not tell.
 

@@ -10,20 +10,18 @@ reproduces the rollouts, it goes on with a model of the readings (`model_based_r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Row
 from loop_method.adapt.belief import Belief, believe
-from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.initial_fields import mixtures
+from loop_method.adapt.improve import cheapest, curvature_of, improve
+from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.observer_design import compensators, whole_field_law
 from loop_method.adapt.renewal import mean_and_error
-from loop_method.adapt.sensed_loop import REPRODUCED, SensedLoop, sensed_from, sensed_loop
+from loop_method.adapt.sensed_loop import REPRODUCED, sensed_from, sensed_loop
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -112,14 +110,6 @@ class ModelBasedSensed(ModelBasedReadings):
             ModelBased._judge(self, row)
 
 
-def weighted(fields: Array, drawn: Array, share: float) -> tuple[Array, Array]:
-    """Measured and drawn fields, and their weights: the share of the measured ones."""
-    share = share if len(drawn) else 1.0
-    own = np.full(len(fields), share / len(fields))
-    others = np.full(len(drawn), (1.0 - share) / max(len(drawn), 1))
-    return np.concatenate([fields, drawn]), np.concatenate([own, others])
-
-
 def gained(costs: Array, base: Array) -> tuple[float, float]:
     """The mean change against the costs of another law and its standard error, where both are finite.
 
@@ -127,13 +117,3 @@ def gained(costs: Array, base: Array) -> tuple[float, float]:
     """
     known = np.isfinite(costs) & np.isfinite(base)
     return mean_and_error(costs[known] - base[known]) if known.any() else (np.nan, np.nan)
-
-
-def cheapest(loop: SensedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
-    """The law that is finite from most of the fields, and cheapest where all of those are."""
-    costs = np.array([loop.costs(theta, fields) for theta in laws])
-    lost = ~np.isfinite(costs) @ weights
-    best = lost <= lost.min()
-    common = np.isfinite(costs[best]).all(axis=0)
-    total = np.where(common, costs, 0.0) @ weights
-    return laws[int(np.lexsort((total, lost))[0])]

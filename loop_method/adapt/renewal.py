@@ -19,15 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.initial_fields import mixtures
+from loop_method.adapt.improve import cheapest, curvature_of, improve
+from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.settings import ModelBasedSettings
+
+_Descent: TypeAlias = Callable[[Sequence[Array], Array, int], tuple[Array, int] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +104,8 @@ def renew(
     Renewal or None
         None where no law is finite on the model.
     """
-    descend = partial(
-        _improved,
-        loop,
-        curvature=curvature_of(loop),
-        rng=rng,
-        settings=settings,
-        components=components,
-        periodic=periodic,
-        least_gain=settings.least_gain if final else settings.first_gain,
-    )
+    least_gain = settings.least_gain if final else settings.first_gain
+    descend = _descent(loop, rng, settings, components, periodic, least_gain)
     few = settings.mixtures // 2
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
         found = descend([first, improved], fields, 0)
@@ -144,23 +138,14 @@ def confirmed_fraction(
     """
     if len(fields) < 2:
         return 1.0, 0.0, 0.0
-    descend = partial(
-        _improved,
-        loop,
-        curvature=curvature_of(loop),
-        rng=rng,
-        settings=settings,
-        components=components,
-        periodic=periodic,
-        least_gain=settings.first_gain,
-    )
+    descend = _descent(loop, rng, settings, components, periodic, settings.first_gain)
     starts = [first] * settings.folds
     made, _ = _of_parts(descend, first, starts, fields, settings.mixtures // 2)
     return held_out_fraction(loop, first, made, fields, settings)
 
 
 def _of_parts(
-    descend: Callable[[Sequence[Array], Array, int], tuple[Array, int] | None],
+    descend: _Descent,
     first: Array,
     starts: Sequence[Array],
     fields: Array,
@@ -246,32 +231,25 @@ def mean_and_error(values: Array) -> tuple[float, float]:
     return mean, float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
-def _improved(
+def _descent(
     loop: ClosedLoop,
-    starts: Sequence[Array],
-    fields: Array,
-    most: int,
-    *,
-    curvature: Array,
     rng: np.random.Generator,
     settings: ModelBasedSettings,
     components: int,
     periodic: bool,
     least_gain: float,
-) -> tuple[Array, int] | None:
-    """The law after a descent from the cheapest start, and its steps."""
-    drawn = mixtures(fields, most, rng, components, periodic=periodic)
-    share = settings.measured_share if len(drawn) else 1.0
-    every = np.concatenate([fields, drawn])
-    weights = np.append(
-        np.full(len(fields), share / len(fields)),
-        np.full(len(drawn), (1.0 - share) / max(len(drawn), 1)),
-    )
-    costs = np.array([loop.costs(theta, every) for theta in starts])
-    # First the start that is finite from more of the fields, then the cheaper one.
-    lost = (~np.isfinite(costs)) @ weights
-    common = np.isfinite(costs).all(axis=0)
-    total = np.where(common, costs, 0.0) @ weights
-    start = starts[int(np.lexsort((total, lost))[0])]
-    found = improve(loop, start, every, weights, curvature, settings, least_gain)
-    return None if found is None else (found.theta, found.steps)
+) -> _Descent:
+    """The law after a descent from the cheapest of some laws, and its steps, as a function.
+
+    Its arguments are these laws, measured fields and how many to draw.
+    """
+    curvature = curvature_of(loop)
+
+    def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
+        drawn = mixtures(fields, most, rng, components, periodic=periodic)
+        every, weights = weighted(fields, drawn, settings.measured_share)
+        start = cheapest(loop, starts, every, weights)
+        found = improve(loop, start, every, weights, curvature, settings, least_gain)
+        return None if found is None else (found.theta, found.steps)
+
+    return descend

@@ -91,6 +91,37 @@ def whole_rollouts(
     return list(whole.values())[-NEWEST:]
 
 
+def of_rollouts(
+    problem: ClosedLoopProblem, rollouts: Sequence[Record]
+) -> tuple[list[Array], list[Array], Array]:
+    """Readings, actions and `distance` of each rollout."""
+    weights = problem.state_weight, problem.action_weight, problem.horizon
+    return (
+        [record.acted_from for record in rollouts],
+        [record.actions for record in rollouts],
+        np.array([distance(record, *weights) for record in rollouts]),
+    )
+
+
+def fit_rollouts(
+    problem: ClosedLoopProblem,
+    rollouts: Sequence[Record],
+    centres: Array,
+    noise: float,
+    start: Array | None,
+) -> tuple[Array, Array, float] | None:
+    """The fit that reproduces the readings of rollouts, from an earlier equation or from nothing.
+
+    The shared unknowns, the initial fields and the error, as of `fit_sensed`; None if neither does.
+    """
+    readings, actions, distances = of_rollouts(problem, rollouts)
+    for first in (None,) if start is None else (start, None):
+        found = fit_sensed(readings, actions, centres, noise, first, problem.target, distances)
+        if found[2] <= REPRODUCED:
+            return found
+    return None
+
+
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring."""
     sensors = context.sensors
@@ -112,17 +143,11 @@ def sensed_from(
     if not chosen:
         return None
     centres = context.actuator_centres(n_a)
-    weights = context.state_weight, context.action_weight, context.horizon
-    distances = np.array([distance(record, *weights) for record in chosen])
-    readings = [record.acted_from for record in chosen]
-    actions = [record.actions for record in chosen]
-    seen = readings, actions, centres, context.noise
-    for first in (None,) if start is None else (start, None):
-        shared, fields, error = fit_sensed(*seen, first, context.target, distances)
-        if error <= REPRODUCED:
-            break
-    else:
+    found = fit_rollouts(problem, chosen, centres, context.noise, start)
+    if found is None:
         return None
+    shared, fields, error = found
+    readings, actions, distances = of_rollouts(problem, chosen)
     known = list(zip(readings, actions, distances.tolist(), strict=True))
     size = float(np.mean([np.mean(own**2) for own in readings]))
 
@@ -134,7 +159,10 @@ def sensed_from(
     smoothing = learned()
     # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
     for _ in range(AGAIN if context.noise else 0):
-        again = fit_sensed(*seen, shared, context.target, distances, smoothing.spread)
+        again = fit_sensed(
+            *(readings, actions, centres, context.noise, shared, context.target, distances),
+            smoothing.spread,
+        )
         if again[2] > REPRODUCED:
             break
         shared, fields, error = again

@@ -15,9 +15,8 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
 from loop_method.adapt.field_step import EXTRAPOLATION, extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
-from loop_method.adapt.sensed_loop import REPRODUCED, distance, whole_rollouts
+from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
 from loop_method.models.sensed import KIND, SHARED, interpolated, sensed_model
-from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 
@@ -58,13 +57,11 @@ class SensedProposals:
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""
         rollouts = whole_rollouts(self._loop, data, self._largest_cost)
-        starts = (self.equation, None) if self.equation.any() else (None,)
-        for start in starts:
-            shared, fields, error = self._fit(rollouts, start)
-            if error <= REPRODUCED:
-                break
-        else:
+        start = self.equation if self.equation.any() else None
+        fitted = fit_rollouts(self._loop, rollouts, self._centres, self._noise, start)
+        if fitted is None:
             return None
+        shared, fields, error = fitted
         self.equation = shared
         loop, (sensors, n_s) = self._loop, self._loop.U.shape
         n, largest = fields.shape[1], float(np.abs(fields).max())
@@ -89,15 +86,3 @@ class SensedProposals:
             return None
         candidate = between.policy(found[0], policy)
         return Proposal(candidate, found[1], 1, 0.0, error, KIND)
-
-    def _fit(self, rollouts: Sequence[Record], start: Array | None) -> tuple[Array, Array, float]:
-        """The shared unknowns, the initial fields, and the relative error of the readings."""
-        loop = self._loop
-        readings = [record.acted_from for record in rollouts]
-        actions = [record.actions for record in rollouts]
-        weights = loop.state_weight, loop.action_weight, loop.horizon
-        return fit_sensed(
-            *(readings, actions, self._centres, self._noise, start),
-            loop.target,
-            np.array([distance(record, *weights) for record in rollouts]),
-        )

@@ -107,10 +107,8 @@ class SensedModel(SpectralModel):
     @staticmethod
     def from_arrays(arrays: Arrays) -> SensedModel:
         """The model of `arrays`."""
-        whole, sensors = (
-            SpectralModel.from_arrays(arrays),
-            int(checked_array(arrays, "sensors", "i", ())),
-        )
+        whole = SpectralModel.from_arrays(arrays)
+        sensors = int(checked_array(arrays, "sensors", "i", ()))
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         return SensedModel(
