@@ -70,10 +70,7 @@ class GaussNewtonSettings(Settings):
     """The constants of `gauss_newton`."""
 
     fields: int = setting(
-        3,
-        "initial fields M that judge a policy at first; they grow to twice as many",
-        1,
-        1000,
+        3, "initial fields M that judge a policy at first; they grow to twice as many", 1, 1000
     )
 
 
@@ -393,8 +390,10 @@ class GaussNewton(Optimizer):
                 accepted=now.accepted,
                 first=now.believed if again else None,
             )
-        if proposal is not None:
-            if again:
-                now.believed, now.tried = proposal.believed, count
-            now.candidate, now.fall, now.proposed = proposal.policy, proposal.fall, True
-            row.update(proposal.row())
+        if proposal is None:
+            row["reason"] = "no model gives a finite step; the law stays"
+            return
+        if again:
+            now.believed, now.tried = proposal.believed, count
+        now.candidate, now.fall, now.proposed = proposal.policy, proposal.fall, True
+        row.update(proposal.row())

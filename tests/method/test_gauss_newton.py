@@ -155,6 +155,15 @@ def test_with_sensors_the_first_law_has_to_beat_no_control_on_all_fields(
     assert same_bits(optimizer.policy, 0.6 * first if better else np.zeros_like(first))
 
 
+def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    monkeypatch.setattr(Proposer, "propose", lambda *given, **named: None)
+    row = optimizer.tell(measure(plant, optimizer.ask()))
+    assert optimizer.done and row["rollouts"] == 3 and same_bits(optimizer.policy, 0.6 * plant.best)
+    assert row["reason"] == "no model gives a finite step; the law stays"
+
+
 def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
     plant = Plant()
     optimizer = make(plant, rollouts=24)
