@@ -70,7 +70,10 @@ class GaussNewtonSettings(Settings):
     """The constants of `gauss_newton`."""
 
     fields: int = setting(
-        3, "initial fields M that judge a policy at first; they grow to twice as many", 1, 1000
+        3,
+        "initial fields M on which a policy is judged at first; their number grows to 2M",
+        1,
+        1000,
     )
 
 

@@ -28,7 +28,7 @@ class ModelBasedSettings(Settings):
     )
     believed: float = setting(
         0.05,
-        "largest error E of a model that is used; above it there are local steps",
+        "largest error E at which a model is used; above it, local steps are taken",
         0.0,
         1.0,
     )
@@ -40,14 +40,15 @@ class ModelBasedSettings(Settings):
     )
     readings_trust: float = setting(
         1.0,
-        "weight of the distance from where a step on a model of readings begins; of a linear plant the "
-        "step is 1/(1 + this) of the whole one",
+        "weight of the distance from the start of a step on a model of readings; for a linear "
+        "plant the step is 1/(1 + weight) of the full one",
         0.0,
         1e6,
     )
     mixtures: int = setting(
         24,
-        "most initial fields drawn around the measured ones; half as many before the final law",
+        "maximum number of initial fields drawn around the measured ones; half as many before "
+        "the final law",
         0,
         1000,
     )
@@ -60,12 +61,12 @@ class ModelBasedSettings(Settings):
     measured_share: float = setting(
         0.5, "weight of the measured fields against the drawn ones", 0.0, 1.0
     )
-    iterations: int = setting(100, "most steps of L-BFGS per improvement", 1, 10_000)
+    iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
     memory: int = setting(40, "gradient differences that L-BFGS keeps", 1, 1000)
-    window: int = setting(5, "steps of L-BFGS that together must gain least_gain", 1, 100)
+    window: int = setting(5, "L-BFGS steps that together must gain least_gain", 1, 100)
     least_gain: float = setting(
         1e-3,
-        "share of the cost that a window must gain for the descent to continue",
+        "share of the cost by which a window must reduce it for the descent to continue",
         0.0,
         1.0,
     )
@@ -76,10 +77,12 @@ class ModelBasedSettings(Settings):
         1e-12,
         1.0,
     )
-    halvings: int = setting(12, "times a law is halved until the model's fields are finite", 0, 100)
+    halvings: int = setting(
+        12, "maximum number of halvings of a law until the model's fields are finite", 0, 100
+    )
     folds: int = setting(
         2,
-        "parts of the fields, each left out once to choose how far the law moves",
+        "parts of the fields, each held out once to choose how far the law moves",
         2,
         100,
     )
@@ -88,13 +91,14 @@ class ModelBasedSettings(Settings):
     )
     close: float = setting(
         0.2,
-        "no control is also rolled out if it costs at most this share more than the law on the model",
+        "no control is also rolled out if its cost on the model exceeds the law's by at most "
+        "this share",
         0.0,
         10.0,
     )
     confidence: float = setting(
         1.0,
-        "standard errors by which a law must beat the first one on fields that did not produce it",
+        "standard errors by which a law must beat the first one on held-out fields",
         0.0,
         10.0,
     )

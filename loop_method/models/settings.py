@@ -17,35 +17,36 @@ class FieldModelSettings(Settings):
     """
 
     # The choice of a kind.
-    reproduced: float = setting(2e-3, "E up to which the first kind that reaches it is taken", 0, 1)
+    reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
     reproduced_noisy: float = setting(
         0.05, "the same with measurement noise, which leaves initial states uncertain", 0, 1
     )
     better: float = setting(
         3.0, "how many times smaller the E of a kind with more unknowns must be", 1, 100
     )
-    folds: int = setting(3, "most turns in which rollouts are fitted and judged", 2, 100)
+    folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
     hopeless: float = setting(
         20.0,
-        "multiple of the best E, or of `reproduced`, above which a kind gets no more turns",
+        "multiple of the best E, or of `reproduced`, above which a kind is dropped from further "
+        "folds",
         1,
         1e6,
     )
-    worst: float = setting(2.0, "E that counts for a model that diverges", 1, 1e6)
+    worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
     dense: int = setting(
-        512, "largest state of the kinds whose work grows with its square", 2, 65536
+        512, "largest state for the kinds whose cost grows with its square", 2, 65536
     )
     largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
-    fewest_points: int = setting(8, "fewest grid points of a spectral model", 4, 65536)
+    fewest_points: int = setting(8, "minimum number of grid points of a spectral model", 4, 65536)
     # Spectral models.
     passes: int = setting(
-        12, "times that an equation is fitted along the paths of the one before", 1, 20
+        12, "times that an equation is refitted along the paths of the previous fit", 1, 20
     )
     settled: float = setting(
         1e-3, "relative change of the one-step error at which the passes end", 0, 0.1
     )
-    samples: int = setting(500, "most steps of the data in a fit", 50, 1_000_000)
-    substeps: int = setting(64, "most internal steps per sampling time", 1, 1000)
+    samples: int = setting(500, "maximum number of data steps in a fit", 50, 1_000_000)
+    substeps: int = setting(64, "maximum number of internal steps per sampling time", 1, 1000)
     first_substeps: int = setting(6, "internal steps of the first pass", 1, 1000)
     reach: float = setting(
         1.5, "fastest nonlinear rate times the internal step; ETDRK4 is stable up to 2.8", 0.1, 2.8
@@ -68,20 +69,24 @@ class FieldModelSettings(Settings):
     )
     convolution_ridge: float = setting(1e-9, "ridge of convolution models", 0, 1e-3)
     low_rank_ridge: float = setting(1e-12, "ridge of low-rank models", 0, 1e-3)
-    snapshots: int = setting(400, "most states that POD modes are computed from", 2, 10_000)
+    snapshots: int = setting(
+        400, "maximum number of states that POD modes are computed from", 2, 10_000
+    )
     energy: float = setting(1e-12, "share of the energy below which a POD mode is left out", 0, 1)
     samples_per_mode: int = setting(
-        4, "steps of the data per unknown of a row of a low-rank model", 1, 1000
+        4, "data steps per unknown in a row of a low-rank model", 1, 1000
     )
     # Fits to noisy data.
     noisy_steps: int = setting(
-        2000, "most steps of the data in a fit with measurement noise", 50, 1_000_000
+        2000, "maximum number of data steps in a fit with measurement noise", 50, 1_000_000
     )
     noisy_power: float = setting(
         3.0, "mean power of a wavenumber, relative to the noise, from which it is compared", 1, 1e6
     )
-    fewest_modes: int = setting(4, "wavenumbers that are compared whatever their power", 1, 65536)
-    largest_window: int = setting(16, "most sampling times of a window", 1, 16)
+    fewest_modes: int = setting(
+        4, "wavenumbers that are always compared, whatever their power", 1, 65536
+    )
+    largest_window: int = setting(16, "maximum number of sampling times of a window", 1, 16)
     growth: float = setting(
         1.5, "largest growth of the linear part within a window, as an exponent of e", 0.1, 10
     )
@@ -92,7 +97,7 @@ class FieldModelSettings(Settings):
         3.0, "standard errors that a coefficient must have to be kept", 0, 100
     )
     least_correction: float = setting(
-        0.02, "least share of an innovation that corrects a filtered state", 0, 1
+        0.02, "minimum share of an innovation that corrects a filtered state", 0, 1
     )
     far: float = setting(
         1e3,

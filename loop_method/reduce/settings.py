@@ -21,35 +21,39 @@ class IdentificationSettings(Settings):
     order_folds: int = setting(4, "parts of these pieces, each held out once", 2, 1000)
     order_share: float = setting(
         0.8,
-        "share of the digits that the best order gains in the one-step error, which the suggested "
-        "order reaches",
+        "share of the best order's reduction of the one-step error, on a logarithmic scale, that "
+        "the suggested order reaches",
         0.0,
         1.0,
     )
     field_largest: int = setting(
-        512, "largest state of which a model of the whole field is made for the first law", 0, 65536
+        512,
+        "largest state for which a model of the whole field is fitted for the first law",
+        0,
+        65536,
     )
     field_error: float = setting(
-        0.05, "largest error of such a model that a first law is designed from", 0.0, 1.0
+        0.05, "largest error of a model that a first law is designed from", 0.0, 1.0
     )
     field_pieces: int = setting(
-        8, "pieces of an episode that it may predict instead of the whole", 1, 1000
+        8, "pieces of an episode that the model may predict instead of the whole", 1, 1000
     )
     field_thinning: int = setting(
         5, "interval between the simulated states that the basis is computed from", 1, 1000
     )
     field_room: float = setting(
         2.0,
-        "modes per actuator from which on the rows of the field's feedback are part of the basis",
+        "modes per actuator from which the rows of the full-state feedback are part of the basis",
         1.0,
         1000.0,
     )
     subspace_tolerance: float = setting(
-        1.02, "times the least held-out error up to which a lower order is taken", 1.0, 100.0
+        1.02, "multiple of the least held-out error up to which a lower order is chosen", 1.0, 100.0
     )
     noise_evidence: float = setting(
         2.0,
-        "standard errors by which measurement noise must show in residuals for a filter of it",
+        "standard errors by which the residuals must show measurement noise before a filter is "
+        "designed for it",
         0.0,
         100.0,
     )
