@@ -1,22 +1,32 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Laws in a closed loop: their cost, and on a model of the whole field its exact gradient.
+"""Laws in a closed loop: their cost, and on a model of the plant its exact gradient.
 
-The law is a = theta [s; 1] with theta = [K_a b] and s = U^T z, saturated at the action limit. On a
-model, from an initial field z_0, it costs
+The law is linear in what it knows, the projected state s = U^T z and its memory p, and gives besides
+the action what moves the memory:
 
-    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),        z_{k+1} = f(z_k, a_k),
+    [a_k; u_k] = theta [s_k; p_k; 1],        z_{k+1} = f(z_k, a_k),        p_{k+1} = u_k + B a_k,
 
-with f the model. With eta_k = dJ/dz_k, eta_T = 0, the gradient follows backwards in time,
+with f the model, p_0 = s_0, and a_k saturated at the action limit. The affine law has no memory, and
+theta = [K_a b]; `observed_loop` has that of a law with an observer. From an initial field z_0 a law
+costs
 
-    g_k   = (df/da)^T eta_{k+1} + 2 r/T a_k        (0 where a_k is saturated),
-    eta_k = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + U K_a^T g_k,
-    dJ/dtheta = sum_k g_k [s_k; 1]^T.
+    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2).
+
+With eta_k = dJ/dz_k and mu_k = dJ/dp_k, both 0 at k = T, the gradient follows backwards in time,
+
+    g_k     = (df/da)^T eta_{k+1} + B^T mu_{k+1} + 2 r/T a_k        (0 where a_k is saturated),
+    [v; mu_k] = [theta_s theta_p]^T [g_k; mu_{k+1}],
+    eta_k   = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + U v,
+    dJ/dtheta = sum_k [g_k; mu_{k+1}] [s_k; p_k; 1]^T.
 
 It costs about three simulations, whatever the number of gains.
 
 References
 ----------
 Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode).
+El Ghaoui, Oustry, AitRami, "A cone complementarity linearization algorithm for static output-feedback
+and related problems", IEEE Trans. Automatic Control 42(8), 1997, section IV (a law with memory is a
+static law of a larger plant).
 """
 
 from __future__ import annotations
@@ -113,7 +123,9 @@ class ClosedLoopProblem:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop(ClosedLoopProblem):
-    """A model of the whole field under such laws, and what they cost on it.
+    """A model of the plant under such laws, and what they cost on it.
+
+    A class derived from it says how a law remembers, or what of a model's state is seen.
 
     Attributes
     ----------
@@ -129,34 +141,126 @@ class ClosedLoop(ClosedLoopProblem):
     noise: float = field(default=0.0, kw_only=True)
     cost: Cost | None = field(default=None, kw_only=True)
 
+    replays: ClassVar[bool] = False
+    """True if initial fields are measured rollouts, with what in them was not foreseen."""
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """The initial field of each rollout, (n, n_z)."""
+        return np.stack([record.states[0] for record in records])
+
+    @property
+    def memory_input(self) -> Array:
+        """B of the memory, (n_p, n_a); n_p = 0: the law has none."""
+        return np.zeros((0, self.model.n_a))
+
+    @property
+    def no_control(self) -> Array:
+        """Theta of a = 0."""
+        n_p = len(self.memory_input)
+        return np.zeros((self.model.n_a + n_p, self.U.shape[1] + n_p + 1))
+
+    def curvature(self, own: Array) -> Array:
+        """What a change of the law's outputs [a; u] costs, from that of an action, (n_a, n_a)."""
+        return own
+
+    def costs(self, theta: Array, fields: Array) -> Array:
+        """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
+        return self.simulate(theta, fields).costs
+
     def simulate(self, theta: Array, fields: Array) -> Simulation:
-        """Roll theta (n_a, n_s + 1) out from the fields (F, n_z)."""
-        K, b = theta[:, :-1], self.constant_feature * theta[:, -1]
-        states = np.empty((self.horizon + 1, *fields.shape))
-        actions = np.empty((self.horizon, len(fields), len(theta)))
-        costs, finite = np.zeros(len(fields)), np.ones(len(fields), dtype=bool)
-        noise = self._noise_of(len(fields))
-        states[0] = fields
+        """Roll theta (n_a + n_p, n_s + n_p + 1) out from the fields (F, n_z)."""
+        B, T, count = self.memory_input, self.horizon, len(fields)
+        (n_p, n_a), n_s = B.shape, self.U.shape[1]
+        begin = self._start(fields)
+        states = np.empty((T + 1, *begin.shape))
+        actions = np.empty((T, count, n_a))
+        features = np.full((T, count, n_s + n_p + 1), self.constant_feature)
+        costs, finite = np.zeros(count), np.ones(count, dtype=bool)
+        noise = self._noise_of(count)
+        gains, constant = theta[:, :-1].T, self.constant_feature * theta[:, -1]
+        states[0] = begin
+        memory = np.empty((count, n_p))
         with np.errstate(all="ignore"):
-            for k in range(self.horizon):
-                a = (states[k] @ self.U + noise[k]) @ K.T + b
+            for k in range(T):
+                outputs = self._outputs(k, states[k], fields)
+                known = features[k, :, :-1]
+                known[:, :n_s] = s = outputs @ self.U + noise[k]
+                known[:, n_s:] = memory if k else s[:, :n_p]
+                out = known @ gains + constant
+                a = out[:, :n_a]
                 if self.action_limit:
                     np.clip(a, -self.action_limit, self.action_limit, out=a)
-                self._add_stage(costs, states[k], states[k], a, k)
+                self._add_stage(costs, states[k], outputs, a, k)
                 # Diverged fields stay marked and continue with numbers that a model can take.
-                finite &= np.isfinite(costs)
-                a[~finite] = 0.0
+                memory = out[:, n_a:] + a @ B.T
+                finite &= np.isfinite(costs) & np.isfinite(memory).all(axis=1)
+                for part in (a, memory, known):
+                    part[~finite] = 0.0
                 actions[k] = a
-                after = self.model.step(states[k], a)
+                after = self._step(k, states[k], a, fields)
                 finite &= np.isfinite(after).all(axis=1)
                 after[~finite] = 0.0
                 states[k + 1] = after
             if self.cost is not None:
                 self.cost.add_terminal(costs, states[-1])
                 finite &= np.isfinite(costs)
-        costs /= self.horizon
+        costs /= T
         costs[~finite] = np.inf
-        return Simulation(states, actions, costs)
+        return Simulation(states, actions, costs, features)
+
+    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
+        """The weighted sum of the costs, and its gradient, of the shape of theta.
+
+        Infinite, with a gradient of zero, where a cost of positive weight is.
+        """
+        simulation = self.simulate(theta, fields)
+        gradient = np.zeros_like(theta)
+        if not np.isfinite(simulation.costs[weights > 0.0]).all():
+            return np.inf, gradient
+        states, actions = simulation.states, simulation.actions
+        B, gains, n_s = self.memory_input, theta[:, :-1], self.U.shape[1]
+        eta, mu = np.zeros_like(states[0]), np.zeros((len(fields), len(B)))
+        weight = weights[:, None] / self.horizon
+        if self.cost is not None:
+            eta = weight * self.cost.terminal_slope(states[-1])
+        share = 2.0 / self.horizon * weights[:, None]
+        for k in reversed(range(self.horizon)):
+            z, a = states[k], actions[k]
+            eta, g = self.model.pull_back(z, a, eta)
+            if self.cost is None:
+                error = self._outputs(k, z, fields) - self.target
+                on_z = self._pull_outputs(self.state_weight * share * error)
+                on_a = self.action_weight * share * a
+            else:
+                on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
+            g = g + on_a + mu @ B
+            if self.action_limit:
+                g = g * (np.abs(a) < self.action_limit)
+            out = np.hstack([g, mu])
+            gradient[:, :-1] += out.T @ simulation.features[k, :, :-1]
+            gradient[:, -1] += self.constant_feature * out.sum(axis=0)
+            known = out @ gains
+            by_s, mu = known[:, :n_s], known[:, n_s:]
+            if k == 0:
+                by_s[:, : len(B)] += mu
+            eta = eta + on_z + self._pull_outputs(by_s @ self.U.T)
+        counted = weights > 0.0
+        return float(weights[counted] @ simulation.costs[counted]), gradient
+
+    def _start(self, fields: Array) -> Array:
+        """The model's state at the beginning."""
+        return fields
+
+    def _outputs(self, k: int, z: Array, fields: Array) -> Array:
+        """What U^T is applied to, and the target is of."""
+        return z
+
+    def _pull_outputs(self, by_outputs: Array) -> Array:
+        """The derivative by z of that by the outputs."""
+        return by_outputs
+
+    def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
+        return self.model.step(z, a)
 
     def _add_stage(self, costs: Array, z: Array, outputs: Array, a: Array, k: int) -> None:
         """Add the stage costs of step k, which are of z, or of the outputs that have a target."""
@@ -166,64 +270,6 @@ class ClosedLoop(ClosedLoopProblem):
         error = outputs - self.target
         costs += self.state_weight * np.einsum("fi,fi->f", error, error)
         costs += self.action_weight * np.einsum("fi,fi->f", a, a)
-
-    replays: ClassVar[bool] = False
-    """True if initial fields are measured rollouts, with what in them was not foreseen."""
-
-    def beginnings(self, records: Sequence[Record]) -> Array:
-        """The initial field of each rollout, (n, n_z)."""
-        return np.stack([record.states[0] for record in records])
-
-    @property
-    def no_control(self) -> Array:
-        """Theta of a = 0."""
-        return np.zeros((self.model.n_a, self.U.shape[1] + 1))
-
-    def features(self, simulation: Simulation) -> Array:
-        """What the law was of in a simulation, [s_k; 1], (T, F, n_s + 1)."""
-        s = simulation.states[:-1] @ self.U
-        return np.concatenate([s, np.full((*s.shape[:2], 1), self.constant_feature)], axis=2)
-
-    def curvature(self, own: Array) -> Array:
-        """What a change of the law's outputs costs, from that of an action, (n_a, n_a)."""
-        return own
-
-    def costs(self, theta: Array, fields: Array) -> Array:
-        """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
-        return self.simulate(theta, fields).costs
-
-    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
-        """The weighted sum of the costs, and its gradient (n_a, n_s + 1).
-
-        Infinite, with a gradient of zero, where a cost of positive weight is.
-        """
-        simulation = self.simulate(theta, fields)
-        gradient = np.zeros_like(theta)
-        if not np.isfinite(simulation.costs[weights > 0.0]).all():
-            return np.inf, gradient
-        states, actions = simulation.states, simulation.actions
-        K, eta = theta[:, :-1], np.zeros_like(fields)
-        weight = weights[:, None] / self.horizon
-        if self.cost is not None:
-            eta = weight * self.cost.terminal_slope(states[-1])
-        noise = self._noise_of(len(fields))
-        share = 2.0 / self.horizon * weights[:, None]
-        for k in reversed(range(self.horizon)):
-            z, a = states[k], actions[k]
-            eta, g = self.model.pull_back(z, a, eta)
-            if self.cost is None:
-                on_z = self.state_weight * share * (z - self.target)
-                on_a = self.action_weight * share * a
-            else:
-                on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
-            g = g + on_a
-            if self.action_limit:
-                g = g * (np.abs(a) < self.action_limit)
-            eta = eta + on_z + g @ K @ self.U.T
-            gradient[:, :-1] += g.T @ (z @ self.U + noise[k])
-            gradient[:, -1] += self.constant_feature * g.sum(axis=0)
-        counted = weights > 0.0
-        return float(weights[counted] @ simulation.costs[counted]), gradient
 
     def _noise_of(self, count: int) -> Array:
         """The noise added to U^T z, whose columns are orthonormal, (T, count, n_s) or (T, 1, 1)."""
@@ -235,11 +281,22 @@ class ClosedLoop(ClosedLoopProblem):
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """States (T + 1, F, n_z), actions (T, F, n_a), and the mean stage cost of each field (F,).
+    """States (T + 1, F, n_z), actions (T, F, n_a), mean stage costs (F,) and features (T, F, n_f).
 
-    From where a field's simulation is not finite its states and actions are zero.
+    The features are what the law was of, [s_k; p_k; 1]. From where a field's simulation is not finite
+    its states, its actions and what the law knew of it are zero.
     """
 
     states: Array
     actions: Array
     costs: Array
+    features: Array
+
+    def of_fields(self, chosen: Array) -> Simulation:
+        """Of some of the fields."""
+        return Simulation(
+            self.states[:, chosen],
+            self.actions[:, chosen],
+            self.costs[chosen],
+            self.features[:, chosen],
+        )

@@ -115,7 +115,7 @@ def improve(
     else:
         return None
     fields, weights = fields[finite], weights[finite] / weights[finite].sum()
-    features = loop.features(simulation)[:, finite]
+    features = simulation.features[:, finite]
     moment = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
     size = float(np.trace(moment[:-1, :-1])) / (len(moment) - 1)
     if not (size > 0.0 and np.isfinite(moment).all()):

@@ -104,10 +104,8 @@ def whole_field_law(
     known = np.isfinite(simulation.costs)
     if not known.any():
         return None
-    simulation = Simulation(
-        simulation.states[:, known], simulation.actions[:, known], simulation.costs[known]
-    )
-    return WholeFieldLaw(whole, found.theta, simulation, weights[known] / weights[known].sum())
+    share = weights[known] / weights[known].sum()
+    return WholeFieldLaw(whole, found.theta, simulation.of_fields(known), share)
 
 
 def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
