@@ -23,14 +23,14 @@ Sources and equations: docs/optimizers.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import Arrays, checked_array
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -45,6 +45,7 @@ from loop_method.adapt.base import (
     require_results,
 )
 from loop_method.adapt.proposer import Proposer
+from loop_method.adapt.search_state import NONE, SearchState, Stamps
 from loop_method.adapt.trajectories import Records
 from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, size_of
 from loop_method.seeds import field_seed
@@ -52,17 +53,13 @@ from loop_method.settings import Settings, setting
 
 __all__ = ["GaussNewton", "GaussNewtonSettings"]
 
-Stamps = NDArray[np.int64]
-
-_DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
+_DAMPING = (1e-4, 100.0)  # smallest, largest after a rejection
 _ABORT = 1.05
 _MEMORY = 40
 # An accepted step that gains less than this share of the cost is small: what is left to gain is less
 # than how much fields differ, so more of them have to judge.
 _SMALL = 0.02
-_NONE = -1
 _CONFIRMING = 0x434F4E46  # "CONF": of the fields that are drawn for the verdict
-_STAMPS = ("fields", "incumbents", "trials", "compared")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,73 +72,6 @@ class GaussNewtonSettings(Settings):
         1,
         1000,
     )
-
-
-@dataclass(eq=False)
-class SearchState:
-    """State of an optimisation, apart from the rollouts that it remembers.
-
-    policy, candidate (n_a, 2 n_s): the incumbent, and what is tried if `proposed`; fields (M,):
-    numbers of the initial fields that judge; incumbents, trials, compared (M,): stamps of the
-    rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
-    compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
-    candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was;
-    believed: the kind of the model of the whole field, empty for none; tried: rollouts, when none was
-    found.
-    """
-
-    policy: Array
-    candidate: Array
-    fields: Stamps
-    incumbents: Stamps
-    trials: Stamps
-    compared: Stamps
-    fall: float = 0.0
-    damping: float = _DAMPING[1]
-    accepted: bool = True
-    proposed: bool = False
-    tells: int = 0
-    believed: str = ""
-    tried: int = 0
-
-    @classmethod
-    def begin(cls, policy: Array, count: int, first: int) -> SearchState:
-        """Before the first rollout, with this many fields from number `first` on."""
-        incumbents, trials, compared = np.full((3, count), _NONE, dtype=np.int64)
-        numbers = first + np.arange(count, dtype=np.int64)
-        return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, compared)
-
-    def arrays(self) -> State:
-        """A copy of everything, as a checkpoint holds it."""
-        return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
-
-    def later(self, arrays: Arrays) -> SearchState:
-        """From the `arrays` of a later state of this optimisation; a ValueError if they are none."""
-        given: dict[str, Any] = {}
-        if "compared" not in arrays and "others" in arrays:  # its name in older checkpoints
-            arrays = {**arrays, "compared": arrays["others"]}
-        for name, own in self.arrays().items():
-            shape = (None,) if name in _STAMPS else own.shape
-            array = checked_array(arrays, name, own.dtype.kind, shape)
-            given[name] = array.copy() if shape else array.item()
-        if len({given[name].size for name in _STAMPS}) > 1:
-            raise ValueError("the fields of the checkpoint do not add up.")
-        return SearchState(**given)
-
-    @property
-    def missing(self) -> Stamps:
-        """Indices of the fields on which the incumbent has not run."""
-        return np.flatnonzero(self.incumbents == _NONE)
-
-    @property
-    def next_trial(self) -> int:
-        """Index of the field on which the candidate runs next."""
-        return int(np.argmax(self.trials == _NONE))
-
-    @property
-    def referred(self) -> set[int]:
-        """Stamps of the rollouts that are still needed."""
-        return {int(s) for s in (*self.incumbents, *self.trials, *self.compared)} - {_NONE}
 
 
 class GaussNewton(Optimizer):
@@ -259,7 +189,7 @@ class GaussNewton(Optimizer):
             now.trials[now.next_trial] = self._add(now.candidate, results[0]).stamp
             row["role"] = "candidate"
             decided = self._judge(row)
-        cost = self._mean_cost(now.incumbents[now.incumbents != _NONE])
+        cost = self._mean_cost(now.incumbents[now.incumbents != NONE])
         if np.isfinite(cost):
             row["cost"] = cost
         row["rollouts"] = self._records.count
@@ -302,7 +232,7 @@ class GaussNewton(Optimizer):
     def _judge(self, row: Row) -> bool:
         """Accept or reject the candidate, or let it run on; whether the decision has fallen."""
         now = self._now
-        ran = now.trials != _NONE
+        ran = now.trials != NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
         # The first law with sensors says nothing about the models.
@@ -313,7 +243,7 @@ class GaussNewton(Optimizer):
             lost = trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent)
         if lost:
             if from_model:
-                now.damping = min(4.0 * now.damping, _DAMPING[2])
+                now.damping = min(4.0 * now.damping, _DAMPING[1])
             now.compared = now.trials.copy()
             now.accepted = False
         elif ran.all():
@@ -331,7 +261,7 @@ class GaussNewton(Optimizer):
         row["accepted"] = now.accepted
         if np.isfinite(trial) and np.isfinite(incumbent):
             row["relative_cost"] = trial / incumbent
-        now.trials[:] = _NONE
+        now.trials[:] = NONE
         now.proposed = False
         return True
 
@@ -344,12 +274,12 @@ class GaussNewton(Optimizer):
         if grow:
             now.fields = np.append(now.fields, now.fields.max() + 1)
             now.incumbents, now.trials, now.compared = (
-                np.append(stamps, _NONE) for stamps in (now.incumbents, now.trials, now.compared)
+                np.append(stamps, NONE) for stamps in (now.incumbents, now.trials, now.compared)
             )
         else:
             oldest = int(np.argmin(now.fields))
             now.fields[oldest] = now.fields.max() + 1
-            now.compared[oldest] = now.incumbents[oldest] = _NONE
+            now.compared[oldest] = now.incumbents[oldest] = NONE
 
     def _compare(self, row: Row) -> None:
         """Move from the first law only as far as fields that were left out confirm."""
@@ -388,7 +318,7 @@ class GaussNewton(Optimizer):
             proposal = self._proposer.propose(
                 self._records.all(),
                 [self._records[int(stamp)] for stamp in now.incumbents],
-                [None if stamp == _NONE else self._records[int(stamp)] for stamp in now.compared],
+                [None if stamp == NONE else self._records[int(stamp)] for stamp in now.compared],
                 damping=now.damping,
                 accepted=now.accepted,
                 first=now.believed if again else None,

@@ -1,0 +1,87 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""How far a search by `gauss_newton` has come, for checkpoints: its laws, fields and decisions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.array_files import Arrays, checked_array
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import State
+
+Stamps = NDArray[np.int64]
+NONE = -1
+"""The stamp of a rollout that has not been made."""
+STAMPS = ("fields", "incumbents", "trials", "compared")
+FIRST_DAMPING = 1.0
+
+
+@dataclass(eq=False)
+class SearchState:
+    """State of an optimisation, apart from the rollouts that it remembers.
+
+    policy, candidate (n_a, 2 n_s): the incumbent, and what is tried if `proposed`; fields (M,):
+    numbers of the initial fields that judge; incumbents, trials, compared (M,): stamps of the
+    rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
+    compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
+    candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was;
+    believed: the kind of the model of the whole field, empty for none; tried: rollouts, when none was
+    found.
+    """
+
+    policy: Array
+    candidate: Array
+    fields: Stamps
+    incumbents: Stamps
+    trials: Stamps
+    compared: Stamps
+    fall: float = 0.0
+    damping: float = FIRST_DAMPING
+    accepted: bool = True
+    proposed: bool = False
+    tells: int = 0
+    believed: str = ""
+    tried: int = 0
+
+    @classmethod
+    def begin(cls, policy: Array, count: int, first: int) -> SearchState:
+        """Before the first rollout, with this many fields from number `first` on."""
+        incumbents, trials, compared = np.full((3, count), NONE, dtype=np.int64)
+        numbers = first + np.arange(count, dtype=np.int64)
+        return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, compared)
+
+    def arrays(self) -> State:
+        """A copy of everything, as a checkpoint holds it."""
+        return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
+
+    def later(self, arrays: Arrays) -> SearchState:
+        """From the `arrays` of a later state of this optimisation; a ValueError if they are none."""
+        given: dict[str, Any] = {}
+        if "compared" not in arrays and "others" in arrays:  # its name in older checkpoints
+            arrays = {**arrays, "compared": arrays["others"]}
+        for name, own in self.arrays().items():
+            shape = (None,) if name in STAMPS else own.shape
+            array = checked_array(arrays, name, own.dtype.kind, shape)
+            given[name] = array.copy() if shape else array.item()
+        if len({given[name].size for name in STAMPS}) > 1:
+            raise ValueError("the fields of the checkpoint do not add up.")
+        return SearchState(**given)
+
+    @property
+    def missing(self) -> Stamps:
+        """Indices of the fields on which the incumbent has not run."""
+        return np.flatnonzero(self.incumbents == NONE)
+
+    @property
+    def next_trial(self) -> int:
+        """Index of the field on which the candidate runs next."""
+        return int(np.argmax(self.trials == NONE))
+
+    @property
+    def referred(self) -> set[int]:
+        """Stamps of the rollouts that are still needed."""
+        return {int(s) for s in (*self.incumbents, *self.trials, *self.compared)} - {NONE}
