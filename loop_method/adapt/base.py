@@ -158,6 +158,9 @@ class Context:
         What theta is the parameters of, with its derivatives where it has them.
     field_models : FieldModelSettings
         How models of the whole field are fitted and one is chosen.
+    refused : array or None
+        The first law, where it was no better than no control on the field of its check, so that the
+        optimisation begins without control.
     """
 
     U: Array
@@ -177,6 +180,7 @@ class Context:
     cost: Cost | None = None
     law: Law | None = None
     field_models: FieldModelSettings = DEFAULTS
+    refused: Array | None = None
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:

@@ -79,7 +79,7 @@ def propose(
         if not fall > LEAST_FALL * before:  # also where it is not finite
             return None
     kind = belief.model.kind
-    return Proposal(loop.policy(theta, policy), fall, 1, 0.0, belief.error, kind, kind)
+    return Proposal(loop.policy(theta, policy), fall, 1, 0.0, belief.error, kind, kind, whole)
 
 
 def improved(

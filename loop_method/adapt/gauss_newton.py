@@ -15,15 +15,15 @@ step
    clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda;
    an incumbent that diverges is halved instead,
 4. after an acceptance replaces the oldest field, so that the policy does not fit M fields, or adds one
-   if the step was small.
+   if the step was small,
 
-Sources and equations: docs/optimizers.md.
+and the last rollouts decide what is returned (`final_comparison`). Sources and equations:
+docs/optimizers.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,17 +41,25 @@ from loop_method.adapt.base import (
     Row,
     State,
     checked_policy,
+    part_of,
     require_positive,
     require_results,
 )
+from loop_method.adapt.final_comparison import (
+    Comparison,
+    none_is_close,
+    on_same_fields,
+    rollouts_to_keep,
+)
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.search_state import NONE, SearchState, Stamps
+from loop_method.adapt.settings import GaussNewtonSettings, ModelBasedSettings
 from loop_method.adapt.trajectories import Records
-from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, size_of
+from loop_method.adapt.verdict import ADAPTED, FIRST, Verdict
+from loop_method.adapt.verdict import NONE as NO_CONTROL
 from loop_method.seeds import field_seed
-from loop_method.settings import Settings, setting
 
-__all__ = ["GaussNewton", "GaussNewtonSettings"]
+__all__ = ["GaussNewton"]
 
 _DAMPING = (1e-4, 100.0)  # smallest, largest after a rejection
 _ABORT = 1.05
@@ -59,19 +67,9 @@ _MEMORY = 40
 # An accepted step that gains less than this share of the cost is small: what is left to gain is less
 # than how much fields differ, so more of them have to judge.
 _SMALL = 0.02
+_LAST = "last."
+_CONSTANTS = ModelBasedSettings()
 _CONFIRMING = 0x434F4E46  # "CONF": of the fields that are drawn for the verdict
-
-
-@dataclass(frozen=True, kw_only=True)
-class GaussNewtonSettings(Settings):
-    """The constants of `gauss_newton`."""
-
-    fields: int = setting(
-        3,
-        "initial fields M on which a policy is judged at first; their number grows to 2M",
-        1,
-        1000,
-    )
 
 
 class GaussNewton(Optimizer):
@@ -119,17 +117,20 @@ class GaussNewton(Optimizer):
         if context is None:
             raise ValueError("Gauss-Newton needs the context: trajectories were not asked for")
         settings = settings or GaussNewtonSettings()
-        policy = checked_policy(policy0)
-        self._now = SearchState.begin(policy, settings.fields, first_field)
+        self._first = checked_policy(policy0 if context.refused is None else context.refused)
+        self._now = SearchState.begin(self._first, settings.fields, first_field)
         self._proposer = Proposer(context, self._now.policy)
-        self._sensors = context.sensors
-        self._first = policy
-        # With sensors the first law was compared with no control by rollouts.
+        self._sensors, self._context = context.sensors, context
+        # With sensors the first law is compared with no control by the rollouts of the search.
         self._verdict = verdict and not context.sensors
-        # One field says little with few sensors: the law has to beat no control on all of them.
-        if self._sensors and self._now.policy.any():
+        # One field says little, above all with few sensors or of a chaotic plant: where it spoke
+        # against the first law, that law has to beat no control on all of them.
+        contested = bool(context.sensors) or context.refused is not None
+        self._contested = contested and bool(self._first.any())
+        if self._contested:
             self._now.policy[:] = 0.0
             self._now.proposed = True
+        self._comparison: Comparison | None = None
         self._seed = seed
         self._budget = rollouts
         self._field_count = settings.fields
@@ -156,9 +157,11 @@ class GaussNewton(Optimizer):
         return not self.ask()
 
     def ask(self) -> list[Rollout]:
-        """The incumbent on fields that are new to it, or the candidate on the next field."""
+        """The incumbent on fields that are new to it, the candidate on the next, or the last ones."""
         now = self._now
-        left = self._budget - self._records.count
+        if self._comparison is not None:
+            return self._comparison.rollouts(self._laws, self._seed)
+        left = 0 if now.ended else self._left
         missing = now.missing
         if missing.size:
             new = [self._rollout(now.policy, int(i)) for i in missing]
@@ -175,6 +178,9 @@ class GaussNewton(Optimizer):
             self._records.validated_samples(result)
         now.tells += 1
         row: Row = {"diverged": sum(not r.usable for r in results)}
+        if self._comparison is not None:
+            self._decide(results, row)
+            return row
         missing = now.missing
         if missing.size:
             first = self._records.count == 0
@@ -196,27 +202,30 @@ class GaussNewton(Optimizer):
         row["damping"] = now.damping
         if decided and not now.missing.size and not now.proposed:
             self._propose(row)
-        if self._verdict and now.believed and self.done:
-            self._compare(row)
+        if self._verdict and self.done:
+            self._finish(row)
         return row
 
     def state(self) -> State:
         """The policies, the decisions that are pending, and the remembered trajectories."""
         sensed = self._proposer.sensed
         equation = {"equation": sensed.equation.copy()} if sensed else {}
+        last = self._comparison.state() if self._comparison is not None else {}
         return {
             **self._now.arrays(),
             **equation,
             **self._records.state(),
+            **{_LAST + name: array for name, array in last.items()},
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
         now, sensed = self._now.later(state), self._proposer.sensed
+        last = Comparison.of(part_of(state, _LAST), self._first.shape, self._context)
         self._records.restore(state, len(self._proposer.loop.U), self._now.policy.shape)
         if missing := now.referred - {record.stamp for record in self._records.all()}:
             raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
-        self._now = now
+        self._now, self._comparison = now, last
         if sensed:
             sensed.equation = checked_array(state, "equation", "f", sensed.equation.shape).copy()
 
@@ -235,22 +244,23 @@ class GaussNewton(Optimizer):
         ran = now.trials != NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
-        # The first law with sensors says nothing about the models.
-        from_model = not self._sensors or now.fall > 0.0
-        if self._sensors:
+        # What the first law costs says nothing of the models.
+        contest = self._contested and np.array_equal(now.candidate, self._first)
+        if self._sensors or contest:
             lost = ran.sum() * trial >= ran.size * self._mean_cost(now.incumbents)
         else:
             lost = trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent)
         if lost:
-            if from_model:
+            now.from_none = now.from_none or contest
+            if not contest:
                 now.damping = min(4.0 * now.damping, _DAMPING[1])
             now.compared = now.trials.copy()
             now.accepted = False
         elif ran.all():
             fall = incumbent - trial
-            if from_model and fall > 0.5 * now.fall:
+            if not contest and fall > 0.5 * now.fall:
                 now.damping = max(now.damping / 3.0, _DAMPING[0])
-            elif from_model and fall <= 0.2 * now.fall:
+            elif not contest and fall <= 0.2 * now.fall:
                 now.damping *= 2.0
             now.policy = now.candidate.copy()
             now.compared, now.incumbents = now.incumbents, now.trials.copy()
@@ -269,7 +279,7 @@ class GaussNewton(Optimizer):
         """A fresh field in place of the oldest, or besides it after a small step."""
         now = self._now
         grow = small and len(now.fields) < 2 * self._field_count
-        if self._budget - self._records.count <= len(now.fields) + grow:
+        if self._left <= len(now.fields) + grow:
             return
         if grow:
             now.fields = np.append(now.fields, now.fields.max() + 1)
@@ -281,29 +291,87 @@ class GaussNewton(Optimizer):
             now.fields[oldest] = now.fields.max() + 1
             now.compared[oldest] = now.incumbents[oldest] = NONE
 
-    def _compare(self, row: Row) -> None:
-        """Move from the first law only as far as fields that were left out confirm."""
-        now = self._now
-        if np.array_equal(now.policy, self._first):
-            row["chosen"] = FIRST
-            return
-        rng = np.random.default_rng([self._seed, _CONFIRMING])
+    @property
+    def _laws(self) -> dict[str, Array]:
+        none = np.zeros_like(self._first)
+        return {FIRST: self._first, ADAPTED: self._now.policy, NO_CONTROL: none}
+
+    @property
+    def _base(self) -> str:
+        """The law that the search began with."""
+        return FIRST if self._first.any() and not self._now.from_none else NO_CONTROL
+
+    @property
+    def _left(self) -> int:
+        """Rollouts that are left for the search."""
+        kept = 0
+        if self._verdict:
+            known = self._context.measured
+            opposed = self._base == FIRST and not self._contested
+            close = opposed and none_is_close(known, self._first, _CONSTANTS.close)
+            step, whole = 2 * self._field_count, self._now.whole
+            kept = rollouts_to_keep(self._budget, step, whole, 2 + close, _CONSTANTS)
+        return self._budget - kept - self._records.count
+
+    def _finish(self, row: Row) -> None:
+        """After the last step: what is rolled out to decide what is returned."""
+        now, known, comparison = self._now, self._records.all(), None
+        left = max(self._budget - self._records.count, 0)
+        fresh = (int(now.fields.max()) + 1 + np.arange(left)).tolist()
+        if now.believed:
+            rng = np.random.default_rng([self._seed, _CONFIRMING])
+            # One thread: a threaded LAPACK rounds differently for another number of threads.
+            with threadpool_limits(limits=1):
+                comparison = self._proposer.comparison(
+                    *(self._laws, known, now.believed, fresh[: _CONSTANTS.judging], rng)
+                )
+        if comparison is None:
+            base, measured = self._base, [*self._context.measured, *known]
+            close = base == FIRST and none_is_close(measured, self._first, _CONSTANTS.close)
+            comparison = on_same_fields(self._laws, base, close, fresh, _CONSTANTS)
+        else:
+            row["fraction"] = comparison.fraction
+        if comparison.names:
+            self._comparison = comparison
+        elif np.array_equal(now.policy, self._laws[comparison.base]):
+            reason = "no step was better than the law that they began with"
+            self._end(row, Verdict(comparison.base, 0.0, 0.0, reason))
+        else:
+            now.policy = comparison.law
+            self._end(row, comparison.without_rollouts(self._laws))
+
+    def _decide(self, results: Sequence[RolloutResult], row: Row) -> None:
+        """Choose between first law, found law and no control."""
+        now, comparison = self._now, self._comparison
+        assert comparison is not None
+        before = self._records.all()
+        asked = comparison.rollouts(self._laws, self._seed)
+        fresh = [
+            self._add(rollout.policy, result)
+            for rollout, result in zip(asked, results, strict=True)
+        ]
+        row["role"] = "judging"
+        costs = [r.cost for r, name in zip(fresh, comparison.names, strict=True) if name == ADAPTED]
+        if costs and np.isfinite(costs).all():
+            row["cost"] = float(np.mean(costs))
+        row["rollouts"] = self._records.count
         with threadpool_limits(limits=1):
-            found = self._proposer.confirmed(self._records.all(), self._first, now.believed, rng)
-        if found is None:
-            return
-        row["fraction"], change, deviation = found
-        row["chosen"], row["reason"] = FIRST, NO_OTHER
-        if found[0]:
-            row["chosen"], row["reason"] = ADAPTED, size_of(ADAPTED, FIRST, change, deviation)
-            row["predicted_change"], row["deviation"] = change, deviation
-        if found[0] < 1.0:
-            first, own = (self._proposer.loop.theta(law) for law in (self._first, now.policy))
-            now.policy = self._proposer.loop.policy(first + found[0] * (own - first), self._first)
+            verdict = self._proposer.verdict(comparison, self._laws, before, fresh)
+        now.policy = comparison.law
+        self._comparison = None
+        self._end(row, verdict)
+
+    def _end(self, row: Row, verdict: Verdict) -> None:
+        now = self._now
+        now.policy, now.ended = self._laws[verdict.chosen].copy(), True
+        row["chosen"] = verdict.chosen
+        row["reason"] = f"{now.reason}; {verdict.reason}" if now.reason else verdict.reason
+        if verdict.change:
+            row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
 
     def _propose(self, row: Row) -> None:
         now = self._now
-        if self._budget - self._records.count < len(now.fields):
+        if self._left < len(now.fields):
             return
         if not np.isfinite(self._mean_cost(now.incumbents)):
             # Nothing to improve on: halve the gains until the rollouts come to their end.
@@ -324,9 +392,11 @@ class GaussNewton(Optimizer):
                 first=now.believed if again else None,
             )
         if proposal is None:
-            row["reason"] = "no model gives a finite step; the law stays"
+            now.reason = row["reason"] = "no model gives a finite step that gains anything"
             return
         if again:
-            now.believed, now.tried = proposal.believed, count
+            now.believed, now.tried, now.whole = proposal.believed, count, proposal.whole
+            if self._left < len(now.fields):  # without such a model the comparison takes more
+                return
         now.candidate, now.fall, now.proposed = proposal.policy, proposal.fall, True
         row.update(proposal.row())

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State, part_of
-from loop_method.adapt.gauss_newton import GaussNewton, GaussNewtonSettings
+from loop_method.adapt.gauss_newton import GaussNewton
 from loop_method.adapt.renewal import mean_and_error
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import GaussNewtonSettings, ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, NONE, size_of
 from loop_method.seeds import field_seed
 

@@ -34,6 +34,8 @@ class Proposal:
     believed : str
         The kind of the model of the whole field that was believed, also where the step is local; empty:
         none.
+    whole : bool
+        Whether that model predicts rollouts as a whole.
     """
 
     policy: Array
@@ -43,6 +45,7 @@ class Proposal:
     mismatch: float
     kind: str = LOCAL
     believed: str = ""
+    whole: bool = False
 
     def row(self) -> Row:
         """Its entries in a row of the history."""

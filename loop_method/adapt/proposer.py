@@ -22,13 +22,13 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic
+from loop_method.adapt.final_comparison import Comparison, Laws, on_model
 from loop_method.adapt.proposal import Proposal
-from loop_method.adapt.renewal import confirmed_fraction
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import cleaned
+from loop_method.adapt.verdict import Verdict
 from loop_method.models.denoising import denoised
 
 
@@ -115,7 +115,7 @@ class Proposer:
             Kind of the model of the whole field to try first; None: try none.
         """
         loop = self.loop
-        measured = [r for r in (*self._measured, *records) if len(r.states) > 1]
+        measured = self._measurements(records)
         records = [self._clean(record) for record in records]
         incumbents = [self._clean(record) for record in incumbents]
         compared = [other and self._clean(other) for other in compared]
@@ -131,7 +131,7 @@ class Proposer:
         # A rollout counts less in a fit, the more it costs above the incumbent's.
         level = loop.mean_cost_of(incumbents)
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
-        believed = ""
+        believed, whole = "", False
         if first is not None:
             belief, whole = field_step.field_model(self._context, measured, first, self._believed)
             if belief is not None:
@@ -141,44 +141,53 @@ class Proposer:
                     or not whole
                     or field_step.agrees_with_rejections(self._context, belief, rejected)
                 ):
-                    known = cleaned(measured, self._noise) if self._noise else data
+                    known = self._without_noise(measured)
                     return field_step.propose(
                         *(self._context, belief, whole, known, policy, damping),
                     )
         proposal = local_step.propose(
             *(loop, data, shares, incumbents, compared), damping=damping, accepted=accepted
         )
-        return proposal and replace(proposal, believed=believed)
+        return proposal and replace(proposal, believed=believed, whole=bool(believed) and whole)
 
-    def confirmed(
-        self, records: Sequence[Record], first: Array, believed: str, rng: np.random.Generator
-    ) -> tuple[float, float, float] | None:
-        """How far from the first law fields that were left out confirm a way (`confirmed_fraction`).
+    def comparison(
+        self,
+        laws: Laws,
+        records: Sequence[Record],
+        believed: str,
+        numbers: Sequence[int],
+        rng: np.random.Generator,
+    ) -> Comparison | None:
+        """The last rollouts on a model (`on_model`), or None if no model predicts rollouts as a whole.
 
-        None where no model predicts the rollouts as a whole, the plant is chaotic, or the first law is
-        no better than no control on the model, so that it is nothing to stay near to.
+        records : as of `propose`; believed : kind of the model to try first.
         """
-        measured = [r for r in (*self._measured, *records) if len(r.states) > 1]
+        measured = self._measurements(records)
         belief, whole = field_step.field_model(self._context, measured, believed, self._believed)
         if belief is None or not whole:
             return None
-        loop = belief.loop(self._context)
-        known = cleaned(measured, self._noise) if self._noise else measured
-        fields = initial_fields(known)
-        theta, none = loop.theta(first), loop.no_control
-        if is_chaotic(loop, fields) or not (
-            loop.costs(theta, fields).mean() < loop.costs(none, fields).mean()
-        ):
-            return None
-        return confirmed_fraction(
-            loop,
-            theta,
-            fields,
-            rng,
-            field_step.SETTINGS,
-            components=belief.components,
-            periodic=self._context.periodic,
-        )
+        known = self._without_noise(measured)
+        return on_model(self._context, belief, laws, known, numbers, rng, field_step.SETTINGS)
+
+    def verdict(
+        self, last: Comparison, laws: Laws, before: Sequence[Record], fresh: Sequence[Record]
+    ) -> Verdict:
+        """The law to return, after the rollouts of a comparison.
+
+        before, fresh : the remembered rollouts before, and those.
+        """
+        every = self._without_noise([*(measured := self._measurements(before)), *fresh])
+        known, new = every[: len(measured)], every[len(measured) :]
+        return last.verdict(self._context, laws, known, new, field_step.SETTINGS.confidence)
+
+    def _measurements(self, records: Sequence[Record]) -> list[Record]:
+        """All rollouts of more than a state, as they were measured."""
+        return [r for r in (*self._measured, *records) if len(r.states) > 1]
+
+    def _without_noise(self, measured: Sequence[Record]) -> list[Record]:
+        if not self._noise:
+            return list(measured)
+        return cleaned(measured, self._noise, line=self._context.line)
 
     def _clean(self, record: Record) -> Record:
         """The rollout without what of its noise can be told from the fields."""

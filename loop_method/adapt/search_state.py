@@ -17,6 +17,8 @@ Stamps = NDArray[np.int64]
 NONE = -1
 """The stamp of a rollout that has not been made."""
 STAMPS = ("fields", "incumbents", "trials", "compared")
+LATER = ("whole", "from_none", "reason", "ended")
+"""What older checkpoints lack."""
 FIRST_DAMPING = 1.0
 
 
@@ -29,8 +31,10 @@ class SearchState:
     rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
     compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
     candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was;
-    believed: the kind of the model of the whole field, empty for none; tried: rollouts, when none was
-    found.
+    believed: the kind of the model of the whole field, empty for none; whole: whether it predicts
+    rollouts as a whole; tried: rollouts, when none was found; from_none: whether the search goes on
+    from no control, which the first law did not beat; reason: why it ended early, empty: it did not;
+    ended: whether it is decided what is returned.
     """
 
     policy: Array
@@ -46,6 +50,10 @@ class SearchState:
     tells: int = 0
     believed: str = ""
     tried: int = 0
+    whole: bool = False
+    from_none: bool = False
+    reason: str = ""
+    ended: bool = False
 
     @classmethod
     def begin(cls, policy: Array, count: int, first: int) -> SearchState:
@@ -64,6 +72,8 @@ class SearchState:
         if "compared" not in arrays and "others" in arrays:  # its name in older checkpoints
             arrays = {**arrays, "compared": arrays["others"]}
         for name, own in self.arrays().items():
+            if name in LATER and name not in arrays:
+                continue
             shape = (None,) if name in STAMPS else own.shape
             array = checked_array(arrays, name, own.dtype.kind, shape)
             given[name] = array.copy() if shape else array.item()

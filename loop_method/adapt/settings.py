@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The constants of the optimiser `model_based`: how a law is improved on a model, and judged."""
+"""The constants of `model_based` and `gauss_newton`: how a law is improved, and judged."""
 
 from __future__ import annotations
 
@@ -101,4 +101,16 @@ class ModelBasedSettings(Settings):
         "standard errors by which a law must beat the first one on held-out fields",
         0.0,
         10.0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussNewtonSettings(Settings):
+    """The constants of `gauss_newton`."""
+
+    fields: int = setting(
+        3,
+        "initial fields M on which a policy is judged at first; their number grows to 2M",
+        1,
+        1000,
     )

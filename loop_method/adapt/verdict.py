@@ -142,6 +142,19 @@ def evidence_of(
     return evidence
 
 
+def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
+    """The evidence of rollouts alone, of all laws from the same initial fields.
+
+    costs: those of each law, field by field, infinite where it diverged; base: the law to stay with.
+    """
+    evidence = {}
+    for name, own in costs.items():
+        known = np.isfinite(own) & np.isfinite(costs[base])
+        difference = mean_and_error((own - costs[base])[known]) if known.any() else (0.0, 0.0)
+        evidence[name] = Evidence(*difference, own[np.isinf(own)])
+    return evidence
+
+
 def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
     """Measured less model cost of the rollouts of a law; infinite where one diverged."""
     excess = []

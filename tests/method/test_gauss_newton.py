@@ -5,13 +5,23 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from loop_method.adapt import (
+    Context,
+    GaussNewton,
+    Rollout,
+    RolloutResult,
+    Trajectory,
+    field_step,
+    final_comparison,
+)
+from loop_method.adapt.base import Record
 from loop_method.adapt.proposer import Proposer
 from loop_method.design.lqt import track
 from loop_method.reduce.reduced_model import ReducedModel
@@ -111,21 +121,130 @@ def test_improves_a_plant_that_is_not_linear() -> None:
 def test_the_law_moves_only_as_far_as_fields_left_out_confirm(
     fraction: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The plant is linear, so that a model predicts it; as many rollouts as judge are fresh ones."""
     plant = Plant()
-    whole = make(plant, rollouts=9, verdict=False)
+    whole = make(plant, rollouts=6, verdict=False)
     optimizer = make(plant, rollouts=9)
-    monkeypatch.setattr(Proposer, "confirmed", lambda *_: (fraction, -0.5 * fraction, 0.1))
+    monkeypatch.setattr(
+        final_comparison, "confirmed_fraction", lambda *_, **__: (fraction, -0.5 * fraction, 0.1)
+    )
+    seeds: list[int] = []
     for each in (whole, optimizer):
         while not each.done:
-            row = each.tell(measure(plant, each.ask()))
+            asked = each.ask()
+            seeds += [] if each is whole else [rollout.field_seed for rollout in asked]
+            row = each.tell(measure(plant, asked))
     first = 0.6 * plant.best
     moved = whole.policy - first
     assert np.abs(moved).max() > 1e-3
     np.testing.assert_allclose(optimizer.policy - first, fraction * moved, atol=1e-12)
     assert row["chosen"] == ("adapted" if fraction else "first") and row["reason"]
+    assert len(seeds) == (9 if fraction else 6)
+    assert not set(seeds[6:]) & set(seeds[:6])
     again = make(plant, rollouts=9)
     again.restore(optimizer.state())
     assert again.done and same_state(again, optimizer)
+
+
+def finished(
+    optimizer: GaussNewton, plant: Plant, cost: Callable[[np.ndarray, int], float] | None = None
+) -> tuple[list[Rollout], list[dict[str, Any]]]:
+    """All that an optimiser asks for, and its history; cost: another one of a policy and a seed.
+
+    It is continued from a checkpoint at every step, which has to make no difference.
+    """
+    asked, rows = [], []
+    while not optimizer.done:
+        now = optimizer.ask()
+        results = measure(plant, now)
+        if cost is not None:
+            results = [
+                replace(result, cost=cost(rollout.policy, rollout.field_seed))
+                for rollout, result in zip(now, results, strict=True)
+            ]
+        again = make(
+            plant, optimizer._first, rollouts=optimizer._budget, context=optimizer._context
+        )
+        again.restore(optimizer.state())
+        rows.append(optimizer.tell(results))
+        assert again.tell(results) == rows[-1] and same_state(again, optimizer)
+        asked += now
+    return asked, rows
+
+
+def without_field_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that all steps are local."""
+    monkeypatch.setattr(field_step, "field_model", lambda *_, **__: (None, False))
+
+
+@pytest.mark.parametrize("helped", [True, False])
+def test_without_a_model_what_was_found_is_compared_on_the_same_fresh_fields(
+    helped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A law that was better on the fields that it was made on, and is worse on all others."""
+    without_field_models(monkeypatch)
+    plant = Plant()
+    first = 0.6 * plant.best
+    known = [rollout.field_seed for rollout in make(plant, rollouts=17).ask()]
+
+    def cost(policy: np.ndarray, seed: int) -> float:
+        own = 5.0 + seed % 7
+        return own if same_bits(policy, first) else own * (0.9 if helped or seed in known else 1.1)
+
+    none = plant.run(np.zeros_like(first), 9)
+    assert none.trajectory is not None
+    measured = [Record(np.zeros_like(first), 99.0, none.trajectory.states, none.trajectory.actions)]
+    context = replace(plant.context(), measured=measured)
+    optimizer = make(plant, rollouts=17, context=context)
+    asked, rows = finished(optimizer, plant, cost)
+    last = [row["role"] for row in rows].index("judging")
+    assert last == len(rows) - 1 and any(row.get("accepted") for row in rows)
+    judged = asked[-(rows[-1]["rollouts"] - rows[-2]["rollouts"]) :]
+    half = len(judged) // 2
+    assert half >= 2 and len(asked) <= 17
+    assert all(same_bits(rollout.policy, first) for rollout in judged[:half])
+    seeds = [rollout.field_seed for rollout in judged]
+    assert seeds[:half] == seeds[half:], "in pairs"
+    assert not set(seeds) & {rollout.field_seed for rollout in asked[: -len(judged)]}, "fresh"
+    assert rows[-1]["chosen"] == ("adapted" if helped else "first") and rows[-1]["reason"]
+    assert same_bits(optimizer.policy, first) is not helped
+
+
+def test_without_a_model_no_control_is_returned_where_it_is_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    without_field_models(monkeypatch)
+    plant = Plant()
+
+    def cost(policy: np.ndarray, seed: int) -> float:
+        return 5.0 + seed % 7 + 9.0 * float(policy.any())
+
+    optimizer = make(plant, rollouts=23)
+    _, rows = finished(optimizer, plant, cost)
+    assert rows[-1]["chosen"] == "none" and not optimizer.policy.any()
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_a_first_law_that_its_check_refused_is_tried_on_all_fields(
+    better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One field is chance: what is returned is the better one of no control and the first law."""
+    without_field_models(monkeypatch)
+    plant = Plant()
+    first = 0.6 * plant.best
+
+    def cost(policy: np.ndarray, seed: int) -> float:
+        if not policy.any():
+            return 10.0 + seed % 7
+        return 30.0 if not same_bits(policy, first) else 8.0 if better else 12.0 + seed % 7
+
+    context = replace(plant.context(), refused=first)
+    optimizer = make(plant, np.zeros_like(first), rollouts=17, context=context)
+    asked, rows = finished(optimizer, plant, cost)
+    assert not any(rollout.policy.any() for rollout in asked[:3])
+    assert same_bits(asked[3].policy, first)
+    assert same_bits(optimizer.policy, first if better else np.zeros_like(first))
+    assert rows[-1]["chosen"] == ("first" if better else "none")
 
 
 @pytest.mark.parametrize(
@@ -159,9 +278,14 @@ def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     plant = Plant()
     optimizer = make(plant)
     monkeypatch.setattr(Proposer, "propose", lambda *given, **named: None)
+    why = "no model gives a finite step that gains anything"
     row = optimizer.tell(measure(plant, optimizer.ask()))
-    assert optimizer.done and row["rollouts"] == 3 and same_bits(optimizer.policy, 0.6 * plant.best)
-    assert row["reason"] == "no model gives a finite step; the law stays"
+    assert row["reason"] == why and row["rollouts"] == 3
+    row = optimizer.tell(measure(plant, optimizer.ask()))
+    assert optimizer.done and row["rollouts"] == 9 and same_bits(optimizer.policy, 0.6 * plant.best)
+    assert row["chosen"] == "first" and str(row["reason"]).startswith(
+        f"{why}; no other law is better"
+    )
 
 
 def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:

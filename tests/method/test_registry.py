@@ -11,8 +11,8 @@ import pytest
 
 from loop_interfaces.spec import ParameterError
 from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
-from loop_method.adapt.gauss_newton import GaussNewtonSettings
 from loop_method.adapt.registry import offered, optimizer_kind
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.settings import Settings, setting
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
