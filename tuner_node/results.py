@@ -156,14 +156,14 @@ def verdict(none: float, lqt: float, adapted: float, *, changed: bool) -> str:
     ('better', 'worse than no control')
     >>> verdict(4.0, 2.0, 2.0, changed=False), verdict(4.0, 2.0, 3.0, changed=True)
     ('the first law', 'worse than the first law')
-    >>> verdict(4.0, 5.0, 4.0, changed=True)
-    'no control'
+    >>> verdict(4.0, 5.0, 4.0, changed=True), verdict(4.0, 2.0, 2.0, changed=True)
+    ('no control', 'the first law')
     """
     if not adapted <= none:
         return WORSE_THAN_NONE
     if adapted == none:
         return "no control"
-    if not changed:
+    if not changed or adapted == lqt:
         return "the first law"
     return "better" if adapted <= lqt else "worse than the first law"
 
