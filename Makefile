@@ -3,16 +3,16 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 .SHELLFLAGS := -o pipefail -c
-# Python is not to import what lies in this folder (loop_interfaces/module_path.py).
+# Python must not import from this folder by chance (loop_interfaces/module_path.py).
 export PYTHONSAFEPATH := 1
 
 .PHONY: setup run test coverage packages lint types docs check lock audit clean
 
 setup: .venv/ready
 
-# A fresh virtual environment with pinned versions, made again when the pins change: what running
-# needs, and then what the tests need. Each archive must have one of the digests in requirements/. What is
-# imported first is compiled to bytecode then.
+# A virtual environment with pinned versions, updated when the pins change: first the packages that running
+# needs, then those of the tests. Each archive must have one of the digests in requirements/. Bytecode is
+# compiled at the first import.
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt \
 	| sed -un 's/^Collecting \([^ ]*\).*/  \1/p; s/^Installing collected.*/  installing/p'
@@ -31,7 +31,7 @@ install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt 
 	@$(call install,test)
 	@touch $@
 
-# uv writes the digests, pip-audit asks for advisories; neither is part of what pdeloop runs on.
+# uv writes the digests, pip-audit asks for advisories; pdeloop itself needs neither.
 .venv/supply:
 	@test -d .venv || $(PYTHON) -m venv .venv
 	@$(PYTHON) -m venv .venv/supply.new
@@ -58,17 +58,17 @@ audit: setup .venv/supply
 run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
-# Four workers for two cores: tests over topics wait a part of their time. Each has a ROS domain of its own.
+# Four workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own.
 test: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal
 
-# The tests without topics, with what they cover of the pure modules (pyproject.toml).
+# The tests without topics, with their coverage of the pure modules (pyproject.toml).
 coverage: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not topics" -p pytest_cov --cov
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, a C compiler for exported laws, zsh and fish for
-# their completion. Where they cannot be had, those tests are skipped and say so.
+# their completion. Other distributions lack some of them (Ubuntu: chromium): those tests are skipped and say so.
 packages:
 	@missing=(); \
 	command -v chromium >/dev/null || missing+=(chromium); \
@@ -76,10 +76,13 @@ packages:
 	command -v ip >/dev/null || missing+=(iproute2); \
 	for shell in zsh fish; do command -v $$shell >/dev/null || missing+=($$shell); done; \
 	ls /usr/lib/*/faketime/libfaketime.so.1 >/dev/null 2>&1 || missing+=(faketime); \
-	if [ $${#missing[@]} = 0 ]; then exit 0; fi; \
-	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-		apt-get update -qq && apt-get install -y -qq --no-install-recommends "$${missing[@]}" >/dev/null; \
-	else \
+	if [ $${#missing[@]} != 0 ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq; then \
+		wanted=("$${missing[@]}"); missing=(); \
+		for name in "$${wanted[@]}"; do \
+			apt-get install -y -qq --no-install-recommends $$name >/dev/null || missing+=($$name); \
+		done; \
+	fi; \
+	if [ $${#missing[@]} != 0 ]; then \
 		echo "not installed: $${missing[*]} (Debian's names): some tests will be skipped" >&2; \
 	fi
 
