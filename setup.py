@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""For `colcon build`, which calls setup.py. What the package is stands in pyproject.toml."""
+"""For `colcon build`, which calls setup.py. The package is described in pyproject.toml."""
 
 from setuptools import setup
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks PROGRAM`: the measuring programs.
+"""`python -m benchmarks PROGRAM`: the benchmarks.
 
 A program is a module with two functions: `run`, whose parameters are its options, explained in its
 docstring, and `text`, which shows the result to people. Keyword-only parameters are flags, the others
@@ -25,9 +25,9 @@ from pdeloop.cli import run
 from pdeloop.output import print_json
 
 PROGRAMS = {
-    "first_run": "where the time of the first `make run` in a fresh clone goes",
+    "first_run": "where the first `make run` in a fresh clone spends its time",
     "rtt": "rounds per second of the loop, compared with a bare ping-pong",
-    "batch": "environment-steps a second against the batch",
+    "batch": "environment steps per second against the batch",
     "train": "a whole training: topics against in-process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
@@ -35,7 +35,7 @@ PROGRAMS = {
     "choices": "how often the law that a training returns is the wrong one",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
     "scale": "what messages, bags, fits, memory and files cost as the state grows",
-    "published": "tasks that others have published figures for, side by side",
+    "published": "tasks with published figures, side by side",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
     "estimator": "what an estimator with the true plant reaches with few sensors and noise",

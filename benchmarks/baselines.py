@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Methods at equal rollouts, one table a problem: `python -m benchmarks baselines STUDY ...`.
+"""Methods at equal rollouts, one table per problem: `python -m benchmarks baselines STUDY ...`.
 
 benchmarks/studies/STUDY.yaml is a study of the project's optimisers, and names the methods of others
 (benchmarks/methods.py), which are further tasks of that study: it runs on all cores, and is interrupted

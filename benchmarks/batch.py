@@ -1,10 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks batch`: environment-steps a second against the batch, and where its knee is.
+"""`python -m benchmarks batch`: environment steps per second against the batch, and where its knee is.
 
 A round of M environments takes t(M) = c + w M + s(M): what a message costs whatever is in it, what
 it costs for each environment (copies, the control law), and the solver. The batch pays as long as c
 is the larger part; the knee is where it is half: M = c / (w + s). Beyond it the rate is that of
-solver and copies, 1 / (w + s) environment-steps a second, however large the batch.
+solver and copies, 1 / (w + s) environment steps per second, however large the batch.
 
 The processor time of a round, in the threads of the plant and of the controller, hardly depends on
 what else the machine does.

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Environment-steps a second of controlgym, in Gymnasium's vector environments; prints them as JSON.
+"""Environment steps per second of controlgym, in Gymnasium's vector environments; prints them as JSON.
 
 `benchmarks.environments` runs it with an interpreter that has controlgym, which needs a NumPy below 2.
 """

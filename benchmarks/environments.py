@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks environments`: environment-steps a second of the Gymnasium environments.
+"""`python -m benchmarks environments`: environment steps per second of the Gymnasium environments.
 
 The batch of `VectorEnvironment` against Gymnasium's own vector environments of as many single ones, in
 one process (sync) and in a process each (async), and against those of controlgym's environment of the
@@ -73,7 +73,7 @@ def run(
 
 
 def _rate(envs: Any, seconds: float) -> float:
-    """Environment-steps a second."""
+    """Environment steps per second."""
     envs.reset(seed=0)
     actions = envs.action_space.sample()
     steps, start = 0, time.perf_counter()

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks estimator`: what an estimator that knows the plant reaches with few readings.
+"""`python -m benchmarks estimator`: the cost with few readings under an estimator that knows the plant.
 
 A law of the whole field acts on the estimate of an extended Kalman filter that has the true plant and
 the distribution of initial fields. What is lost against the law on the field itself is the price of the

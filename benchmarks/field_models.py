@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks field_models`: which model of the whole field is believed, and how good it is.
+"""`python -m benchmarks field_models`: which model of the whole field is selected, and its error.
 
 On every case of `benchmarks.families` models are fitted to one and to two explorations, and to these
 with two rollouts of a law, that of the second model linearised at the target. They are judged on

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks first_run`: where the time of the first `make run` in a fresh clone goes."""
+"""`python -m benchmarks first_run`: where the first `make run` in a fresh clone spends its time."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks general`: what a training is worth on plants that nobody tuned it for.
+"""`python -m benchmarks general`: the benefit of a training on plants for which it was not tuned.
 
 Every case of `benchmarks.families` is trained at each budget and seed, and compared on held-out fields
 with no control, with its own first law, with the best affine law and with the limit of any controller

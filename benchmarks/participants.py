@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks participants`: what it costs that many idle nodes know each other.
+"""`python -m benchmarks participants`: the cost of discovery among many idle nodes.
 
 A tuner and K pairs of plant and controller, a process each, on the loopback interface only. They find
 each other by multicast, or through Fast DDS's discovery server. Nobody computes: the tuner waits for

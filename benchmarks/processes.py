@@ -79,7 +79,7 @@ class BenchProcess:
         """Seconds of processor time so far: `own`, of the node's threads, and `middleware` (Linux)."""
         times = {"own": 0.0, "middleware": 0.0}
         for thread in Path(f"/proc/{self.process.pid}/task").iterdir():
-            with contextlib.suppress(OSError):  # it has ended meanwhile
+            with contextlib.suppress(OSError):  # it has ended in the meantime
                 whose = (thread / "comm").read_text().startswith("dds.")
                 nanoseconds = int((thread / "schedstat").read_text().split()[0])
                 times["middleware" if whose else "own"] += 1e-9 * nanoseconds

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks published TASK`: tasks that others have published figures for, side by side."""
+"""`python -m benchmarks published TASK`: tasks with published figures, side by side."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FIELDS = np.arange(2000, 2010)
 def run(
     task: Task, *, rollouts: list[int] | None = None, cells: int = 50, seeds: int = 3
 ) -> list[Row]:
-    """Measure the controllers of a published task; what its source says stands beside them.
+    """Measure the controllers of a published task; what its source says is shown next to them.
 
     task: lid, convection, transport or reaction-diffusion
     rollouts: budgets of trainings (default: 1 5 20 80); 1 is the first law, of one exploration

@@ -35,12 +35,13 @@ class Exploration:
         return excitations(self._start.values, step, settings.n_a, settings.action_limit)
 
     def lacks(self, state: Frame) -> bool:
-        """True if the state is to be kept. Two different ones of a step make the episode unusable."""
+        """True if the state must be kept. Two different ones of a step make the episode unusable."""
         known = self._states.get((state.plant, state.step))
         if known is None or self._unusable is not None:
             return self._unusable is None
         if not np.array_equal(known, state.values):
-            reason = f"two different states came for step {state.step} of the exploratory episode"
+            reason = f"two different states arrived for step {state.step} of the exploratory "
+            "episode"
             self.give_up(reason, retry=True)
         return False
 
@@ -73,7 +74,7 @@ class Exploration:
             )
         if (ended != COMPLETED).any():
             return self._failure(self._divergence(cost), retry=False)
-        if target is None:  # as none of its states was answered, somebody else did
+        if target is None:  # none of its states was answered, so another node sent the cost
             return self._failure("the plant's target has not arrived", retry=True)
         states = np.stack([known[k] for k in range(cost.step + 1)])
         actions = np.stack([self.actions(k) for k in range(cost.step)])

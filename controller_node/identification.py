@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""From exploratory trajectories to a reduced model with its LQ-tracking gains."""
+"""Reduced models with LQ-tracking gains from exploratory trajectories."""
 
 from __future__ import annotations
 
@@ -231,8 +231,8 @@ def designed(
     if settings.identification == "subspace":
         if not filtered:
             raise ValueError(
-                "the identification 'subspace' gives a filter, which the law "
-                f"'{settings.law}' does not use; take the law 'observer'"
+                f"the identification 'subspace' designs a filter, which the law '{settings.law}' "
+                "does not use; take the law 'observer'"
             )
         every = [*trajectories, *further]
         found_model = subspace_model(

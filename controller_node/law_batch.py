@@ -24,7 +24,7 @@ from loop_method.laws.calls import action, one_thread, updated
 class MemoryUnknownError(Exception):
     """An action depends on what is not known of the episode; the text says on what.
 
-    contradicted: because two different states came for one step, so that what was answered may be
+    contradicted: because two different states arrived for one step, so that what was answered may be
     wrong; otherwise because steps were missed.
     """
 
@@ -114,7 +114,7 @@ class LawBatch:
                 return answer.copy()
             if step:
                 raise MemoryUnknownError(
-                    f"two different states came for step {step}", contradicted=True
+                    f"two different states arrived for step {step}", contradicted=True
                 )
         if step == 0:
             self._begin()

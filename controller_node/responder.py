@@ -54,7 +54,7 @@ room gives no model."""
 class Responder:
     """One controller. It answers whichever run the plant serves; runs never share anything.
 
-    Every event returns what is to be published: above all the answer to a state, also to one that
+    Every event returns the messages to publish: above all the answer to a state, also to one that
     waited for what the event brings. A FrameError, or another ValueError, refuses a message.
     """
 
@@ -133,7 +133,7 @@ class Responder:
             run.exploration = Exploration(run.start, self._settings) if explores else None
             self.failure = ""
         elif differ(known, frame):
-            reason = f"two different starts came for episode {episode_name(frame.episode)}"
+            reason = f"two different starts arrived for episode {episode_name(frame.episode)}"
             return [ModelFailure(frame.run, frame.episode, True, f"{reason}; expected one tuner")]
         elif run.exploration and run.exploration.outcomes:
             return list(run.exploration.outcomes.values())  # the answer may have been lost
@@ -164,7 +164,7 @@ class Responder:
             run.answering = None
             if before:
                 raise FrameError(
-                    f"two different policies came for episode {episode_name(frame.episode)}; "
+                    f"two different policies arrived for episode {episode_name(frame.episode)}; "
                     "expected one tuner"
                 )
         return self._answer_pending()
@@ -188,7 +188,7 @@ class Responder:
             run.answering = None
             if before:
                 raise FrameError(
-                    f"two different sets of reduced models came under number {frame.step}; "
+                    f"two different sets of reduced models arrived under number {frame.step}; "
                     "expected one tuner"
                 )
         return self._answer_pending()
@@ -196,7 +196,7 @@ class Responder:
     def state(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Answer the states of an episode's environments, (M, n_z).
 
-        They are kept while something that the answer needs has not come, but not two different ones
+        They are kept until everything that the answer needs has arrived, but not two different ones
         of one step. A second, different state of an exploratory episode takes back the models that
         came of the first. ValueError for a state that does not fit the start, and policies or
         models that do not fit it.
@@ -230,7 +230,7 @@ class Responder:
         return [Publication(ACTION, replace(frame, time=time, values=actions)), *taken_back]
 
     def advance_counters(self, answers: int, step: int, furthest: int) -> None:
-        """Account for states of the present episode that were answered: the last and the furthest."""
+        """Count the answered states of the current episode: the last and the furthest."""
         self.answered += answers
         self.step = step
         self._steps.answered((*self._served, self.episode), furthest)
@@ -294,7 +294,7 @@ class Responder:
             lacking += [] if models else ["model"]
             lacking += [] if policies else ["policy"]
             if models and policies and run.inputs_for(start, self._settings.action_limit) is None:
-                lacking.append("one tuner (different policies or models came)")
+                lacking.append("one tuner (different policies or models arrived)")
         return lacking
 
     def _run(self, number: int, more: int) -> RunState:

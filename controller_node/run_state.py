@@ -18,7 +18,7 @@ MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
 that was answered last, whatever else comes in."""
 MAX_KEPT = 4
-"""Policies, sets of reduced models, and laws kept per run: room for a stranger's besides its own."""
+"""Policies, sets of reduced models, and laws kept per run: room for an unknown publisher's as well."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +88,11 @@ class RunState:
             del self.laws[next(iter(self.laws))]
 
     def policies_of(self, episode: int) -> list[Frame]:
-        """All that came for an episode."""
+        """All policies that arrived for an episode."""
         return [policy for policy in self.policies if policy.episode == episode]
 
     def models_of(self, number: int) -> list[Models]:
-        """All that came under a number."""
+        """All models that arrived under a number."""
         return [models for models in self.models if models.number == number]
 
     def episode_start(self, frame: Frame) -> Frame | None:

@@ -272,12 +272,12 @@ class RclChannel:
         system.pthread_mutex_init(self._mutex.ctypes.data, None)
 
     def open(self, subscription: Any, publisher: Any, guard: Any) -> bool:
-        """From now on messages come here, and nobody else may take from the subscription.
+        """From now on messages arrive here, and nothing else may take from the subscription.
 
         subscription, publisher, guard: handles of rclpy's objects; the guard condition is triggered
         when a message has to wait. False where the middleware does not announce messages.
 
-        Raises OSError or AttributeError where rcl is not to be had.
+        Raises OSError or AttributeError if rcl is not available.
         """
         rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
         rcutils.rcutils_get_default_allocator.restype = Allocator

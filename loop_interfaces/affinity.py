@@ -53,7 +53,7 @@ def pin_process(core: int) -> None:
         raise ValueError(f"parameter 'pin' is {core}; expected -1 or one of the cores {allowed}")
     os.sched_setaffinity(0, {core})
     for thread in Path("/proc/self/task").iterdir():
-        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+        with contextlib.suppress(ProcessLookupError):  # it has ended in the meantime
             os.sched_setaffinity(int(thread.name), {core})
 
 

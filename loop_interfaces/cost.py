@@ -119,7 +119,7 @@ class Cost:
 
     def add(self, totals: Array, states: Array, actions: Array, k: int) -> None:
         """Add the stage costs of step k: states (M, n_z), actions (M, n_a), to totals (M,)."""
-        with np.errstate(over="ignore", invalid="ignore"):  # whoever counts looks at the total
+        with np.errstate(over="ignore", invalid="ignore"):  # the caller checks the total
             self._state.add(totals, states, self.wanted(k))
             self._action.add(totals, actions, self.action_target)
 

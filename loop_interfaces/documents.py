@@ -26,14 +26,14 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def parse_yaml(text: str | bytes, most: int = MAX_YAML_NODES) -> Any:
-    r"""The content of a YAML document. ValueError if it is none, or has over `most` nodes.
+    r"""The content of a YAML document. ValueError if it is not one, or has more than `most` nodes.
 
     >>> parse_yaml("a: {b: [1, 2.5, text]}")
     {'a': {'b': [1, 2.5, 'text']}}
     >>> parse_yaml("a: &x {b: 1}\nc: *x")
     Traceback (most recent call last):
         ...
-    ValueError: line 2 repeats 'x' by an alias (*); write out what is meant
+    ValueError: line 2 repeats 'x' by an alias (*); write the values out
     """
     try:
         _check_yaml(text, most)
@@ -68,9 +68,7 @@ def _check_yaml(text: str | bytes, most: int) -> None:
         line = 1 + (event.start_mark.line if event.start_mark is not None else 0)
         if isinstance(event, yaml.AliasEvent):
             name = str(event.anchor)[:40]
-            raise ValueError(
-                f"line {line} repeats '{name}' by an alias (*); write out what is meant"
-            )
+            raise ValueError(f"line {line} repeats '{name}' by an alias (*); write the values out")
         if isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
             continue

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Files that are whole or not there, whatever moment a crash comes at.
+"""Files that are complete or absent, whenever a crash happens.
 
 No symbolic link is followed.
 """
@@ -130,7 +130,7 @@ def open_own(path: Path, flags: int) -> BinaryIO:
 def try_lock(file: BinaryIO | BufferedReader, *, shared: bool = False) -> bool:
     """Take the lock of an open file, for as long as it is open; False if another process has it.
 
-    FileError where its file system has no locks: then nobody may take it for free.
+    FileError if its file system has no locks: the file must then not count as free.
     """
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -178,7 +178,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except FileError:
         raise
     except ValueError as error:
-        raise FileError(f"{path} is no JSON: {error}") from error
+        raise FileError(f"{path} is not JSON: {error}") from error
     if not isinstance(content, dict):
-        raise FileError(f"{path} holds no JSON object")
+        raise FileError(f"{path} does not hold a JSON object")
     return content

@@ -36,7 +36,7 @@ _HEAD = struct.Struct("<5d")
 
 
 KEPT_ARRAY = 320
-"""Bytes that Python takes for an array that is kept under its ids, besides the values."""
+"""Bytes of Python's overhead for an array that is kept under its ids, in addition to the values."""
 
 
 class FrameError(ValueError):
@@ -60,7 +60,7 @@ class Frame:
 
 
 def digest(values: NDArray[np.float64]) -> int:
-    """A number that tells other values from these, in this process."""
+    """A number that distinguishes these values from others, in this process."""
     return hash(values.tobytes())
 
 

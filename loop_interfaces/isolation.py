@@ -44,7 +44,7 @@ def check_profile() -> None:
             return
         reason = "it has no element <profiles>"
     raise ValueError(
-        f"{PROFILE}={path} is not a Fast DDS profile ({reason}); Fast DDS would send to every "
+        f"{PROFILE}={path} is not a Fast DDS profile ({reason}); Fast DDS would use every "
         "interface: correct it, or unset the variable to stay on this machine"
     )
 

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Says which call of the user's own code takes long, and at which line it is. Pure.
+"""Reports long calls of user code, and the line at which they are. Pure.
 
-Code that hangs says nothing itself, and from outside it looks like a message that was lost.
+Code that hangs reports nothing itself, and from outside it looks like a lost message.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PATIENCE = 10.0
 
 @dataclass
 class Call:
-    """A call that has not returned: what it is called, whose frame made it, and when to speak next."""
+    """A call that has not returned: its name, the frame that made it, and when to report next."""
 
     name: str
     frame: FrameType

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Code of a user's own: what a name stands for, and which code may be run.
+"""User code: what a name stands for, and which code may be run.
 
 A name is one of the project, an entry point of an installed package, ``package.module:Name`` or
 ``path/to/file.py:Name``. The last two are Python code, which is executed to get it. So a name that a
@@ -105,13 +105,13 @@ class OwnCode:
         if ":" in name and identity(name) not in allowed:
             quoted = shlex.quote(name)
             raise ValueError(
-                f"the {self.word} {shown(name)} is code, which is not run because a file names it; if "
-                f"you trust it, name it yourself: --{self.word} {quoted}, or for nodes and workers "
-                f"{self.variable}={quoted} in the environment"
+                f"the {self.word} {shown(name)} is code, which is not run merely because a file "
+                f"names it; if you trust it, name it yourself: --{self.word} {quoted}, or for "
+                f"nodes and workers {self.variable}={quoted} in the environment"
             )
 
     def load(self, name: str) -> Any:
-        """The object that a name stands for. This executes code, whoever wrote it.
+        """The object that a name stands for. This executes code, whatever its origin.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class OwnCode:
         if not found and name.endswith(".py"):
             whole = shown(f"{name}:ClassName")
             raise ValueError(
-                f"{self.word} {shown(name)} is a file; give the class in it too, as {whole}"
+                f"{self.word} {shown(name)} is a file; name the class in it as well, as {whole}"
             )
         if not found:
             known = [*self.shipped, *sorted(set(offered) - set(self.shipped))]
@@ -200,7 +200,7 @@ FAILURES = Exception, SystemExit
 
 
 def called(name: str, function: Callable[..., Any], *given: Any, module: str = "") -> Any:
-    """What a call of own code returns; which one takes long is said meanwhile.
+    """The result of a call of user code; a long call is reported while it runs.
 
     name: as the sentence has it, Class.method; module: see `located`.
 
@@ -282,8 +282,8 @@ def refuse_while_executed(what: str) -> None:
     """
     if _executing:
         raise RuntimeError(
-            f"{_executing[-1]} {what} while it is executed for what it defines; put that below "
-            "`if __name__ == '__main__':`"
+            f"{_executing[-1]} {what} while it is being imported; put that below `if __name__ == "
+            "'__main__':`"
         )
 
 

@@ -3,7 +3,7 @@
 
 A problem is one YAML file (loop_interfaces.spec), read unchanged by the three nodes
 (`--params-file`) and by the command line. The nodes declare from this table, the command line
-validates by it and docs/parameters.md lists it. A parameter says itself which nodes take it
+validates by it and docs/parameters.md lists it. Each parameter names the nodes that take it
 (`nodes`) and under which heading of `pdeloop train --help` its flag stands (`group`), so that a new
 one is an entry here and its use. No ROS import.
 """
@@ -78,15 +78,16 @@ IDENTIFICATION = Spec(
     nodes="CT",
     group="budget and method",
 ).means(
-    "regression: least squares in reduced coordinates; field: a linearised model of the whole field, "
-    "where its law is better; subspace: a model in innovation form with its filter, from measurements "
-    "alone, for the law observer; dmdc: the paper's truncated DMDc. An optimizer may have a default of "
-    "its own: gauss_newton has regression, two_point dmdc, the law observer subspace with few sensors"
+    "regression: least squares in reduced coordinates; field: a linearised model of the whole "
+    "field, where its law is better; subspace: a model in innovation form with its filter, from "
+    "measurements alone, for the law observer; dmdc: the paper's truncated DMDc. An optimiser may "
+    "have its own default: gauss_newton has regression, two_point dmdc; the law observer has "
+    "subspace with few sensors"
 )
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
-    "control law: a shipped or installed name, or code that the user has to allow, "
-    "'file.py:Class' or 'module:Class'"
+    "control law: a shipped or installed name, or code that the user must allow, 'file.py:Class' "
+    "or 'module:Class'"
 )
 
 PROBLEM = _section(
@@ -95,12 +96,12 @@ PROBLEM = _section(
         "name of the problem, used in messages and for result folders"
     ),
     Spec("equation", "burgers").means(
-        "PDE of the plant: a shipped or installed name, or code that the user has to allow, "
+        "PDE of the plant: a shipped or installed name, or code that the user must allow, "
         "'file.py:Class' or 'module:Class'"
     ),
     Spec("plant", "").means(
         "your own plant instead of an equation: an installed name, or a class or function that the "
-        "user has to allow, 'file.py:Name' or 'module:Name'"
+        "user must allow, 'file.py:Name' or 'module:Name'"
     ),
     Spec("grid", "", nodes="PTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
@@ -157,7 +158,7 @@ PROBLEM = _section(
     ),
     *INSTRUMENTS,
 )
-"""Parameters of a problem's YAML file, besides `physical.*` (those of the equation or plant itself)."""
+"""Parameters of a problem's YAML file, apart from `physical.*` (those of the equation or plant)."""
 POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 """The size of the state of an equation."""
 OF_THE_PLANT = (
@@ -194,7 +195,7 @@ EXECUTION = _section(
 """Use of the machine by plant and controller."""
 
 OPTIMIZER = Spec("optimizer", "model_based", nodes="T", group="budget and method").means(
-    "method of the adapt phase: a shipped or installed name, or code that the user has to allow, "
+    "method of the adapt phase: a shipped or installed name, or code that the user must allow, "
     "'file.py:Class' or 'module:Class'; its settings are optimizer_settings.*"
 )
 
@@ -277,7 +278,7 @@ EVALUATION = frozenset(
     {spec.name for spec in PROBLEM if "P" in spec.nodes} - {"problem"}
     | {"evaluation_fields", "evaluation_seed"}
 )
-"""The parameters of plant, cost and evaluation fields: what costs compare by, besides `physical.*`."""
+"""Parameters that, with `physical.*`, must agree for costs to be comparable."""
 
 
 def table() -> tuple[Spec, ...]:
@@ -306,7 +307,7 @@ def with_names(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def recorded_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The checked parameters of a run or a bag, with the present defaults of what it does not know.
+    """The checked parameters of a run or a bag, with current defaults for those that it lacks.
 
     Others, `physical.*` among them, are kept as they are. ParameterError where one is out of range.
     """

@@ -114,8 +114,8 @@ def parse(text: str) -> list[Box]:
             for component, *sides in parse_json(text)[:MOST]
         ]
     except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise ValueError(f"{text[:200]!a} tells of no actuators: {error}") from error
+        raise ValueError(f"{text[:200]!a} does not describe actuators: {error}") from error
     ends = [end for box in boxes for side in box.sides for end in side]
     if not all(map(math.isfinite, ends)):
-        raise ValueError(f"{text[:200]!a} tells of actuators that are nowhere")
+        raise ValueError(f"{text[:200]!a} describes actuators without positions")
     return boxes

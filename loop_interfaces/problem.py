@@ -96,7 +96,7 @@ def load_parameters(
 def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
     """The parameters given to a node, on top of the shipped problem that they name.
 
-    ParameterError for a problem that nobody knows: of a plant without an equation, and of another node
+    ParameterError for an unknown problem: of a plant without an equation, and of another node
     without anything else. Their defaults would be another problem's.
     """
     name = given.get("problem")
@@ -107,7 +107,7 @@ def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
     if name in shipped:
         return {**read_problem(shipped[name]), **given}
     others = {spec.name for spec in PROBLEM if spec.name in given} - {"problem"}
-    if package != "pde_sim_node" and others:  # of a plant that somebody else has made
+    if package != "pde_sim_node" and others:  # of a plant from another source
         return dict(given)
     raise ParameterError(
         f"unknown problem {shown(name)} without an 'equation'; expected one of {', '.join(shipped)}, "
@@ -116,7 +116,7 @@ def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
 
 
 def own_values(given: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a plant of a user's own, without what it says itself and nobody else gives."""
+    """The parameters of a user's plant, without those that it defines itself and that are not given."""
     if given.get("equation"):
         raise ParameterError(
             f"parameters 'equation' and 'plant' are both given ({given['equation']}, "

@@ -67,7 +67,7 @@ def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]
             changed["ROS_DISCOVERY_SERVER"] = ""
         found |= _QUIET
     remarks = [
-        f"{name}={environment[name]} is left out: the messages stay on this machine"
+        f"{name}={environment[name]} is ignored: the messages stay on this machine"
         for name in changed
     ]
     found |= changed
@@ -114,7 +114,7 @@ def with_log_folder(environment: Mapping[str, str]) -> tuple[dict[str, str], lis
         return dict(environment), []
     if named:
         raise RosEnvironmentError(
-            f"ROS_LOG_DIR={named} cannot be written; name a folder that can be, or unset it"
+            f"ROS_LOG_DIR={named} is not writable; name a writable folder, or unset it"
         )
     instead = Path(tempfile.gettempdir()) / f"pdeloop-logs-{os.getuid()}"
     try:
@@ -151,8 +151,8 @@ def _check_values(environment: Mapping[str, str]) -> None:
         keystore = environment.get("ROS_SECURITY_KEYSTORE", "")
         if not Path(keystore).is_dir() or not keystore:
             raise RosEnvironmentError(
-                f"ROS_SECURITY_KEYSTORE is {keystore!r}; expected the folder of a keystore, as "
-                "ROS_SECURITY_ENABLE is true"
+                f"ROS_SECURITY_KEYSTORE is {keystore!r}; expected the folder of a keystore, "
+                "because ROS_SECURITY_ENABLE is true"
             )
 
 

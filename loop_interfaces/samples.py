@@ -32,7 +32,7 @@ LIMIT = 512 * 1024
 NO_TIME = -1.0
 """The time stamp of a sample without simulated time."""
 AGE = 0.1
-"""Seconds after which a batch is sent that has not reached LIMIT."""
+"""Seconds after which a batch is sent even if it has not reached LIMIT."""
 MAX_TIME = 2.0**31
 """Simulated time in s up to which /clock, whose seconds are an int32, can tell it."""
 RATE, COUNTED = 600.0, 4096
@@ -64,7 +64,7 @@ class TokenBucket:
         self._tokens, self._when = 0.0, -math.inf
 
     def admits(self, now: float) -> bool:
-        """True if the episode that begins now (monotonic s) is to be shown."""
+        """True if the episode that begins now (monotonic s) must be shown."""
         self._tokens = max(-RATE, min(RATE, self._tokens + RATE * (now - self._when)))
         self._when = now
         return self._tokens >= 0.0

@@ -28,7 +28,7 @@ NOT_SIGNED = 0.0
 DESIGN = (
     "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
 )  # fmt: skip
-"""Parameters that a model depends on besides its episode, and the cost where it is not empty."""
+"""Parameters that a model depends on in addition to its episode, and the cost where it is not empty."""
 
 
 CONSTANTS = (IDENTIFICATION_SETTINGS, LAW_SETTINGS, FIELD_MODEL_SETTINGS)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A parameter as data, and what values are good for it. No ROS import."""
+"""A parameter as data, with its valid values. No ROS import."""
 
 from __future__ import annotations
 

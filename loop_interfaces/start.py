@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The start of a process: its standard streams, its signals, what is not installed. It imports little.
+"""The start of a process: its standard streams, its signals, missing packages. It imports little.
 
 The console scripts of the nodes are here; `python -m loop_interfaces.start NODE` does the same.
 """

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Texts and values from files and from the network, as they may be shown."""
+"""Texts and values from files and the network, made safe for display."""
 
 import reprlib
 

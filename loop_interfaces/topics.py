@@ -2,7 +2,7 @@
 """The topics of the loop: names, axes, quality of service, and why. No ROS import.
 
 Names are relative, so a namespace makes a second loop. docs/protocol.md describes them for
-somebody who writes a node of their own; this is the same table for our nodes.
+authors of other nodes; this is the same table for the project's nodes.
 """
 
 from dataclasses import dataclass
@@ -150,7 +150,7 @@ VIEW_NUMBERS = {
     "tracking_error": "root of the mean square of z_k - z_r of the newest sample",
     "final_error": "the same at the last step of the last episode",
     "action_norm": "|a_k| of the newest sample",
-    "gain_norm": "Frobenius norm of the present gains [K_a K_b], or of another law's parameters",
+    "gain_norm": "Frobenius norm of the current gains [K_a K_b], or of another law's parameters",
     "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
     "step": "k of the newest sample",
 }

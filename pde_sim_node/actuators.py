@@ -40,8 +40,8 @@ def actuator_supports(
         return supports
     if shape == "equation" and type(equation).supports is not Equation.supports:
         raise ValueError(
-            f"{equation.name} has actuators of its own, which have no other places: give "
-            "actuator_shape together with actuator_positions"
+            f"{equation.name} has actuators of its own at fixed positions: give actuator_shape "
+            "together with actuator_positions"
         )
     if shape == "indicator" and not len(positions):
         return indicator_supports(len(x), n_a, width)

@@ -56,7 +56,7 @@ Coefficient: TypeAlias = float | Sequence[float] | Array | Callable[..., Array]
 
 
 def values_at(name: str, given: Coefficient, x: Array, *further: Array) -> Array:
-    """A coefficient at points, in the shape of x; ValueError where it has not as many finite values.
+    """A coefficient at points, in the shape of x; ValueError if it does not have as many finite values.
 
     x, further: coordinates of the points, all of one shape; values may also come in a row.
 

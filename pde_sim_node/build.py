@@ -56,7 +56,7 @@ def fingerprint(values: Mapping[str, Any]) -> int:
 
 
 def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant, dict[str, Any]]:
-    """The plant of a problem, as of `build_plant`, and the parameters with all that it says itself."""
+    """The plant of a problem, and the parameters with those that the plant defines itself."""
     plant, physical = _build(values, compiled)
     own = {name: getattr(plant, name) for name in (*_FIXED, *SETTABLE)}
     axes = plant.grid.axes

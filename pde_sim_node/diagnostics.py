@@ -65,7 +65,7 @@ class PlantDiagnostics:
             return Level.OK, where
         costs = lockstep.last_cost
         if lockstep.run and costs is not None and (costs[:, CostColumn.ENDED] == VOID).any():
-            why = lockstep.contradiction or "nobody answered a state"
+            why = lockstep.contradiction or "no controller answered a state"
             return Level.ERROR, f"episode {episode_name(lockstep.episode)} is void: {why}"
         return Level.OK, "between two episodes" if lockstep.run else "no run; ready for one"
 

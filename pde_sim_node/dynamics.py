@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A plant of one's own: z_{k+1} = f(z_k, a_k) of one state, and the numbers of its control task.
+"""A plant of your own: z_{k+1} = f(z_k, a_k) of one state, and the numbers of its control task.
 
 >>> import numpy as np
 >>> class Chain(Dynamics):
@@ -56,7 +56,7 @@ class Dynamics(ABC):
     grid : Grid or None
         What the numbers of a state are; None: a plain vector.
     target : array of n_z numbers, or number
-        State z_r to be tracked, or what an output is to be; one row a step: the target of each step.
+        State z_r to be tracked, or the target of the output; one row per step: the target of each step.
     horizon : int
         Steps of an episode.
     sample_time : float

@@ -101,8 +101,8 @@ class InstrumentedPlant:
         self.cost = plant.cost
         if instruments.sensors and not plant.cost.plain:
             raise ValueError(
-                "sensors need weights that are numbers and a constant target, and the cost of "
-                f"{plant!r} is another one: measure the whole state, or change the cost"
+                f"sensors need scalar weights and a constant target, unlike the cost of {plant!r}: "
+                "measure the whole state, or change the cost"
             )
         self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target
         points = self.grid.equally_spaced(instruments.sensors or self.grid.points)
@@ -206,7 +206,7 @@ class InstrumentedPlant:
     def adjoint(self) -> Adjoint:
         """There is none: actions saturate, and the states are not those that are measured."""
         raise ValueError(
-            "exact gradients are of a plant without noise, limits and sensors: leave "
+            "exact gradients need a plant without noise, limits and sensors: leave "
             "measurement_noise, process_noise, action_limit and sensors at 0"
         )
 

@@ -21,7 +21,7 @@ state T advances nothing: it acknowledges the last state.
 Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
 
 A pause is independent of the phase: a paused plant takes the answer it waits for, and sends no further
-state. Nothing is repeated or abandoned meanwhile; `episode/paused` tells those who
+state. Nothing is repeated or abandoned during a pause; `episode/paused` tells those who
 wait for the plant.
 """
 
@@ -63,7 +63,7 @@ class Phase(Enum):
     AWAITING = auto()
     """The action that answers the state that was sent."""
     READY = auto()
-    """The instant at which the next state, already computed, is to be sent, or the end of a pause."""
+    """The instant at which the next state, already computed, is due, or the end of a pause."""
 
 
 class Lockstep:
@@ -136,7 +136,7 @@ class Lockstep:
 
     @property
     def stale(self) -> int:
-        """Messages that came too late, too early or for somebody else."""
+        """Messages that arrived too late, too early or for another node."""
         return sum(count for reason, count in self.counters.items() if reason in _STALE)
 
     @property
@@ -215,7 +215,7 @@ class Lockstep:
             hold = self._timing.run_hold
             if self.run and now - self._tuner_heard < hold:
                 raise FrameError(
-                    f"run {frame.run} asked for an episode, but run {self.run} has this plant "
+                    f"run {frame.run} asked for an episode, but run {self.run} holds this plant "
                     f"(until it ends, or is silent for {hold:g} s)"
                 )
             self._serve(frame.run, now)

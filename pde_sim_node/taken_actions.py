@@ -129,13 +129,15 @@ class TakenActions:
 def two_actions(action: Frame) -> str:
     """Message that a different action was taken."""
     return (
-        f"two different actions came for step {action.step} of episode {episode_name(action.episode)}; "
-        "expected one controller, which answers a repeated state with the same action"
+        f"two different actions arrived for step {action.step} of episode "
+        f"{episode_name(action.episode)}; expected one controller, which answers a repeated state "
+        "with the same action"
     )
 
 
 def two_starts(start: Frame) -> str:
     """Message that a different start was taken."""
     return (
-        f"two different starts came for episode {episode_name(start.episode)}; expected one tuner"
+        f"two different starts arrived for episode {episode_name(start.episode)}; expected one "
+        "tuner"
     )

@@ -140,7 +140,7 @@ def problem(
         A name that `pdeloop problems` lists, or the path of a YAML file; burgers if neither it nor a
         plant is given.
     plant
-        A plant of one's own: an object of a class derived from `Dynamics`, or a name
+        A plant of your own: an object of a class derived from `Dynamics`, or a name
         ('file.py:Class'), whose code is then run. Without a `source` the rest is as the class has it.
     physical
         The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
@@ -181,13 +181,15 @@ def problem(
 
 
 def _with_cost(source: str, given: Mapping[str, Any], cost: object) -> dict[str, Any]:
-    """The parameter `cost`, of which the plant without it says the rest."""
+    """The parameter `cost`, completed by the plant without it."""
     if isinstance(cost, list):  # as a run has it
         return {"cost": cost}
     if not isinstance(cost, Mapping):
         raise ValueError(f"cost is {cost!r}; expected a dict like {{'terminal_weight': 2.0}}")
     if given.get("plant"):
-        raise ValueError("the class of a plant of your own says its cost; leave out the cost here")
+        raise ValueError(
+            "a plant of your own defines its cost in its class; leave out the cost here"
+        )
     # Of the whole field, whatever is measured of it.
     plant, _ = complete(training_parameters(source, {**given, "sensors": 0}), compiled=False)
     own = {name: getattr(plant, name) for name in ("state_weight", "action_weight")}
@@ -201,7 +203,7 @@ def _with_cost(source: str, given: Mapping[str, Any], cost: object) -> dict[str,
 
 
 def _plant_named(plant: Dynamics | Plant | str) -> dict[str, Any]:
-    """The parameters of a plant that is given; ValueError for what is none."""
+    """The parameters of the given plant; ValueError if it is not one."""
     if isinstance(plant, str):
         return {"plant": OWN_PLANTS.allow(plant)}
     if not isinstance(plant, Dynamics | Plant):
@@ -318,7 +320,7 @@ def train(
     problem
         A problem, or its name; not needed with a plant.
     plant
-        A plant of one's own, as of `problem`.
+        A plant of your own, as for `problem`.
     law
         The control law: a class derived from `Law`, or a name; the problem's if not given.
     out
@@ -342,7 +344,7 @@ def train(
     ValueError
         The parameters do not fit together, or the folder cannot be used.
     RuntimeError
-        A node cannot be started or ends, or somebody stops the training over topics.
+        A node cannot be started or ends, or the training over topics is stopped.
 
     Examples
     --------

@@ -59,7 +59,7 @@ def _run(
             asked = getattr(options, "prog", parser.prog)
             refuse(f"unrecognized arguments: {shlex.join(unknown)}; see `{asked} --help`")
         code: int = options.command(options)
-        sys.stdout.flush()  # here, where it can still be said that nobody reads
+        sys.stdout.flush()  # here, where a missing reader can still be reported
         return code
     except (ValueError, RuntimeError) as error:
         # RunFolderError, FileError, ParameterError, DomainError, NodeError and the plant's
@@ -111,7 +111,8 @@ def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     root = argparse.ArgumentParser(
         prog="pdeloop",
-        description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
+        description="Identify, design and adapt controllers for PDEs, in one process or over ROS 2 "
+        "topics.",
         epilog="example: pdeloop train burgers (every command has an example in its --help)",
     )
     root.add_argument("--version", action="version", version=f"pdeloop {_version()}")

@@ -37,7 +37,7 @@ class Measurements:
     trajectories : list of (states (N + 1, n_z), actions (N, n_a))
         a_k was held from z_k to z_{k+1}.
     target : (n_z,) array or None
-        z_r, the state that is to be reached; None if no file has one.
+        z_r, the target state; None if no file has one.
     sample_time : float
         Seconds between two states.
     channels : Channels

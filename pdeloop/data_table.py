@@ -49,7 +49,7 @@ class Columns:
 
     @property
     def chosen(self) -> bool:
-        """True if any is given, so that columns of no kind are left out."""
+        """True if any is given, so that other columns are ignored."""
         return bool(self.time or self.states or self.inputs)
 
 

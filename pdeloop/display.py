@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Displays a run to a person: lines for events, a bar while it adapts."""
+"""Display of a run on the terminal: lines for events, a bar while it adapts."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A ROS domain of one's own, so that two runs on a machine never meet."""
+"""A separate ROS domain for each run, so that two runs on a machine never interfere."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def own_domain() -> Iterator[int]:
 
 @contextlib.contextmanager
 def _held(chosen: int) -> Iterator[None]:
-    """A domain that the user gave, for this block; without a place for locks nobody is noticed."""
+    """The user's domain, for this block; without a place for locks other runs go unnoticed."""
     with contextlib.ExitStack() as held:
         free = True
         with contextlib.suppress(OSError, FileError):

@@ -64,7 +64,7 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
     for name in changes:
         if name not in EVALUATES and not name.startswith("physical."):
             raise ParameterError(
-                f"parameter '{name}' changes nothing about policies that are there; expected one of "
+                f"parameter '{name}' has no effect on trained policies; expected a parameter of "
                 "the plant or the cost, such as horizon, state_weight or physical.*"
             )
     values = {**run.values, **changes}

@@ -58,7 +58,8 @@ class Parameters:
     def c(self) -> bytes:
         """Refused with a ParameterError: only gains are written in C."""
         raise ParameterError(
-            f"the law '{self.kind}' has no gains, so there is none in C; write its parameters as .npz"
+            f"the law '{self.kind}' has no gains, so it cannot be written in C; write its "
+            "parameters as .npz"
         )
 
 
@@ -107,7 +108,7 @@ def law_of(
 ) -> GainLaw | Parameters:
     """A law of a run: adapted or lqt, of its first seed or a given one.
 
-    ParameterError for a seed that the run has not.
+    ParameterError for a seed that the run does not have.
     """
     if which not in LAWS:
         raise ParameterError(f"the law is '{which}'; expected one of {', '.join(LAWS)}")

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A finished run as its folder holds it, and how far its costs lie below those of LQT."""
+"""A finished run, read from its folder, and its cost reduction against LQT."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FinishedRun:
     folder : Path
         Where it is.
     values : dict
-        Resolved parameters, with the present defaults.
+        Resolved parameters, with the current defaults.
     result : dict
         result.json.
     policies, warm : (S, n_a, 2 n_s) array

@@ -121,7 +121,7 @@ class Identified:
         own = self.determined.independence
         lines.append(
             f"  rank {known['rank']} of {known['unknowns']}, smallest singular value "
-            f"{known['smallest_singular_value']:.2g}; the inputs move by themselves to "
+            f"{known['smallest_singular_value']:.2g}; independent share of the inputs "
             f"{100 * min(own.min(), 1.0):.0f} % or more"
         )
         if self.study is None:
@@ -251,7 +251,7 @@ def _identified(
     if target is None and (unused := sorted({"state_weight", "action_weight"} & {*given})):
         flags = " and ".join(f"--{name.replace('_', '-')}" for name in unused)
         raise ParameterError(
-            f"{flags} weigh a law, for which there is no target: give --target too"
+            f"{flags} are weights of a law, which needs a target: give --target as well"
         )
     values = known
     study, none = None, ""
@@ -275,12 +275,12 @@ def _identified(
     method, p = settings.identification, settings.dmdc_rank
     if given.get("dmdc_rank") and method != "dmdc":
         raise ParameterError(
-            f"--rank is that of the identification dmdc, and this one is {method}: "
-            "add --identification dmdc, or leave --rank out"
+            f"--rank applies to the identification dmdc, but this one is {method}: add "
+            "--identification dmdc, or leave --rank out"
         )
     if target is None and method in ("field", "subspace") and "identification" in given:
         raise ParameterError(
-            f"--identification {method} designs a law for a target: give --target too"
+            f"--identification {method} designs a law for a target: give --target as well"
         )
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The law of an identified model, on that model: what it would do, and how it is applied elsewhere."""
+"""The law of an identified model: its behaviour on that model, and how to apply it elsewhere."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def interruptible(continue_with: str, *, at_once: bool = True) -> Iterator[Calla
     except Interruption as reason:
         raise Interruption(f"{reason}; continue with: {continue_with}") from None
     except BrokenPipeError:
-        complain(f"nobody reads the output; continue with: {continue_with}")
+        complain(f"the output has no reader; continue with: {continue_with}")
         raise
     finally:
         for number, handler in known.items():  # nor is the rest of the way

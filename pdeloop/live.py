@@ -49,7 +49,7 @@ class Live:
 def announced(domain: int, folder: Path, *, network: bool = False) -> Iterator[None]:
     """Say for the time of the block that a loop with this folder runs in this domain.
 
-    A temporary folder that cannot be written only means that nobody finds it.
+    A temporary folder that cannot be written only means that it is not found.
     """
     content = {
         "domain": domain,

@@ -33,7 +33,7 @@ RECORD_EVERY = next(spec for spec in taken_by("recorder_node") if spec.name == "
 
 @dataclass(frozen=True)
 class LoopNode:
-    """A node of a run: name of its process, package, and parameters besides those of the problem.
+    """A node of a run: name of its process, package, and parameters other than those of the problem.
 
     namespace: relative to that of the run, empty: the run's own; cores: those that all its threads
     may use, empty: any.
@@ -125,16 +125,18 @@ class Transport:
 
     def __post_init__(self) -> None:
         if self.record_every > 1 and not self.recorded:
-            raise ParameterError("--record-every is about a recording; give --record as well")
+            raise ParameterError("--record-every needs a recording; give --record as well")
         if self.in_process and (self.recorded or self.network):
-            raise ParameterError("--record and --network are about topics; leave out --in-process")
+            raise ParameterError(
+                "--record and --network apply to topics only; leave out --in-process"
+            )
         if self.network and os.environ.get(PROFILE):
             raise ParameterError(
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
                 "out --network to use that profile, or unset the variable"
             )
         if self.in_process and (self.pairs > 1 or self.view):
-            raise ParameterError("--pairs and --view are about nodes; leave out --in-process")
+            raise ParameterError("--pairs and --view apply to nodes only; leave out --in-process")
         PAIRS.check(self.pairs)
         RECORD_EVERY.check(self.record_every)
 

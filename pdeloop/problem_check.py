@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`pdeloop check FILE`: whether a problem's numbers are ones that a training can work with.
+"""`pdeloop check FILE`: whether a training can work with a problem's numbers.
 
 Four findings: the integration step, by halving it; the actuators, by the plant linearised at the
 target; the exploration, the order and the first law, by one exploratory episode.

@@ -60,13 +60,14 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     kind = kind_of(values)
     if kind.needs_trajectories and not plant.quadratic:
         raise ParameterError(
-            f"the optimizer '{values['optimizer']}' learns from a quadratic cost about a target, and "
-            "this plant has none: take one that needs costs alone, such as two_point, or give a target"
+            f"the optimizer '{values['optimizer']}' needs a quadratic cost about a target, which "
+            "this plant does not have: choose one that needs only costs, such as two_point, or "
+            "give a target"
         )
     if kind.needs_trajectories and not (plant.cost.plain or kind.any_cost):
         raise ParameterError(
-            f"the optimizer '{values['optimizer']}' needs weights that are numbers and a constant "
-            "target, and the cost of this plant is another one: take model_based or two_point"
+            f"the optimizer '{values['optimizer']}' needs scalar weights and a constant target, "
+            "unlike the cost of this plant: choose model_based or two_point"
         )
     if not values["model"]:
         check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)

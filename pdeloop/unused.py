@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Parameters that are given and would change nothing: refused, instead of ignored."""
+"""Parameters that are given but would have no effect: refused rather than ignored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OF_NODES = {
     *(spec.name for spec in (*PLANT, *EXECUTION)),
     *("episode_timeout", "max_attempts"),
 }
-"""Parameters of processes and messages, which a training in this process has not."""
+"""Parameters of processes and messages, which a training in this process does not have."""
 ELSEWHERE = {spec.name for spec in (*RECORDER, *VIEWER)} - {spec.name for spec in PROBLEM}
 
 
@@ -34,7 +34,7 @@ def refuse_unused(
     in_process: bool = False,
     viewed: bool = False,
 ) -> None:
-    """ParameterError for a parameter that was given for a training and changes nothing in it.
+    """ParameterError for a parameter that was given for a training and has no effect on it.
 
     given: those that the user named, not those of a problem's file; values: all of them, resolved;
     viewed: whether a viewer runs as well.
@@ -42,22 +42,22 @@ def refuse_unused(
     for name in given:
         reason = _reason(name, values, in_process=in_process, viewed=viewed)
         if reason:
-            raise ParameterError(f"parameter '{name}' changes nothing here: {reason}")
+            raise ParameterError(f"parameter '{name}' has no effect here: {reason}")
 
 
 def _reason(name: str, values: Mapping[str, Any], *, in_process: bool, viewed: bool) -> str:
     if name in OF_A_METHOD:
         chooser, word = OF_A_METHOD[name]
         if values[chooser] != word:
-            return f"it is of the {chooser} {word}, and this one is {values[chooser]}"
+            return f"it applies to the {chooser} {word}, but this one is {values[chooser]}"
     if name == "sensor_delays" and not values["sensors"]:
         return "there are no sensors; give sensors as well"
     if name in OF_THE_COMMAND:
         return "it follows from how the training is started; see pdeloop train --help"
     if name in OF_NODES and in_process:
-        return "it is about nodes; train over topics, without --in-process"
+        return "it applies to nodes; train over topics, without --in-process"
     if name in ELSEWHERE and not (viewed and name.startswith("view_")):
-        return "it is of another node than the training's" + (
+        return "it belongs to a node that the training does not start" + (
             "; add --view" if name.startswith("view_") else ""
         )
     return ""

@@ -14,7 +14,7 @@ PATIENCE = 10.0
 class Matching:
     """The answers of the loop's nodes: that they have discovered us, and their parameters.
 
-    required: full names of topics that somebody must publish; others: whose publishers, if there
+    required: full names of topics that must have a publisher; others: whose publishers, if there
     are any, are also asked.
     """
 

@@ -42,7 +42,7 @@ RECORDING_FAILED = 3
 DRAIN = 0.02
 """Seconds between two batches: often enough for the depth below, seldom enough to cost little."""
 FLUSH = 0.3
-"""Seconds of recording that a SIGKILL may lose at the most."""
+"""Maximum seconds of recording that a SIGKILL may lose."""
 LOOK = 0.1
 """Seconds between two rounds of reading the ROS graph."""
 DEPTH = 1000
@@ -50,7 +50,7 @@ DEPTH = 1000
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 """A node that starts later also gets the earlier messages."""
 QUIET, END = 0.1, 1.0
-"""At the end: seconds without a message after which the recording ends, and at the most."""
+"""At the end: seconds without a message after which the recording ends, and the maximum wait."""
 
 
 class RecorderNode:

@@ -340,9 +340,9 @@ def derivative_loop(nonlinearity: Callable[[float], float]) -> Any:
     wrong = np.abs(slopes - finite)[known].max(initial=0.0)
     if not wrong <= 1e-5 * np.abs(finite[known]).max(initial=0.0):
         raise ValueError(
-            f"the nonlinearity {nonlinearity.__qualname__} is not an analytic function of u, so that "
-            "its derivative cannot be taken by the complex step; gradients need one without |u|, "
-            "max, min or branches"
+            f"the nonlinearity {nonlinearity.__qualname__} is not an analytic function of u, so "
+            "the complex step cannot differentiate it; gradients need one without |u|, max, min "
+            "or branches"
         )
     return loop
 

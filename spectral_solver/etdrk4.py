@@ -80,8 +80,8 @@ def etdrk4_coefficients(linear: Spectrum, dt: float) -> Coefficients:
         )
     if not np.isfinite(values).all():
         raise ValueError(
-            f"the linear operator must not grow beyond all bounds within one integration_time, "
-            f"got a growth rate of {np.max(y.real / dt):g} over {dt:g}: take a smaller integration_time"
+            "the linear operator must not grow without bound within one integration_time, got a "
+            f"growth rate of {np.max(y.real / dt):g} over {dt:g}: take a smaller integration_time"
         )
     if np.isrealobj(linear):
         values = tuple(value.real.copy() for value in values)

@@ -71,8 +71,8 @@ def exact_propagator(linear: Spectrum, time: float) -> tuple[Spectrum, Spectrum]
             e, f = whole[:, :c, :c], whole[:, :c, c:]
     if not (np.isfinite(e).all() and np.isfinite(f).all()):
         raise ValueError(
-            f"the linear operator must not grow beyond all bounds within one sample_time of "
-            f"{time:g}: take a smaller sample_time"
+            f"the linear operator must not grow without bound within one sample_time of {time:g}: "
+            "take a smaller sample_time"
         )
     return e, f
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The time step in plain NumPy: what the compiled one of `kernel` computes, to be read.
+"""The time step in plain NumPy, for readers: the same computation as the compiled `kernel`.
 
 It is the step of `etdrk4` (equations and sources there) for the real FFT v of the state, with the
 nonlinear part on the dealiased grid and the forcing of the held action, N(v) = m F[g(u)] + F_a.

@@ -32,7 +32,7 @@ def most_environments(max_batch: int, state_size: int, horizon: int) -> int:
 
 
 def less_often(numbers: int) -> int:
-    """How many times less often a message of so many numbers, or what asks for it, is repeated: 1 to 4.
+    """Factor, 1 to 4, by which a message of this many numbers, or its request, is repeated less often.
 
     A plant keeps itself for a run whose tuner it hears every ten seconds.
 
@@ -91,7 +91,7 @@ class BatchResult:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """The definition of a training besides the problem; see loop_interfaces.parameters.TUNER."""
+    """The definition of a training apart from the problem; see loop_interfaces.parameters.TUNER."""
 
     n_a: int
     seed: int

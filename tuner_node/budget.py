@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The budget of a training: the rollouts that every seed has paid, by what they were for.
+"""The budget of a training: the rollouts of every seed, by purpose.
 
 A rollout counts once, when its result is used: what a fault makes a plant repeat is not counted again.
 """

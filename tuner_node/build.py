@@ -112,13 +112,13 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     if kind.needs_affine_law and law is not Affine and law.name not in kind.also_improves:
         adapted = " and ".join((Affine.name, *kind.also_improves))
         raise ParameterError(
-            f"the optimizer '{values['optimizer']}' adapts no law but {adapted}, and the law is "
-            f"'{values['law']}'; take an optimizer that adapts any law, such as two_point"
+            f"the optimizer '{values['optimizer']}' adapts only {adapted}, but the law is "
+            f"'{values['law']}'; choose an optimizer that adapts any law, such as two_point"
         )
     if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
-            "the identification 'subspace' gives a filter, which the law "
-            f"'{law.name}' does not use; give --law observer, or another identification"
+            f"the identification 'subspace' designs a filter, which the law '{law.name}' does not "
+            "use; give --law observer, or another identification"
         )
     return law
 

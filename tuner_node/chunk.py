@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A part of a batch that is one episode: what asks for it, and what comes of it. Pure."""
+"""A part of a batch that is one episode: its request and its results. Pure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -232,7 +232,7 @@ class Dispatcher:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
-        # The same again says nothing of a plant that does not answer.
+        # A repetition says nothing about a plant that does not answer.
         if known.chunk.models is None:
             known.last_heard = now
         known.take_answer(topics.MODEL_IDENTIFIED.name, frame)
@@ -254,7 +254,7 @@ class Dispatcher:
         return []
 
     def tick(self, now: float) -> list[PairPublication]:
-        """Ask again for what is not answered; start again what has been silent for too long.
+        """Ask again for missing answers; restart episodes that have been silent for too long.
 
         A pair that is at work ignores being asked again, one that was done answers again.
         """
@@ -353,8 +353,8 @@ class Dispatcher:
         for samples in (used for pair in self.pairs for used in pair.used_samples()):
             if samples.contradiction:
                 raise ContradictionError(
-                    f"{samples.contradiction}, one of which was used: stop who else publishes them "
-                    "and start a new run"
+                    f"{samples.contradiction}, one of which was used: stop the other publisher and "
+                    "start a new run"
                 )
         queue, publications = self._queue, list[PairPublication]()
         if self.paused or queue is None:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Why a training over topics ends before its end."""
+"""Why a training over topics ends early."""
 
 
 class DispatchError(RuntimeError):

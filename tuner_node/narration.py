@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A training in words: its events, how far it is, and its outcome. Pure.
+"""A training in words: its events, its progress, and its outcome. Pure.
 
 The tuner logs these lines, and `pdeloop train` shows them.
 """
@@ -131,11 +131,13 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     if comparable and not diverged["none"] and lqt >= none > 0:
         share = 100 * (1 - adapted / none)
         lines.append(
-            "  the LQT law costs no less than no control; the adapted one costs "
+            "  the LQT law costs at least as much as no control; the adapted one costs "
             f"{abs(share):.1f} % {'less' if share >= 0 else 'more'} than no control"
         )
     if not any(summary["changed"]):
-        lines.append("  nothing was adapted: the policies are those that the adaptation began with")
+        lines.append(
+            "  nothing was adapted: the policies are those that the adaptation started from"
+        )
     elif worse := _worse_than_lqt(summary):
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
@@ -158,8 +160,8 @@ def differences(summary: Row) -> list[str]:
         ]
     (own,) = known
     return [
-        f"adapted less LQT on the same {own['fields']} fields: {own['change']:.4g} "
-        f"(95 % interval {own['low']:.4g} to {own['high']:.4g})"
+        f"adapted minus LQT on the same {own['fields']} fields: {own['change']:.4g} (95 % interval "
+        f"{own['low']:.4g} to {own['high']:.4g})"
     ]
 
 
@@ -173,7 +175,7 @@ def _reasons(summary: Row) -> list[str]:
             seeds_of.setdefault(own["reason"], []).append(summary["seed"] + m)
     several = summary["seeds"] > 1
     return [
-        f"  {f'seed {_listed(seeds)}: ' if several else 'the optimizer says: '}{reason}"
+        f"  {f'seed {_listed(seeds)}: ' if several else 'the optimiser says: '}{reason}"
         for reason, seeds in seeds_of.items()
     ]
 
@@ -209,10 +211,10 @@ def warnings(summary: Row) -> list[str]:
     found = several_publishers(summary.get("several_publishers", {}))
     if lost["lqt"] == rollouts:
         found.append(
-            "every rollout of the first laws diverged; likely causes: an exploration that is too weak "
-            "or too short to identify from (exploration_variance, horizon), an order that leaves out "
-            "unstable modes (reduced_order), actuators that do not reach them, or a controller that "
-            "answers by another law"
+            "every rollout of the first laws diverged; likely causes: an exploration that is too "
+            "weak or too short to identify from (exploration_variance, horizon), an order that "
+            "leaves out unstable modes (reduced_order), actuators that do not reach them, or a "
+            "controller that applies another law"
         )
     if lost["adapted"] == rollouts:
         found.append("every rollout of the adapted policies diverged")
@@ -264,7 +266,7 @@ def _spread(costs: Sequence[float | None]) -> str:
 def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
     """The rollouts of a seed by purpose."""
     spent = {name: span([seed[name] for seed in rollouts]) for name in rollouts[0]}
-    each = " a seed" if len(rollouts) > 1 else ""
+    each = " per seed" if len(rollouts) > 1 else ""
     return (
         f"{spent['total']} rollouts{each} (exploration {spent['exploration']}, "
         f"check {spent['check']}, adaptation {spent['adaptation']})"

@@ -179,7 +179,7 @@ class TunerNode:
     def _stop(self) -> str:
         self._guarded(lambda now: self._session.stop())
         if self._writer:
-            self._writer.hold(False)  # whoever continues the run has chosen to
+            self._writer.hold(False)  # the run is continued deliberately
         if self._session.stopped:
             return "stopping now"
         return "stopping after the rollouts under way" + (

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The problem as an optimiser that learns from trajectories is told it."""
+"""The problem, as given to an optimiser that learns from trajectories."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A pair of plant and controller as the dispatcher knows it, and what contradicts that. Pure."""
+"""A pair of plant and controller as seen by the dispatcher, and contradictions to it. Pure."""
 
 import math
 from dataclasses import dataclass, field
@@ -125,9 +125,9 @@ class Pair:
         # is void at an earlier step.
         if void and answer.step == step and not self.runs(answer.episode):
             raise ContradictionError(
-                f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
-                "run has used, because different starts or actions came: stop the second tuner or "
-                "controller and start a new run"
+                f"the plant withdrew the cost of episode {episode_name(answer.episode)}, which "
+                "this run has used, because different starts or actions arrived: stop the second "
+                "tuner or controller and start a new run"
             )
 
     def check_failure(self, failure: ModelFailure) -> None:
@@ -135,9 +135,9 @@ class Pair:
         # With `retry` the controller has only lost what it knew.
         if not failure.retry and self.used(failure.episode):
             raise ContradictionError(
-                f"the controller took back episode {episode_name(failure.episode)}, which this run "
-                f"has used, because {failure.reason}; stop who else publishes in this namespace and "
-                "start a new run"
+                f"the controller withdrew episode {episode_name(failure.episode)}, which this run "
+                f"has used, because {failure.reason}; stop the other publisher in this namespace "
+                "and start a new run"
             )
 
     def check_signature(self, model: Frame, design: int) -> None:
@@ -152,7 +152,7 @@ class Pair:
     def check_plant(self, cost: Frame, plant: int, now: float) -> None:
         """A FrameError unless a cost is of this plant.
 
-        A DispatchError after FOREIGN_PLANT_GRACE, if this plant has not been there.
+        A DispatchError after FOREIGN_PLANT_GRACE, if this plant has not been present.
         """
         foreign = cost.plant != plant and plant not in self.announced
         self.foreign_since = min(self.foreign_since, now) if foreign else math.inf

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The rollouts that the phases of a training want, besides those that the optimisers ask for. Pure.
+"""The rollouts of a training's phases other than those of its optimisers. Pure.
 
 All of them are functions of the training's seeds and of how often a seed has explored.
 """

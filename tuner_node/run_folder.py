@@ -4,7 +4,7 @@
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
 run.json           the run's id on the network, how often its tuner was started, whether an
                    operator has paused it, the plant's fingerprint if it was given (0: not),
-                   what defines the training, and why nobody may continue it, if so
+                   what defines the training, and why it cannot be continued, if so
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,);
@@ -110,7 +110,7 @@ class RunFolder:
             begun = f"{self.path} already holds a run; choose another folder, delete this one, or "
             if (self.path / "result.json").exists():  # there is nothing to continue
                 report = f"pdeloop report {shlex.quote(str(self.path))}"
-                raise RunFolderError(f"{begun}see what it came to: {report}")
+                raise RunFolderError(f"{begun}see its results: {report}")
             raise RunFolderError(
                 f"{begun}continue it with: {resuming(self.path)} "
                 "(a tuner_node with -p resume:=true)"

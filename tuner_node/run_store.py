@@ -19,7 +19,7 @@ from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
-"""Seconds between checkpoints at the least. What a crash loses is computed again, identically."""
+"""Minimum seconds between checkpoints. What a crash loses is computed again, identically."""
 CHECKPOINT_SHARE = 0.2
 """Share of the time that writing them may take: with many trajectories one has 100 MB and more."""
 
@@ -118,7 +118,7 @@ def open_run(
     """Begin the run in the folder `out` of the tuner's parameters, or continue it (`resume`).
 
     locks: the folder is locked until it is closed, before anything in it is looked at or written, as
-    somebody else may also begin a run in it. Without a folder nothing is written.
+    another process may also begin a run in it. Without a folder nothing is written.
     """
     if not values["out"]:
         return None, RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)

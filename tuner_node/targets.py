@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Targets of the plants that were heard of, until the run's own plant is known. Pure."""
+"""Targets of all plants that published one, until the run's own plant is known. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Targets:
         self._known: dict[int, Array] = {}
 
     def of(self, plant: int) -> Array | None:
-        """The target of a plant; None if it has not come."""
+        """The target of a plant; None if it has not arrived."""
         return self._known.get(plant)
 
     def keep_only(self, plant: int) -> None:
@@ -42,6 +42,6 @@ class Targets:
             self._known[frame.plant] = frame.values.copy()
         elif not np.array_equal(known, frame.values):
             raise ContradictionError(
-                f"two different targets came for the plant {frame.plant} of this run; expected one "
-                "plant with this fingerprint: stop the other and start a new run"
+                f"two different targets arrived for the plant {frame.plant} of this run; expected "
+                "one plant with this fingerprint: stop the other and start a new run"
             )

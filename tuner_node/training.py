@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The training as a state machine: which rollouts it needs next, what it does with their costs.
+"""The training as a state machine: the rollouts it needs next, and the use of their costs.
 
     phase     rollouts of each seed                     next phase
     identify  an exploration, from which the            check; adapt where only one attempt is
@@ -158,8 +158,8 @@ class Training:
         steps = sorted({*result.steps, *([self.steps] if self.steps else [])})
         if len(steps) > 1:
             raise ContradictionError(
-                f"episodes of this run ended after {' and '.join(map(str, steps))} steps, expected one "
-                "horizon: stop who else publishes episode/cost and start a new run"
+                f"episodes of this run ended after {' and '.join(map(str, steps))} steps, expected "
+                "one horizon: stop the other publisher of episode/cost and start a new run"
             )
         return next(iter(steps), 0)
 
@@ -201,7 +201,7 @@ class Training:
 
     @property
     def generation(self) -> int:
-        """Number of the present models: grows whenever one of them is another one."""
+        """Number of the current models: increases whenever one of them changes."""
         return 1 + sum(self.attempts)
 
     @property
@@ -249,7 +249,7 @@ class Training:
         return rows
 
     def _excitation(self, m: int, explored: Trajectory) -> list[dict[str, Any]]:
-        """History rows about what an exploration hardly determines, whoever drew its actions.
+        """History rows about what an exploration hardly determines, whatever drew its actions.
 
         NotIdentifiableError if the effects of its inputs cannot be told apart.
         """
@@ -329,7 +329,7 @@ class Training:
         self._leave_adapt_if_done()
 
     def start_optimizers(self) -> None:
-        """Make the optimiser of every seed, with its start and what is left of its budget."""
+        """Make the optimiser of every seed, with its start and its remaining budget."""
         budgets = self.budget.adaptation.tolist()
         self.optimizers = [
             self.make_optimizer(start, seed, self._context(m), budget)

@@ -54,7 +54,7 @@ class TrajectoryCollector:
             known[key], self.nbytes = frame.values.copy(), self.nbytes + size
         elif not np.array_equal(known[key], frame.values):
             self.contradiction = (
-                f"two different {what} came for step {frame.step} of episode "
+                f"two different {what} arrived for step {frame.step} of episode "
                 f"{episode_name(frame.episode)}"
             )
 

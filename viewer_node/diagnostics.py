@@ -22,7 +22,7 @@ class ViewerDiagnostics:
         if current is not None:
             message = f"step {current.last} of episode {episode_name(current.key[1])}"
             if quiet is not None and quiet > SILENT:
-                level, message = Level.STALE, f"nothing heard for {quiet:.0f} s"
+                level, message = Level.STALE, f"no messages for {quiet:.0f} s"
         return Status(
             level,
             message,

@@ -23,7 +23,7 @@ ROWS = 256
 SIDE = 96
 """Points along each axis that are kept of a field on two, of its newest and its first state."""
 MAX_ACTIONS = 32
-"""Actions that are kept: more lines than that nobody can tell apart."""
+"""Actions that are kept: more lines could not be told apart."""
 MAX_COMPONENTS = 8
 """Components of the state that are kept: of delayed measurements there may be very many."""
 _VERSIONS = itertools.count(1)

@@ -3,7 +3,7 @@
 
 Subscribes  state, action (or samples_throttled), target, episode/start, policy, model, episode/cost
 Publishes   view/field, view/target (visualization_msgs/Marker), view/spacetime (sensor_msgs/Image),
-            view/... (std_msgs/Float64), at view_rate and only what somebody subscribes to
+            view/... (std_msgs/Float64), at view_rate and only with subscribers
 It takes no part in the loop, and nothing waits for it. What is shown: docs/watching.md.
 """
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""ping_node: one end of a raw ping-pong, the yardstick of `python -m benchmarks rtt`.
+"""ping_node: one end of a raw ping-pong, the reference of `python -m benchmarks rtt`.
 
 Nothing but the middleware: bytes are published and taken as they are, on a WaitSet with one
 subscription, with the quality of service of our topics. The end `ping` reads one JSON object a line

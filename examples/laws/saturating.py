@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A law of one's own: an action that never exceeds a limit, and is smooth where it comes near it."""
+"""A law of your own: an action that stays within a limit and approaches it smoothly."""
 
 from dataclasses import dataclass
 

@@ -138,7 +138,7 @@ class SampleBatcher:
 
     @property
     def wanted(self) -> bool:
-        """True if anybody takes samples of the present episode."""
+        """True if any node reads samples of the current episode."""
         return self._full.open or self._throttled.open
 
     def begin(self, now: float) -> None:

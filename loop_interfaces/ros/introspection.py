@@ -26,7 +26,7 @@ from loop_interfaces.isolation import is_confined
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """The graph's name for the node of an endpoint, before it has discovered the node."""
 WAITING_REQUESTS = 100
-"""Requests to a service that wait for an answer at the most."""
+"""Maximum number of requests to a service that wait for an answer."""
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
 """Seconds between two reports, and between two inspections of the graph."""
@@ -53,7 +53,7 @@ def process_of(endpoint: Any) -> bytes:
 def matched_processes(node: Node, publisher: Publisher) -> set[bytes]:
     """The processes whose subscriptions receive what the publisher sends from now on.
 
-    The graph tells who subscribes, the publisher how many of them it is matched with: none is named
+    The graph shows the subscribers, the publisher how many of them it is matched with: none is named
     before all are.
     """
     there = node.get_subscriptions_info_by_topic(publisher.topic_name)

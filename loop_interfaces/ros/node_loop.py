@@ -128,7 +128,7 @@ class NodeLoop(EventLoop):
     def answer_fast(self, receiver: Receiver, sender: Sender, path: FastPath) -> None:
         """Let `path` answer messages of `receiver` on `sender` while this thread waits.
 
-        Where rcl is not to be had, or the middleware does not announce messages, all of them go the
+        Where rcl is not available, or the middleware does not announce messages, all of them go the
         ordinary way.
         """
         self._fast = _Fast(receiver, sender, path)
@@ -262,7 +262,7 @@ class NodeLoop(EventLoop):
         """In another thread: report a long computation, and end a wait that takes too long.
 
         Fast DDS waits until a point of the machine's clock where it was built with an old C++
-        library, as the wheels are; when that clock is set back meanwhile, until it gets there again.
+        library, as the wheels are; if that clock is set back in the meantime, until it has caught up.
         """
         now = self.now()
         if now - self._turned > STUCK:
@@ -272,7 +272,7 @@ class NodeLoop(EventLoop):
     def _subscriptions(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
         """Functions that take from each subscription, by its handle, those of samples first.
 
-        A cost comes after the samples of its episode, and is to be handled after them.
+        A cost arrives after the samples of its episode, and must be handled after them.
         """
         found: dict[Any, Callable[[], int]] = {}
         for samples, handlers in self._observed:
@@ -299,7 +299,7 @@ class NodeLoop(EventLoop):
         """Handle the message that has waited longest; how many there were."""
         channel = fast.path.channel
         if dropped := channel.newly_dropped():
-            reason = "came while too many others waited"
+            reason = "arrived while too many others were waiting"
             self.introspection.refuse(fast.receiver.name, reason, dropped)
         raw = channel.next_message()
         return 0 if raw is None else self._handle(fast.receiver, raw)

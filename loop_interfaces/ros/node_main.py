@@ -78,7 +78,7 @@ def ros_node(
 
 
 def prepare_process(name: str) -> None:
-    """Make this process's environment one in which a node works; say what is left out of it.
+    """Make this process's environment one in which a node works; report what is removed from it.
 
     RosEnvironmentError where none does.
     """

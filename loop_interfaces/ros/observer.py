@@ -59,7 +59,7 @@ class EventLoop:
         return time.monotonic()
 
     def stop(self, reason: str) -> None:
-        """Leave `run` after the present event."""
+        """Leave `run` after the current event."""
         self._stop_reason = reason
 
     def serve_next(self, seconds: float) -> bool:

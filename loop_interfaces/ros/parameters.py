@@ -40,7 +40,7 @@ _FILES = "_pdeloop_parameter_files"
 def given_parameters(node: Node, package: str) -> dict[str, Any]:
     """The parameters that command line and files give a node, on top of the problem they name.
 
-    ParameterError for unknown names, and for a problem that nobody knows. A relative file of user code
+    ParameterError for unknown names, and for an unknown problem. A relative file of user code
     is that from the folder of the parameter file, as for the commands.
     """
     given = {

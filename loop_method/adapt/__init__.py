@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Optimisers of a policy behind one interface: see `loop_method.adapt.base`."""
+"""Optimisers with a common interface: see `loop_method.adapt.base`."""
 
 from loop_method.adapt.base import Context as Context
 from loop_method.adapt.base import Optimizer as Optimizer

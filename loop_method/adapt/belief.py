@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The model of the whole field that measured rollouts speak for, and how well it predicts them."""
+"""The model of the whole field that is selected by measured rollouts, and its prediction error."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def believe(
     records : sequence of Record
         Explorations, whose policy is zero and whose cost is infinite, and rollouts of laws.
     first : str
-        The kind that is tried first, which was believed before; empty: none.
+        The kind that is tried first, the one selected before; empty: none.
     parts : int
         Pieces of equal length that are predicted in place of a rollout.
     """

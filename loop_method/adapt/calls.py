@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Calls of an optimiser, which may be a user's own: what it raises and returns is checked.
+"""Calls of an optimiser, possibly a user's: exceptions and results are checked.
 
 What an optimiser of this package raises is its own sentence, and goes through as it is.
 """

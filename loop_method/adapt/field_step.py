@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A law that is improved on a model of the whole field.
+"""A step that improves a law on a model of the whole field.
 
 Applies where such a model predicts the rollouts, or, of a chaotic plant, pieces of them. There the law
 is improved from many measured states (`initial_fields`), and tried only where it is better from others.

@@ -276,7 +276,7 @@ class GaussNewton(Optimizer):
         return True
 
     def _renew_fields(self, small: bool) -> None:
-        """A fresh field in place of the oldest, or besides it after a small step."""
+        """A fresh field in place of the oldest, or in addition to it after a small step."""
         now = self._now
         grow = small and len(now.fields) < 2 * self._field_count
         if self._left <= len(now.fields) + grow:

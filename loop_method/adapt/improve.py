@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A law that costs less on a model of the whole field.
+"""Improvement of a law on a model of the whole field.
 
 L-BFGS on the weighted cost over initial fields, in the coordinates
 
@@ -103,7 +103,7 @@ def improve(
     least_gain : float, optional
         In place of that of the settings.
     trust : float
-        What |x - x_0|^2 costs besides, with x_0 the law to begin with: of a linear plant the step is
+        Weight of the added cost |x - x_0|^2, with x_0 the initial law: for a linear plant the step is
         1/(1 + trust) of the whole one.
     """
     for _ in range(settings.halvings + 1):
@@ -198,7 +198,7 @@ def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Ar
 
 
 def curvature_of(loop: ClosedLoop) -> Array:
-    """R + B^T P B of the model linearised at the target; R where that is not to be had."""
+    """R + B^T P B of the model linearised at the target; R where there is none."""
     n_a, r = loop.model.n_a, loop.action_weight
     if loop.model.n_z <= LARGEST:
         A, B = loop.model.linearise(loop.target, np.zeros(n_a))

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""An optimiser of a law for states of very many numbers, which sees coordinates in their place.
+"""An optimiser for large states, which works on their coordinates in a basis.
 
-With orthonormal rows W that span U, the target and the measured states, x = W^T z says all that an
+With orthonormal rows W that span U, the target and the measured states, x = W^T z contains all that an
 optimiser needs: s = U^T z = (W^T U)^T x, and |z - z_r| = |x - W^T z_r|. W grows by what later rollouts
 bring (`loop_method.reduce.snapshots`), and is all in a checkpoint that grows with the size of a state.
 """

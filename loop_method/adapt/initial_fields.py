@@ -1,12 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The fields that a law is improved from on a model: measured ones, and draws that are like them.
+"""The initial fields on which a law is improved: measured ones, and draws from their distribution.
 
-Measured ones are those in which episodes began. A chaotic plant forgets where it began, and what a law
-costs depends on the initial field as if by chance: a law that is better from a few of them is not from
-others. There any measured state serves as well, of which one rollout has many.
+Measured ones are those in which episodes began. The state of a chaotic plant soon becomes independent
+of them, and the cost of a law depends on the initial field as if by chance: a law that is better on a
+few fields need not be better on others. There any measured state serves, and one rollout has many.
 
-Elsewhere a law that is best on a few fields is not on their neighbours. On a model further fields cost
-no rollout, so the law is improved on draws of a normal distribution as well, with the mean m of the n
+On other plants a law that is best on a few fields need not be best near them. On a model further fields
+cost no rollout, so the law is also improved on draws of a normal distribution, with the mean m of the n
 measured fields and the covariance
 
     C = (1 + 1/n) ((1 - rho) S + rho P),        S = 1/(n - 1) sum (z_i - m)(z_i - m)^T,

@@ -80,7 +80,7 @@ class LocalSearch:
             self._begin_search()
 
     def ask(self) -> list[Rollout]:
-        """The rollouts of the present stage."""
+        """The rollouts of the current stage."""
         if self.stage == COMPARING:
             none = np.zeros_like(self._first)
             return [self._rollout(none, i) for i in range(self._compared)]
@@ -132,7 +132,7 @@ class LocalSearch:
         return arrays
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Continue from a `state`; a ValueError if it is none."""
+        """Continue from a `state`; ValueError if it is not one."""
         stage = str(checked_array(state, "stage", "U", ()))
         if stage not in _STAGES:
             raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A damped Gauss-Newton step on the local models that predict best how measured trajectories differ.
+"""A damped Gauss-Newton step on the local models that best predict differences of trajectories.
 
 It always applies; the other kinds of proposals come before it.
 

@@ -2,7 +2,7 @@
 """The optimiser `model_based`: a law is improved on a model of the whole field, and judged by rollouts.
 
     stage       rollouts                                    afterwards
-    renewing    the present law, each on a fresh field      a model is fitted to all rollouts and the
+    renewing    the current law, each on a fresh field      a model is fitted to all rollouts and the
                                                             law improved on it (`renewal`); at last
                                                             judging, or a search without such a model
     judging     the final law, each on a fresh field        first law, final law or none (`verdict`)
@@ -267,7 +267,7 @@ class ModelBased(Optimizer):
             self._begin_judging()
 
     def _believe(self) -> Belief | None:
-        """The model that predicts the rollouts, the kind that was believed before tried first."""
+        """The model that predicts the rollouts; the kind selected before is tried first."""
         before = self._progress.belief
         kind = "" if before is None else before.model.kind
         return believe(self._context, self._measurements(), kind)

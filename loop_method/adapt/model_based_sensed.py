@@ -5,7 +5,7 @@ Where one equation reproduces the readings of the rollouts (`loop_method.models.
 designed and improved on it as on a model of the whole field, from the initial fields that the readings
 tell and draws that are like them. It begins with the cheapest on the model of the present law and
 those of `observer_design`, and is replaced only where it is cheaper on other draws. Once no equation
-reproduces the rollouts, it goes on with a model of the readings (`model_based_readings`).
+reproduces the rollouts, it continues with a model of the readings (`model_based_readings`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ModelBasedSensed(ModelBasedReadings):
         return np.stack(good or [field for field, _ in found])
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
-        """The law that costs least on the model, of the present one and those that it makes."""
+        """The law of least cost on the model, among the current one and those that it designs."""
         if not isinstance(belief.model, SensedModel):
             super()._improve(belief, row, final)
             return

@@ -153,7 +153,7 @@ def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
 def _regression(
     features: Array, wanted: Array, weights: Array, noise: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
-    """Matrix and constant of the weighted regression on [x; 1], and the covariance of what is left.
+    """Matrix and constant of the weighted regression on [x; 1], and the covariance of its residual.
 
     noise: variances of what will be added to the features.
     """

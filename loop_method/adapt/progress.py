@@ -22,7 +22,7 @@ _STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
 
 @dataclass(eq=False)
 class Progress:
-    """What changes in the course of an optimisation, besides its rollouts and local steps.
+    """State of an optimisation that changes over time, apart from its rollouts and local steps.
 
     Attributes
     ----------

@@ -55,7 +55,7 @@ class Proposer:
         n_a, columns = policy.shape
         if U.ndim != 2 or columns != 2 * U.shape[1]:
             raise ValueError(
-                f"a policy of shape {policy.shape} does not fit a basis U of shape {U.shape}."
+                f"a policy of shape {policy.shape} does not match a basis U of shape {U.shape}."
             )
         if target.shape != U.shape[:1]:
             raise ValueError(

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Optimisers by name: an entry point, ours or another package's, or code of one's own.
+"""Optimisers by name: an entry point, ours or another package's, or code of the user's.
 
 Which code may be run: `loop_interfaces.own_code`.
 """

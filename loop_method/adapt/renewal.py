@@ -75,7 +75,7 @@ def renew(
     periodic: bool = True,
     final: bool = True,
 ) -> Renewal | None:
-    """The law that costs least on the model, moved only as far as the fields left out confirm.
+    """The law of least cost on the model, moved only as far as held-out fields confirm.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ class ReplayedLoop(ObservedLoop):
     replays: ClassVar[bool] = True
 
     def beginnings(self, records: Sequence[Record]) -> Array:
-        """[x_0, e] of each rollout; a shorter one goes on without innovations."""
+        """[x_0, e] of each rollout; a shorter one continues without innovations."""
         model, found = self._readings, []
         for record in records:
             first, e = model.replay(record.states, record.actions)

@@ -68,7 +68,7 @@ class SensedLoop(ObservedLoop):
 
 
 def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:
-    """Mean of (z - z_r)^2 from the cost of a rollout; NaN where it tells none, as of an exploration.
+    """Mean of (z - z_r)^2 from the cost of a rollout; NaN where it has none, as after an exploration.
 
     state_weight: what a sensor counts.
     """

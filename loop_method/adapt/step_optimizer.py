@@ -53,7 +53,7 @@ class StepOptimizer(Optimizer):
     step_rollouts: ClassVar[int] = 1
     """Rollouts of a step."""
     kept: ClassVar[Sequence[str]] = ()
-    """Attributes, arrays of float64 of a fixed shape, that a checkpoint holds besides the policy."""
+    """Float64 arrays of a fixed shape that a checkpoint holds in addition to the policy."""
 
     def __init__(
         self,

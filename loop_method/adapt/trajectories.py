@@ -33,7 +33,7 @@ class LowRankTrajectory(Trajectory):
 
 
 def kept(states: Array, actions: Array) -> Trajectory:
-    """A trajectory to be kept, with large states as factors; states may be a view."""
+    """A trajectory to keep, with large states as factors; states may be a view."""
     if states.shape[1] > LARGE and np.isfinite(states).all():
         return LowRankTrajectory(*factored(states), actions)
     return Trajectory(np.ascontiguousarray(states), actions)
@@ -143,7 +143,7 @@ class Records:
     def restore(
         self, arrays: Arrays, n_z: int, shape: tuple[int, ...], n_a: int | None = None
     ) -> None:
-        """Remember what a `state` does; a ValueError if it is none.
+        """Remember what a `state` does; a ValueError if it is not one.
 
         shape: of the policies, whose rows are as many as actuators if n_a does not say how many.
         """

@@ -7,7 +7,7 @@ distribution,
     m + mean over its own rollouts of (measured - model),
 
 with m the mean of its model costs over all measured fields: the model is a control variate, so that one
-rollout tells what many would without it. The mean over the fields is the same for all laws, so that
+rollout is as informative as many without it. The mean over the fields is the same for all laws, so that
 their difference has little chance in it; for the final law, which these fields made, it is that of
 fields that were left out.
 """
@@ -162,7 +162,7 @@ def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
         model = loop.costs(loop.theta(law), loop.beginnings([record]))[0]
         if not record.usable:
             excess.append(np.inf)
-        elif np.isfinite(model):  # where the model overflows, it says nothing of the rollout
+        elif np.isfinite(model):  # a model that overflows carries no information on the rollout
             excess.append(record.cost - float(model))
     return np.array(excess)
 

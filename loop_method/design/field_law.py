@@ -9,7 +9,7 @@ field (`loop_method.models`) that predicts the episodes is linearised at the tar
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
 
 and the law a = K e + b that minimises the cost over the horizon senses no more than the n_a rows of K.
-They come first in U, and POD modes of what is left of simulated states, with that law and without
+They come first in U, and POD modes of the remainder of simulated states, with that law and without
 control, fill the other columns. Where there is no room for more modes than rows, all are POD modes.
 
 References
@@ -55,7 +55,7 @@ class FieldLaw:
     fitted : FittedModel or None
         The model with its error, and the errors of all kinds; None where none can be fitted.
     rows : ModelRows or None
-        Its law, with the linearised model on U; None where the model is not believed.
+        Its law, with the linearised model on U; None if the model is not accurate enough.
     cost, other_cost : float
         Mean stage costs that the model predicts from the initial fields of the trajectories, of its
         law and of the law to compare with; infinite where there is none, or it runs away.
@@ -95,8 +95,8 @@ class FieldLaw:
             f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
         ]
         if self.rows is None:
-            return [*lines, "  it is not believed: the law is that of the regression"]
-        taken = "its law is taken" if self.better else "the law of the regression is taken"
+            return [*lines, "  it is not accurate enough: the law is that of the regression"]
+        taken = "its law is used" if self.better else "the law of the regression is used"
         costs = (
             f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
         )
@@ -121,8 +121,8 @@ def best_model(
 ) -> FittedModel | None:
     """The model of the whole field that predicts the trajectories best, or pieces of them.
 
-    Pieces, as a chaotic plant forgets where it began. The work grows with the third power of the size
-    of the state, so that there is a largest one.
+    Pieces, because the state of a chaotic plant soon becomes independent of its initial field. The work
+    grows with the third power of the size of the state, so there is a largest one.
     """
     if len(target) > settings.field_largest:
         return None

@@ -119,8 +119,8 @@ def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: A
     radius = float(np.abs(poles).max())
     if not radius < 1.0:
         raise DesignError(
-            f"the filter's errors must decay, but their spectral radius is {radius:.17g}: the readings "
-            "hardly see a mode that does not decay; add sensors where it is large"
+            f"the filter's errors must decay, but their spectral radius is {radius:.17g}: the "
+            "readings hardly observe a mode that does not decay; add sensors where it is large"
         )
     return Filter(M, P, poles)
 
@@ -144,9 +144,9 @@ def require_detectable(A: Array, C: Array) -> None:
             turns = abs(np.angle(eigenvalue))
             wave = f" and turns by {turns:.3g} rad" if 0.0 < turns < np.pi else ""
             raise DesignError(
-                f"the readings do not see a mode that grows by the factor {growth:.6g} a step{wave} "
-                f"(smallest singular value of [lambda I - A; C] {seen:.1e}), so that no filter can "
-                "follow it: move or add sensors so that it is not 0 at all of them"
+                f"the readings do not observe a mode that grows by the factor {growth:.6g} a "
+                f"step{wave} (smallest singular value of [lambda I - A; C] {seen:.1e}), so no "
+                "filter can estimate it: move or add sensors so that it is not 0 at all of them"
             )
 
 
@@ -232,7 +232,7 @@ def law_of_innovations(
     action_weight: float,
     cost: Cost | None = None,
 ) -> ModelRows:
-    """The LQG law of a model in innovation form, for the cost of what is measured.
+    """The LQG law of a model in innovation form, for the cost of the measurements.
 
     The gains K_a are those of the state x, of which y = U C x is the target. s = C^+ U^T z is the least
     state with a measurement z; as A M = G gives the innovations' gain in the estimate after it,

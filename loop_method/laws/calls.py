@@ -26,7 +26,7 @@ _blas: tuple[int, ThreadpoolController] | None = None
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One LAPACK thread meanwhile: more of them round otherwise."""
+    """One LAPACK thread during the call, because the number of threads changes the rounding."""
     global _blas
     if _blas is None or _blas[0] != len(sys.modules):  # another library may have been loaded
         _blas = len(sys.modules), ThreadpoolController()
@@ -66,7 +66,7 @@ def _checked(kind: type[Law], model: ModelRows, horizon: int, cost: Cost | None)
         _called(kind.name, "start", law.start)  # by itself, so that an error names its line
         start = _called(kind.name, "start", lambda: law.theta_start)
         if not start.size or not np.isfinite(start).all():
-            raise OwnCodeError(f"{kind.name}.start must give finite numbers, one at the least")
+            raise OwnCodeError(f"{kind.name}.start must return finite numbers, at least one")
         if kind is not Affine:
             _check_actions(law)
     return law
@@ -79,13 +79,13 @@ def _check_actions(law: Law) -> None:
         acted = action(law, law.parts(theta), z, first, 0)
         if acted.any() and not theta.any():
             raise OwnCodeError(
-                f"{law.name}.action gives an action other than zero for theta = 0, which must be "
-                "no control: every law is compared with it"
+                f"{law.name}.action returns a non-zero action for theta = 0, which must mean no "
+                "control: every law is compared with it"
             )
         if law.compiled and not np.allclose(_by_gains(law, theta, z), acted):
             raise OwnCodeError(
-                f"{law.name}.gains must be [K_a K_b] of the law that {law.name}.action computes, but "
-                "they give another action"
+                f"{law.name}.gains must be [K_a K_b] of the law that {law.name}.action computes, "
+                "but they give a different action"
             )
 
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Laws by name: ours, an entry point of another package, or code of one's own.
+"""Laws by name: ours, an entry point of another package, or code of the user's.
 
 Which code may be run: `loop_interfaces.own_code`.
 """

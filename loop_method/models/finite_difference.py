@@ -128,7 +128,7 @@ class FiniteDifferenceModel:
         _, components, n_x = coefficients.shape
         features = tuple((tuple(row[1 : 1 + row[0]]), row[-1]) for row in table.tolist())
         if known := set(features) - set(features_of(components, MOST_FACTORS)):
-            raise ValueError(f"a model has terms that no model has: {shown(sorted(known))}")
+            raise ValueError(f"a model has unknown terms: {shown(sorted(known))}")
         return FiniteDifferenceModel(
             text_of(arrays, "kind"),
             features,

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fit of an equation whose coefficients depend on the place.
 
-As in `spectral_fit` a sampling time is integrated with the present equation and bent to end in the
+As in `spectral_fit` a sampling time is integrated with the current equation and bent to end in the
 measured state; the change z_{k+1} - z_k is then linear in the coefficients, each with the mean of its
 feature on the way. Coefficients are the sum of one that all points share and a part of each point's
 own, which a ridge holds at zero where the data say nothing of it.

@@ -82,7 +82,7 @@ def kinds_of(
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
         ]
     kinds += _several_fields(n_z, components, settings)
-    if components == 1:  # two fields, of which nobody has told
+    if components == 1:  # two fields that were not declared
         two = _several_fields(n_z, 2, settings, "two-")
         # Linear ones are tried early, as that is quick.
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]

@@ -108,7 +108,7 @@ def fit_convolution(
 ) -> LinearModel | None:
     """Least squares where A is the same at every place of a ring: circulant blocks.
 
-    Each wavenumber has a regression of its own, of `components` unknowns besides the inputs.
+    Each wavenumber has its own regression, with `components` unknowns in addition to the inputs.
 
     ridge: of normalised columns.
     """

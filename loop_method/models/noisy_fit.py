@@ -3,7 +3,7 @@
 
 Two things make the regression of `spectral_fit` fail with noise: within one sampling time the plant
 moves the field hardly further than the noise does, and at wavenumbers without signal the noise of a
-state, which the next one has not, looks like fast decay. So
+state, which is absent from the next one, looks like fast decay. So
 
 1. the states between which the terms of the equation are integrated are those that the present
    equation and the measurements tell together (`filtering`), whose error is a small part of the noise

@@ -6,7 +6,7 @@
 (`loop_method.reduce.subspace`). Of a measured rollout the state x_0 that it began with, which nobody
 knows, is the likeliest one; with it the innovations e_k follow from the readings, and with these the
 model gives the readings again. Under another law it is given the same innovations: the noise, what the
-order leaves out and, as far as it is the same, what is not linear.
+order leaves out and, where it is the same, the nonlinearity.
 
 References
 ----------

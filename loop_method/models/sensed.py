@@ -42,7 +42,7 @@ SHARED = COEFFICIENTS + _ACTUATORS
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
 WAVES = 16
-"""Cosines and sines of an initial field, besides its mean."""
+"""Cosines and sines of an initial field, in addition to its mean."""
 # The least number of grid points.
 _POINTS = 64
 # A linear part that grows faster, in a sampling time, would overflow within an episode.

@@ -7,7 +7,7 @@ Over a sampling time, the unit of time,
     W_p = integral_0^1 e^{L (1 - s)} F[z(s)^p] ds,
 
 is linear in the symbols sigma_p and, through sigma_1 W_1, in a change of L. What is between two samples
-is integrated with the present equation (at first there is none) and bent linearly in time, so that it
+is integrated with the current equation (at first there is none) and bent linearly in time, so that it
 ends in the measured z_{k+1}. So a pass is a linear regression, and a few passes suffice, without a
 start: a plant moves the field far within a sampling time, but an equation from bent paths of the wrong
 equation is nearly right. B and c are free at every wavenumber and are projected out first. A pass is no

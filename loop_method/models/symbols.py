@@ -73,9 +73,9 @@ class Form:
 class Regression:
     """A pass: y = (L' - L) W_1 + sum_p sigma_p W_p + phi_1(L) F[B a + c], weighted.
 
-    symbols (P, modes): the present ones, L first; y (N, modes); W (P, N, modes); phi (modes,); common
+    symbols (P, modes): the current ones, L first; y (N, modes); W (P, N, modes); phi (modes,); common
     (N, n_a + 1): the columns of B and c; free_of_common: orthonormal columns of their space; miss: by
-    how much the present equation misses the samples.
+    the residual of the current equation at the samples.
     """
 
     symbols: Spectrum
@@ -155,7 +155,7 @@ def free_linear(data: Regression, form: Form, settings: FieldModelSettings) -> S
 
 
 def all_free(data: Regression, settings: FieldModelSettings) -> Symbols:
-    """All symbols free at every wavenumber, held to the present ones where the data say nothing."""
+    """All symbols free at every wavenumber, near the current ones where data do not determine them."""
     rests, y = np.stack([data.rest(W) for W in data.W]), data.rest(data.y)
     ridge = settings.coefficient_ridge * np.sum(np.abs(data.W) ** 2, axis=1).T
     ridge = np.where(ridge > 0.0, ridge, 1.0)  # (wavenumbers, P)

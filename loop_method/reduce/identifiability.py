@@ -69,7 +69,7 @@ class IdentifiabilityWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """How well data determine the model that is to be identified from them.
+    """How well data determine the model to be identified from them.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def examine(
 
 
 def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) -> Identifiability:
-    """Examine whether an exploration tells the effects of its inputs apart, for a model of any order.
+    """Examine whether an exploration separates the effects of its inputs, for a model of any order.
 
     trajectory : (states (N + 1, n_z), actions (N, n_a))
     """

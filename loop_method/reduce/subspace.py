@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A model in innovation form from what is measured: predictor-based subspace identification.
+"""A model in innovation form from measurements: predictor-based subspace identification.
 
     x_{k+1} = A x_k + B a_k + G e_k,        y_k = U (C x_k + e_k)
 

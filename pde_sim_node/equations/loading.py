@@ -30,7 +30,7 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
 
 
 def load_equation(name: str) -> type[Equation]:
-    """The equation class that ``name`` stands for. This executes code, whoever wrote it.
+    """The equation class that ``name`` stands for. This executes code, whatever its origin.
 
     Parameters
     ----------

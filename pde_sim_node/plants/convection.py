@@ -6,7 +6,7 @@
 
 No slip; adiabatic sides; T = -1/2 on the upper wall and 1/2 + a_j on ten equal parts of the lower one.
 Actions are made to have mean zero and then divided by max(1, max|a| / bound), as in beacon's task
-`rayleigh-v0`. The conducting state u = 0, T = 1/2 - y is to be held; above Ra = 2585 it is unstable. An
+`rayleigh-v0`. The conducting state u = 0, T = 1/2 - y must be held; above Ra = 2585 it is unstable. An
 episode begins with the convection that develops without control.
 
 Staggered grid: T in the centres of n x n cells, u and v in the middle of their left and lower faces.
@@ -39,7 +39,7 @@ _STARTED = 100.0
 
 
 class Convection(Dynamics):
-    """A fluid that is heated from below and is to be kept at rest.
+    """A fluid heated from below, to be kept at rest.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ def from_gymnasium(
     try:
         made: Env[Any, Any] = gymnasium.make(env) if isinstance(env, str) else env
     except gymnasium.error.Error as error:
-        raise ValueError(f"Gymnasium makes no environment {shown(env)}: {error}") from error
+        raise ValueError(f"Gymnasium cannot make the environment {shown(env)}: {error}") from error
     if not isinstance(made, gymnasium.Env):
         raise ValueError(f"env must be a gymnasium.Env or the id of one, got {shown(made)}")
     limit = made.spec.max_episode_steps if made.spec is not None else None
@@ -82,7 +82,7 @@ def from_gymnasium(
         if not isinstance(space, gymnasium.spaces.Box):
             raise ValueError(f"the {what} space of {made} must be a Box, got {space}")
     if not (horizon or limit):
-        raise ValueError(f"{made} limits no episode: give horizon")
+        raise ValueError(f"{made} has no limit on the length of an episode: give horizon")
     return GymnasiumPlant(
         made,
         target=target,
@@ -147,7 +147,7 @@ class GymnasiumPlant(BatchPlant):
 
     def _initial_states(self, seeds: NDArray[Any]) -> Array:
         if seeds.ndim == 2:
-            raise ValueError(f"{self!r} begins from seeds only: its state cannot be set")
+            raise ValueError(f"{self!r} starts from seeds only: its state cannot be set")
         return super()._initial_states(seeds)
 
     def _draw(self, seed: int) -> Array:
@@ -235,4 +235,4 @@ class GymnasiumPlant(BatchPlant):
         return space.low, space.high
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
-        raise ValueError(f"{self!r} computes no step of a given state: its state cannot be set")
+        raise ValueError(f"{self!r} cannot step from a given state: its state cannot be set")

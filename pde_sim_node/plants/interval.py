@@ -143,7 +143,7 @@ class Interval(Dynamics):
             raise ValueError(
                 f"diffusivity must be positive, got {min(at.min(), inner.min()):g} somewhere"
             )
-        # Beyond the walls as far as a straight line leads, which leaves the order.
+        # Extrapolated linearly beyond the walls, which keeps the order.
         return np.concatenate([[2 * at[0] - inner[0]], inner, [2 * at[-1] - inner[-1]]])
 
     def _place_inputs(

@@ -153,7 +153,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
         for name, value in arguments.items()
         if _storable(value) or not _is_default(kind, name, value)
     }
-    if not isinstance(plant, Dynamics):  # nobody knows what it was made with
+    if not isinstance(plant, Dynamics):  # its arguments are unknown
         stored = {"plant": f"{OBJECT} {plant.definition.fingerprint}"}
     name = OWN_PLANTS.allow(name_of(kind))
     _objects[_key(name, stored)] = Made(plant, stored)

@@ -65,7 +65,7 @@ class VariableDiffusion:
         inner = 0.5 * (D[1:] + D[:-1])
         if self._walls == "periodic":
             first = last = 0.5 * (D[:1] + D[-1:])
-        else:  # as far as a straight line leads, which leaves the order
+        else:  # linear extrapolation, which keeps the order
             first, last = 1.5 * D[:1] - 0.5 * D[1:2], 1.5 * D[-1:] - 0.5 * D[-2:-1]
         return np.moveaxis(np.concatenate([first, inner, last]), 0, axis)
 

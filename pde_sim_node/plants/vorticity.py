@@ -29,7 +29,7 @@ from pde_sim_node.dynamics import Dynamics, arguments_of
 
 
 class Kolmogorov(Dynamics):
-    """A shear flow that is to be kept laminar.
+    """A shear flow to be kept laminar.
 
     Parameters
     ----------

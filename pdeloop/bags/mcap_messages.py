@@ -148,7 +148,7 @@ class _WholeReads:
 def _whole_records(file: IO[bytes], size: int) -> Iterator[McapRecord]:
     """The records of a file up to its last whole one."""
     if file.read(len(MAGIC)) != MAGIC:
-        raise ValueError("it is empty or no MCAP file")
+        raise ValueError("it is empty or not an MCAP file")
     stream = cast("IO[bytes]", _WholeReads(file, size))
     with contextlib.suppress(EndOfFile, RecordLengthLimitExceeded):
         yield from StreamReader(
@@ -172,7 +172,7 @@ def _decompressed(chunk: Chunk) -> Chunk:
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise ValueError(str(error)) from error
     if len(data) != size:
-        raise ValueError("the content of a chunk is not of the size that it says")
+        raise ValueError("the content of a chunk does not have the declared size")
     return replace(chunk, compression="", data=data)
 
 

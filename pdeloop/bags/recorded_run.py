@@ -104,7 +104,7 @@ class RecordedRun:
             self._miss_unfollowed()
 
     def _follow(self, claims: RunClaims | None) -> bool:
-        """Run the training again; whether it could be followed to where it is to be."""
+        """Run the training again; whether it could be followed to its recorded end."""
         if self._values is None or not (self._rollouts or claims):
             return False
         if unknown := [name for name in _TUNERS if name not in self._given]:
@@ -154,7 +154,7 @@ class RecordedRun:
         return claims is None and first // EPISODES_PER_START > 1 and not gaps({first})
 
     def _miss_unfollowed(self) -> None:
-        """Name what is missing where no training tells what was asked for."""
+        """Name what is missing where no training shows what was asked for."""
         if between := gaps(self._numbers):
             self._report.missing.append(f"{self._name}: {gaps_text(between)}")
         if lost := [place for key, place in self._rollouts.items() if key not in self._complete]:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The claims of a run's folder about its training, to compare its bags with."""
+"""What a run's folder claims about its training, for comparison with its bags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RunClaims:
     result : dict or None
         The content of result.json; None for a training that is not finished.
     paid : dict of int to int
-        Rollouts by seed that the training had used, at the least.
+        Minimum number of rollouts, by seed, that the training had used.
     parameters : dict
         Those in run.json that define the run.
     unreadable : list of str

@@ -23,10 +23,10 @@ def add(commands: Commands) -> None:
         commands,
         "animate",
         _animate,
-        help="a moving picture of a run: no control, LQT and the adapted law",
-        description="An episode of a finished run without control, with LQT and with the adapted law "
-        "side by side, from the same initial field and in the same colours, as GIF, or as MP4 where "
-        "ffmpeg is installed.",
+        help="animation of a run: no control, LQT and the adapted law",
+        description="Show an episode of a finished run without control, with LQT and with the "
+        "adapted law side by side, from the same initial field and in the same colours, as a GIF, "
+        "or as an MP4 if ffmpeg is installed.",
         example="pdeloop animate runs/burgers --out burgers.gif",
     )
     add = animate.add_argument

@@ -26,7 +26,7 @@ def add(commands: Commands) -> None:
         "bag",
         None,
         help="inspect or verify a recorded bag",
-        description="Look into a bag that --record or recorder_node wrote, or verify it "
+        description="Inspect or verify a bag written by --record or recorder_node "
         "(docs/recording.md).",
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )

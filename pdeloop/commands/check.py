@@ -37,12 +37,13 @@ def add(commands: Commands) -> None:
         commands,
         "check",
         _check,
-        help="whether a problem can be trained on, or a node of your own keeps to the protocol",
-        description="Check a problem before training on it: halve the integration step, see whether "
-        "the actuators reach the modes that are unstable at the target, explore once, say which order "
-        "the data support and what the first law costs, and draw fields and supports. Exit code "
-        "1 if anything is not as it should be. With plant, controller or tuner instead of a FILE: "
-        "whether such a node of yours, alone in this ROS_DOMAIN_ID, keeps to docs/stand-in.md.",
+        help="check a problem before training, or a node of your own against the protocol",
+        description="Check a problem before training on it: halve the integration step, see "
+        "whether the actuators reach the modes that are unstable at the target, explore once, "
+        "report which order the data support and the cost of the first law, and draw fields and "
+        "supports. Exit code 1 if a check fails. With plant, controller or tuner instead of a "
+        "FILE, check that a node of your own, alone in this ROS_DOMAIN_ID, conforms to "
+        "docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
     check.add_argument(

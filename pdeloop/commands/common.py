@@ -52,7 +52,9 @@ def a_path(text: str) -> Path:
     try:
         str(Path(text).absolute()).encode()
     except UnicodeEncodeError:  # YAML, JSON and HTML that name it could not be written
-        raise argparse.ArgumentTypeError(f"{text!a} is no UTF-8; take another name") from None
+        raise argparse.ArgumentTypeError(
+            f"{text!a} is not valid UTF-8; choose another name"
+        ) from None
     return Path(text)
 
 
@@ -63,7 +65,7 @@ _OWN_CODE = {
     "law": "the control law",
 }
 _NAMED_ANEW = ("optimizer", "law")
-"""Code of one's own whose flag is also among those of a group."""
+"""User code whose flag is also among those of a group."""
 
 
 def spellings(flag: str) -> tuple[str, ...]:
@@ -115,7 +117,8 @@ def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) 
         if named is not None and identity(named) not in map(identity, known):
             theirs = ", ".join(filter(None, known)) or "none"
             raise ParameterError(
-                f"--{word} is {named}, and that of the run is {theirs}; leave it out, or name the run's"
+                f"--{word} is {named}, but that of the run is {theirs}; leave it out, or name the "
+                "run's"
             )
 
 

@@ -16,10 +16,10 @@ def add(commands: Commands) -> None:
         "compare",
         _compare,
         help="costs of finished runs side by side, and the parameters that differ",
-        description="Show the costs of finished runs in one table, each adapted policy against the "
-        "first one's on the same initial fields, with a bootstrap interval of 95 percent over the "
-        "fields, and the parameters in which the runs differ. Where these change the plant, the cost "
-        "or the fields, the costs are not compared.",
+        description="Show the costs of finished runs in one table, each adapted policy against "
+        "that of the first run on the same initial fields, with a 95 percent bootstrap interval "
+        "over the fields, and the parameters in which the runs differ. Where these change the "
+        "plant, the cost or the fields, the costs are not compared.",
         example="pdeloop compare runs/a runs/b",
     )
     compare.add_argument(

@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
         trains=False,
     )
     add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
-    add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
+    add_json(evaluate, "print the costs as JSON: {controller: [[cost per field] per seed]}")
 
 
 def _evaluate(options: argparse.Namespace) -> int:

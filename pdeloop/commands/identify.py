@@ -32,8 +32,8 @@ def add(commands: Commands) -> None:
         help="reduced model from recorded episodes or your own measurements",
         description="Identify a reduced model by least squares in reduced coordinates, design "
         "LQ-tracking gains, and show which order the data support: singular values, and errors on "
-        "held-out steps. The data are the exploratory episodes of a bag (all of its episodes if "
-        "none explores), whatever plant it is of, or measurements in a file.",
+        "held-out steps. The data are the exploratory episodes of a bag of any plant (all episodes "
+        "if none explores), or measurements in a file.",
         example="pdeloop identify --data examples/measurements.csv --out model.npz",
     )
     source = identify.add_mutually_exclusive_group(required=True)
@@ -51,18 +51,18 @@ def add(commands: Commands) -> None:
     add(
         "--states",
         metavar="NAME,...",
-        help="the columns of the state: names or patterns like 'T*'; columns of no kind are left out "
+        help="the columns of the state: names or patterns like 'T*'; other columns are ignored "
         "[those that begin with z]",
     )
     add("--inputs", metavar="NAME,...", help="the columns of the inputs [those that begin with a]")
-    add("--sample-time", type=float, metavar="S", help="where no column has times")
+    add("--sample-time", type=float, metavar="S", help="sampling time, if no column holds times")
     add = identify.add_argument
     add(
         "--target",
         type=_numbers,
         metavar="X,X,...",
-        help="the state to be reached, a number for each of the state [that of the data; without any "
-        "only a model is identified]",
+        help="the target state, one number per entry [that of the data; without a target only a "
+        "model is identified]",
     )
     add(
         "--order",
@@ -74,7 +74,7 @@ def add(commands: Commands) -> None:
         "--identification",
         choices=IDENTIFICATION.choices,
         help="field: a model of the whole field where its law is better; regression: least squares "
-        "with the inputs whole; subspace: a model with its filter, from measurements alone; dmdc: "
+        "in reduced coordinates; subspace: a model with its filter, from measurements alone; dmdc: "
         "truncated DMDc [that of the run, or regression]",
     )
     add_own_code(identify, ("law",))
@@ -121,7 +121,7 @@ def _identify(options: argparse.Namespace) -> int:
             if getattr(options, name) is not None:
                 flag = f"--{name.replace('_', '-')}"
                 raise ParameterError(
-                    f"{flag} is of --data; a bag has names and times: leave it out"
+                    f"{flag} applies to --data only; a bag has names and times: leave it out"
                 )
         found = identify_bag(
             options.bag,

@@ -20,11 +20,11 @@ def add(commands: Commands) -> None:
         commands,
         "monitor",
         _monitor,
-        help="a page that shows a loop as it runs",
-        description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
-        "the profile against the target, the training curve, the nodes, and buttons to pause. "
-        "Without DIR and ROS_DOMAIN_ID it shows the newest training on this machine, "
-        "and the next one when that has ended. Ctrl-C ends it; the loop never waits for it.",
+        help="live page of a running loop",
+        description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the "
+        "actions, the profile against the target, the training curve, the nodes, and buttons to "
+        "pause. Without DIR and ROS_DOMAIN_ID it shows the newest training on this machine, then "
+        "the next one. Ctrl-C ends it; the loop never waits for it.",
         example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
     )
     add = monitor.add_argument
@@ -88,7 +88,7 @@ def _monitor(options: argparse.Namespace) -> int:
         server = Server(page, options.port)
     except OSError as error:
         raise ParameterError(
-            f"port {options.port} on 127.0.0.1 cannot be had ({os.strerror(error.errno or 0)}); "
+            f"port {options.port} on 127.0.0.1 is not available ({os.strerror(error.errno or 0)}); "
             "choose another with --port N, or a free one with --port 0"
         ) from error
     server.start()

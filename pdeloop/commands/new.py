@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`pdeloop new NAME`: a folder with a PDE or plant that runs, to be changed into one's own."""
+"""`pdeloop new NAME`: a folder with a working PDE or plant, as a template."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
     """
     if len(name) > 60 or not _NAME.fullmatch(name):
         raise ParameterError(
-            f"'{name[:80]}' cannot be the name of a problem; expected small letters, digits, '-' and "
-            "'_', beginning with a letter, such as my-pde"
+            f"'{name[:80]}' cannot be the name of a problem; expected lower-case letters, digits, "
+            "'-' and '_', beginning with a letter, such as my-pde"
         )
     module = name.replace("-", "_")
     words = module.split("_")
@@ -51,7 +51,7 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
     try:
         folder.mkdir()
     except FileExistsError:
-        raise ParameterError(f"{folder} is there already; take another name") from None
+        raise ParameterError(f"{folder} already exists; choose another name") from None
     own = ("plant.py", "plant.yaml", "test_plant.py")
     templates = own if plant else ("equation.py", "problem.yaml", "test.py")
     names = (f"{module}.py", f"{name}.yaml", f"test_{module}.py")
@@ -96,16 +96,16 @@ def add(commands: Commands) -> None:
         commands,
         "new",
         _new,
-        help="write class, YAML and test of a PDE or plant of your own, as a start",
-        description="Write a folder with the class, the YAML file and the test of a PDE that runs, or "
-        "of any other plant, to be changed into your own (docs/bring-your-own.md).",
+        help="write a template for a PDE or plant of your own: class, YAML file and test",
+        description="Write a folder with the class, YAML file and test of a working PDE, or of any "
+        "other plant, as a template for your own (docs/bring-your-own.md).",
         example="pdeloop new my-pde",
     )
     new.add_argument("name", metavar="NAME", help="name of the problem and of its new folder")
     new.add_argument(
         "--plant",
         action="store_true",
-        help="of a plant, for which any solver will do, instead of a periodic spectral PDE",
+        help="a plant, with any solver, instead of a periodic spectral PDE",
     )
 
 

@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     )
     add_own_code(report, ("equation", "plant", "optimizer", "law"))
     report.add_argument(
-        "--animate", action="store_true", help="with a moving picture, as of `pdeloop animate`"
+        "--animate", action="store_true", help="also make the animation of `pdeloop animate`"
     )
     report.add_argument(
         "--out", type=a_path, metavar="DIR", help="folder of the report [DIR/report]"

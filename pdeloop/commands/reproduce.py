@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
         help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
         f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
     )
-    add_set(reproduce, "for all trainings, any parameter")
+    add_set(reproduce, "any parameter, for all trainings")
     add_own_code(reproduce)
     add_execution(reproduce)
 

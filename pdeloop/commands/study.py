@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
         metavar="STUDY.yaml",
         help="problems, seeds, variants, settings",
     )
-    add_set(study, "for all trainings, any parameter")
+    add_set(study, "any parameter, for all trainings")
     add_own_code(study, ("equation", "plant", "optimizer", "law"))
     add_execution(study)
 
@@ -57,7 +57,7 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
     """The flags that say where a study's trainings run, and what is printed; see `carry_out`."""
     name, add = parser.prog.rpartition(" ")[2], parser.add_argument
     add("--out", type=a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
-    add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
+    add("--processes", type=int, metavar="N", help="trainings at the same time [one per core]")
     add(
         "--scheduler",
         metavar="ADDRESS",
@@ -66,8 +66,8 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
     add(
         "--any-environment",
         action="store_true",
-        help="also take results of workers with other versions or another processor, which may differ "
-        "in the last bits",
+        help="also accept results of workers with other versions or another processor, which may "
+        "differ in the last bits",
     )
     add_json(parser, "print the table as JSON; progress goes to stderr")
 

@@ -31,8 +31,8 @@ def add(commands: Commands) -> None:
         _train,
         help="identify, design, adapt and evaluate",
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
-        "them from rollouts, evaluate. The plant, the controller and the tuner run as ROS 2 "
-        "nodes in processes of their own.",
+        "them from rollouts, evaluate. The plant, the controller and the tuner run as ROS 2 nodes "
+        "in separate processes.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
     problem = train.add_argument_group("problem")
@@ -130,6 +130,6 @@ def _train(options: argparse.Namespace) -> int:
     given |= own
     problem = options.problem or ""
     if options.sensor_delays is not None and not resolve(problem, given)["sensors"]:
-        raise ParameterError("--sensor-delays goes with --sensors N, or a problem with sensors")
+        raise ParameterError("--sensor-delays needs --sensors N, or a problem with sensors")
     folder, values = begin(problem, given, options.out, transport)
     return run(folder, values, transport, options.json)

@@ -223,7 +223,7 @@ class ControllerCheck(Check):
         first = np.abs(drawn[:, 0])
         require(np.ptp(drawn, axis=0).any(), "others in each step", "the same in all")
         if (first == first.max()).sum() > 1:
-            raise NoteError("they saturate, so that their variance is not seen")
+            raise NoteError("they saturate, so their variance cannot be measured")
         covariance = drawn.T @ drawn / len(drawn)
         good = np.abs(covariance - v * np.eye(self.n_a)).max() < SPREAD * v
         require(good, f"the covariance {v} I", covariance.tolist())
@@ -242,11 +242,11 @@ class ControllerCheck(Check):
         """A and B are those of a linear plant with n_s states, which the gains stabilise."""
         n_s = self.first[1].values.shape[2]
         if self.n_z not in (None, n_s):
-            raise NoteError(f"not looked at, as --n-z is not the order n_s = {n_s}")
+            raise NoteError(f"not checked, as --n-z is not the order n_s = {n_s}")
         explored = self.explore(5, plant=LinearPlant(33, n_s, self.n_a))
         found, plant = self.outcome(explored.cost()), explored.plant
         if not isinstance(found, Frame):
-            raise NoteError(f"not looked at: {self.described(FAILED, found)}")
+            raise NoteError(f"not checked: {self.described(FAILED, found)}")
         m = model_rows.unpack(self.identified(explored).values[0], self.n_a)
         layouts = {
             "A and B": (m.A, m.B),
@@ -295,7 +295,7 @@ class ControllerCheck(Check):
         for i, single in enumerate((one, two)):
             require_same(both.actions[:, i], single.actions[:, 0], f"the actions of row {i} alone")
         if first.values.shape != second.values.shape:
-            raise NoteError("models not looked at, as their order depends on the data")
+            raise NoteError("models not checked, as their order depends on the data")
         expected = np.concatenate([first.values, second.values])
         require_same(self.identified(both).values, expected, "the models of the single rows")
 

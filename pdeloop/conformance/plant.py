@@ -153,7 +153,7 @@ class PlantCheck(Check):
             if step == steps:
                 return []
             if state.values.nbytes * len(states) > MAX_BYTES:
-                raise NoAnswerError(f"expected less than {step} steps; set a smaller horizon")
+                raise NoAnswerError(f"expected fewer than {step} steps; set a smaller horizon")
             if before is not None:
                 before(state)
             actions.append((draw or self.drawn)(step, *rows))
@@ -257,7 +257,7 @@ class PlantCheck(Check):
         more = [self.episode(row)[0] for row in ((1, 0), (2, 0), (3, 3))]
         traces = [t for t in (self.reference, self.second, *more) if t.cost[2] == COMPLETED]
         if len(traces) < 5:
-            raise NoteError("not looked at, as the plant diverges")
+            raise NoteError("not checked, as the plant diverges")
         sums = [_sums(trace, self.z_r.values) for trace in traces]
         totals = np.array([trace.cost[1] for trace in traces])
         misses = {what: _miss(np.array([s[what] for s in sums]), totals) for what in sums[0]}

@@ -61,7 +61,7 @@ class Transport(Protocol):
         """The next message of these topics; None if none comes in time."""
 
     def wait_delivered(self) -> None:
-        """Wait until what was sent has arrived, a second at the most."""
+        """Wait until sent messages have arrived, for at most a second."""
 
 
 class Check(ABC):

@@ -99,7 +99,7 @@ class TunerCheck(Check):
             self.answer()
             self.advance()
         if not self.start.values.size:
-            raise NoteError(f"not looked at, as the run ended after {self.rollouts} rollouts")
+            raise NoteError(f"not checked, as the run ended after {self.rollouts} rollouts")
         return self.start
 
     def again(self, on: Topic, expected: Array) -> None:
@@ -203,7 +203,7 @@ class TunerCheck(Check):
         try:
             start = self.expect("another run", lambda _, frame: frame.values.size > 0, START)[1]
         except NoAnswerError as error:
-            raise NoteError("not looked at: start the tuner again when its run is over") from error
+            raise NoteError("not checked: start the tuner again when its run is over") from error
         require(start.run != self.run, "another id", f"{start.run} again")
 
     probes = (

@@ -11,7 +11,7 @@
 
 An observation is the state as it is measured, an action is held for a sampling time, and the reward
 is minus the stage cost, (z - z_r)'Q(z - z_r) + a'R a of the state before the step. An episode is
-truncated at the horizon, and terminated where the plant diverges, which costs a penalty besides.
+truncated at the horizon, and terminated where the plant diverges, which also costs a penalty.
 
 `reset(seed=s)` begins with the initial field of seed s, so that the episode is `Plant`'s to the bit;
 resets without a seed draw the seeds of further fields. `gymnasium.make_vec(..., num_envs=M)` advances

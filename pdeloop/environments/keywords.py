@@ -42,7 +42,9 @@ def plant_of(source: Source, parameters: Mapping[str, Any], num_envs: int) -> Pl
     known = {spec.name for spec in table()}
     for name in parameters:
         if name in OTHERS:
-            raise ValueError(f"an environment takes no {name!r}; did you mean {OTHERS[name]}?")
+            raise ValueError(
+                f"an environment has no parameter {name!r}; did you mean {OTHERS[name]}?"
+            )
         if name in known - plants_own:
             raise ValueError(
                 f"{name!r} is a parameter of the nodes or of the method that adapts a law, and has no "

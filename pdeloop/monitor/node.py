@@ -85,7 +85,7 @@ class MonitorNode:
             loop.every(period, callback)
 
     def run(self) -> str:
-        """Run until a signal comes, or another loop is to be shown; the reason."""
+        """Run until a signal comes, or another loop must be shown; returns the reason."""
         return self._loop.run()
 
     def _begin(self, namespace: str | None) -> None:
@@ -140,7 +140,7 @@ class MonitorNode:
             self._page.refresh(self._loop.now())
 
     def _poll_graph(self) -> None:
-        """Update which nodes there are, and which loop is to be shown."""
+        """Update which nodes there are, and which loop must be shown."""
         if self._finder.find() != self._live:
             self._loop.stop("moved")
         if self._reader is not None:
@@ -169,7 +169,7 @@ class MonitorNode:
         self._page.refresh(self._loop.now())
 
     def _namespaces(self) -> list[str]:
-        """Namespaces in which somebody publishes what a node of a loop does."""
+        """Namespaces with a publisher of a topic of the loop's nodes."""
         found = set()
         for name, _ in self._node.get_topic_names_and_types():
             for topic in ROLES.values():

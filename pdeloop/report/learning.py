@@ -156,7 +156,15 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
             below = min(std, 0.9 * mean)  # the axis may be logarithmic
             ax.errorbar(i, mean, [[below], [std]], color="0.5", linewidth=0.9, capsize=3)
             number = f"{mean:#.3g}".rstrip(".") + star
-            ax.text(i, mean + std, number, ha="center", va="bottom", fontsize=8)
+            ax.annotate(
+                number,
+                (i, mean + std),
+                xytext=(0, 2),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                fontsize=8,
+            )
             high, most, low = max(high, mean + std), max(most, mean), min(low, mean)
         if most > TENFOLD * low > 0:  # else the bars of the good ones could not be told apart
             plain_log(ax, 2 * high / low)

@@ -245,7 +245,7 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
         share = 100 * (1 - cost / lqt)
         said.append(f"{abs(share):.1f} % {'below' if share >= 0 else 'above'} {NAMES['lqt']}")
     if isfinite(none) and none > 0:
-        said.append(f"{100 * cost / none:.3g} % of the cost without control is left")
+        said.append(f"{100 * cost / none:.3g} % of the cost without control remains")
     outcome = problem.runs[best].result.get("outcome", [])
     said += differences(problem.runs[best].result)
     for own in {own["verdict"]: own for own in outcome if own["verdict"] != "better"}.values():

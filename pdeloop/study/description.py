@@ -107,7 +107,7 @@ class Study:
             file = str(beside.resolve()) if beside.is_file() else word
             name = str(read_problem(find_problem(file)).get("problem", Path(file).stem))
             if not _NAME.fullmatch(name) or name in files:
-                raise StudyError(f"problem '{name}' of {file}; expected names that differ")
+                raise StudyError(f"problem '{name}' of {file}; expected different names")
             files[name] = file
         return cls(files, tuple(sorted(set(seeds))), variants, settings, curves)
 

@@ -82,7 +82,7 @@ def cluster(address: str) -> Iterator[Executor]:
             )
         known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
         _check_versions(known, own)
-        # A worker would end at a task of a package that it has not.
+        # A worker would end at a task of a package that it lacks.
         installed = client.run(metadata.version, "pdeloop", on_error="return")
         for at, version in installed.items():
             if isinstance(version, Exception):

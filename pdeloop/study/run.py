@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Carries a study out, or on: what is not in its folder yet is trained.
+"""Carries out a study, or continues it: trains what its folder does not have yet.
 
 DIR/study.json                what was asked for
 DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a finished training, with
@@ -131,7 +131,7 @@ def run(
                 if isinstance(pool, ProcessPoolExecutor):  # of this machine: once for all of them
                     for values in {v["equation"]: v for v in todo.values()}.values():
                         load_compiled(values)
-                write_study(folder, study)  # not before there is somebody to train
+                write_study(folder, study)  # not before there are workers
                 waiting = {
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
                     for n, v in todo.items()
@@ -170,7 +170,7 @@ def _collect(
             except EnvironmentMismatchError as error:
                 raise StudyError(
                     f"{error}: its results may differ in the last bits; install the same "
-                    "everywhere, or take them with --any-environment"
+                    "everywhere, or accept them with --any-environment"
                 ) from error
             except (BrokenExecutor, CancelledError):
                 raise

@@ -133,7 +133,7 @@ def test_a_memory_that_is_not_known_is_never_made_up() -> None:
     with pytest.raises(MemoryUnknownError, match="before step 2 are not known"):
         batch.actions(2, states[2])
     batch.actions(1, states[1])
-    with pytest.raises(MemoryUnknownError, match="two different states came for step 1"):
+    with pytest.raises(MemoryUnknownError, match="two different states arrived for step 1"):
         batch.actions(1, states[1] + 1e-9)
     batch.forget_answers()
     with pytest.raises(MemoryUnknownError, match=r"step \d"):

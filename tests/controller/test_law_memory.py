@@ -105,7 +105,7 @@ def test_two_states_of_one_step_take_the_episode_back_also_after_its_end() -> No
         answer(made, k, states)
     failure = answer(made, 3, states + 1e-6)
     assert isinstance(failure, ModelFailure) and not failure.retry
-    assert failure.reason.startswith("two different states came for step 3")
+    assert failure.reason.startswith("two different states arrived for step 3")
 
 
 def test_each_plant_has_a_memory_of_its_own() -> None:

@@ -372,7 +372,7 @@ def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_
     responder.state(Frame(RUN, 1, 3, 0.0, states + 1.0))  # before the plant's
     (failure,) = explore(responder, 1)
     assert isinstance(failure, ModelFailure) and failure.retry
-    assert "two different states came for step 3" in failure.reason
+    assert "two different states arrived for step 3" in failure.reason
     (model,) = explore(responder, 2)
     assert model.topic is MODEL_IDENTIFIED
 
@@ -435,7 +435,7 @@ def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(respo
     last = Frame(RUN, 1, 3, 0.0, plant().reset(np.array([1])) + 1.0, model.frame.plant)
     action, failure = responder.state(last)
     assert action.topic is ACTION
-    assert isinstance(failure, ModelFailure) and "two different states came" in failure.reason
+    assert isinstance(failure, ModelFailure) and "two different states arrived" in failure.reason
     assert len(responder.state(last)) == 1
     assert responder.start(start(1, (1, 2, 0.1, 0))) == [failure]
     assert responder.cost(replace(model.frame, step=30, values=COSTS)) == [failure]
@@ -457,10 +457,10 @@ def test_without_signatures_an_episode_with_two_different_policies_or_models_is_
     responder.start(begin)
     assert handlers[what](told[what]) == []
     assert len(responder.state(state)) == 1
-    with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+    with pytest.raises(FrameError, match=r"two different .* arrived .*; expected one tuner"):
         handlers[what](replace(told[what], values=1.5 * told[what].values))
     assert responder.state(state) == [] and responder.answering(state) is None
-    assert responder.waits_for() == ["one tuner (different policies or models came)"]
+    assert responder.waits_for() == ["one tuner (different policies or models arrived)"]
     # Those of the next one are in no doubt.
     responder.policy(replace(told["policy"], episode=5, step=2))
     responder.model(replace(told["model"], step=2))

@@ -264,7 +264,9 @@ def own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_code_that_only_a_problems_file_names_is_not_run(launched, own_equation: Path) -> None:
     out, own = own_equation.parent / "run", f"{own_equation.parent}/own.py:Own"
-    with pytest.raises(ValueError, match="is code, which is not run because a file names it"):
+    with pytest.raises(
+        ValueError, match="is code, which is not run merely because a file names it"
+    ):
         launched(TRAIN, problem=own_equation, out=out)
     nodes = launched(TRAIN, problem=own_equation, out=out, equation=own)
     assert all(own in node["environment"][ALLOWED].split(",") for node in nodes)

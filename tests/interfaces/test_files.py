@@ -289,7 +289,7 @@ def test_json_that_nothing_can_hold_is_refused(tmp_path):
     path = tmp_path / "result.json"
     for text in ("[" * 100_000, f'{{"a": {"9" * 5000}}}', f'{{"a": {-(2**63) - 1}}}'):
         path.write_text(text)
-        with pytest.raises(FileError, match="is no JSON"):
+        with pytest.raises(FileError, match="is not JSON"):
             read_json(path)
     path.write_text(f'{{"a": {-(2**63)}}}')
     assert read_json(path) == {"a": -(2**63)}
@@ -513,7 +513,7 @@ def test_a_folder_with_a_run_is_refused_with_what_can_be_done_with_that(finished
     words = ["train", str(SMALL), "--in-process", "--out"]
     assert main([*words, str(finished)]) == FAILED
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith(f"see what it came to: pdeloop report {finished}")
+    assert line.endswith(f"see its results: pdeloop report {finished}")
     RunFolder(tmp_path / "begun").create(parameters())
     assert main([*words, str(tmp_path / "begun")]) == FAILED
     (line,) = capsys.readouterr().err.splitlines()

@@ -43,7 +43,7 @@ def test_what_contradicts_messages_on_this_machine_is_left_out_by_name(
 ) -> None:
     found, (remark,) = prepared({**OWN, name: value})
     assert found.get(name) == instead
-    assert remark == f"{name}={value} is left out: the messages stay on this machine"
+    assert remark == f"{name}={value} is ignored: the messages stay on this machine"
     if (name, value) != ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"):
         for open_one in ({NETWORK: "1"}, {PROFILE: "/home/me/profile.xml"}):
             given = {**OWN, **open_one, name: value}
@@ -118,7 +118,7 @@ def test_logs_have_a_folder_where_the_home_cannot_be_written(
     found, (remark,) = with_log_folder({"HOME": str(blocked)})
     assert found["ROS_LOG_DIR"].startswith(f"{tmp_path}/pdeloop-logs-")
     assert "cannot be written: logs go to" in remark and "ROS_LOG_DIR" in remark
-    with pytest.raises(RosEnvironmentError, match=r"ROS_LOG_DIR=.*file cannot be written"):
+    with pytest.raises(RosEnvironmentError, match=r"ROS_LOG_DIR=.*file is not writable"):
         with_log_folder({"HOME": str(tmp_path), "ROS_LOG_DIR": str(blocked)})
 
 

@@ -147,7 +147,9 @@ def test_a_controller_answers_by_the_policy_and_model_that_the_start_signs(topic
         nonlocal count
         count += 1
         for step in (1, 2):  # more of them than are kept are told again, as the tuner's are
-            with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+            with pytest.raises(
+                FrameError, match=r"two different .* arrived .*; expected one tuner"
+            ):
                 handle(replace(true, values=true.values + 1e-3 * (count % 3) + step))
         with contextlib.suppress(FrameError):
             handle(true)
@@ -156,7 +158,7 @@ def test_a_controller_answers_by_the_policy_and_model_that_the_start_signs(topic
         loop.controller = loop.controller_told(**{topic.name: true.values + 1e-3})
     handle = {POLICY: loop.controller.policy, MODEL: loop.controller.model}[topic]
     if first:
-        with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+        with pytest.raises(FrameError, match=r"two different .* arrived .*; expected one tuner"):
             handle(true)
     assert loop.finish(disturb).tobytes() == expected.tobytes()
 
@@ -172,7 +174,7 @@ def test_a_controller_that_cannot_know_the_start_says_so_and_the_episode_is_run_
     controller = Responder(DesignSettings(N_A, N_S, 1.0, 1.0))
     assert controller.start(forged if first else start) == []
     (failure,) = controller.start(start if first else forged)
-    assert "two different starts came for episode" in failure.reason
+    assert "two different starts arrived for episode" in failure.reason
     loop.take(loop.tuner.failure(0, failure, 0.0))
     assert loop.told[START].episode == start.episode + 1
     assert loop.told[START].values.tobytes() == start.values.tobytes()
@@ -211,7 +213,7 @@ def test_a_cost_in_the_middle_of_an_episode_is_contradicted_by_the_controller():
     assert loop.tuner.cost(0, void.frame, 0.0) == []  # a plant started again may say so
     (failure,) = loop.controller.cost(void.frame)
     assert loop.controller.cost(void.frame) == []
-    with pytest.raises(DispatchError, match=r"took back episode .* gave it up at step 3"):
+    with pytest.raises(DispatchError, match=r"withdrew episode .* gave it up at step 3"):
         loop.tuner.failure(0, failure, 0.0)
     assert true.tobytes() == cost.frame.values.tobytes()
 

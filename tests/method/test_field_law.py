@@ -113,7 +113,7 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     assert found is not None and found.fitted is not None and found.rows is None
     assert (
         found.fitted.error > IdentificationSettings().field_error
-        and "not believed" in found.text()[-1]
+        and "not accurate enough" in found.text()[-1]
     )
     rows, plain = (design(noisy, target, settings(name)) for name in ("field", "regression"))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
@@ -169,6 +169,6 @@ def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
         assert predicted == pytest.approx(total / STEPS, rel=1e-2)
     told, known = "\n".join(found.text()), found.summary()
     assert all(kind in told for kind, _ in found.fitted.candidates)
-    assert ("its law is taken" in told) is found.better is (known["law"] == "field")
+    assert ("its law is used" in told) is found.better is (known["law"] == "field")
     nothing = FieldLaw(None)
     assert "regression" in nothing.text()[0] and nothing.summary()["predicted_cost"] is None

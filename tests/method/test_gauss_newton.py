@@ -508,7 +508,7 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
     ("changes", "message"),
     [
         ({"rollouts": 0}, "rollouts must be positive"),
-        ({"policy": np.zeros((2, 6))}, "does not fit a basis"),
+        ({"policy": np.zeros((2, 6))}, "does not match a basis"),
         ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
     ],
 )

@@ -158,8 +158,8 @@ def test_numbers_that_are_not_finite_count_as_large_ones() -> None:
 @pytest.mark.parametrize(
     ("members", "words"),
     [
-        ({"start": lambda self: {}}, "start must give finite numbers, one at the least"),
-        ({"start": lambda self: {"K": np.full((N_A, N_S), np.nan)}}, "start must give finite"),
+        ({"start": lambda self: {}}, "start must return finite numbers, at least one"),
+        ({"start": lambda self: {"K": np.full((N_A, N_S), np.nan)}}, "start must return finite"),
         (
             {"start": lambda self: 1 / 0},
             r"Changed.start fails: .*test_laws.py, line \d+: ZeroDivisionError",
@@ -173,7 +173,7 @@ def test_numbers_that_are_not_finite_count_as_large_ones() -> None:
             },
             "must be .* of the law that Changed.action computes",
         ),
-        ({"action": lambda self, *given: np.ones(N_A)}, "other than zero for theta = 0"),
+        ({"action": lambda self, *given: np.ones(N_A)}, "non-zero action for theta = 0"),
         ({"action": lambda self, *given: np.zeros(3)}, r"shape \(3,\); expected 2 numbers"),
         ({"action": lambda self, *given: None}, "not an array of real numbers; expected 2 numbers"),
         ({"action": lambda self, *given: [][0]}, "Changed.action fails: .*IndexError"),

@@ -105,7 +105,7 @@ def test_a_mode_that_no_reading_sees_is_refused_by_name() -> None:
     with pytest.raises(DesignError, match=r"factor 1.1 a step and turns by 1.57 rad"):
         kalman_filter(turning, np.eye(N)[2:], W, np.eye(2))
     # Two equal modes, which one reading sees only together.
-    with pytest.raises(DesignError, match="do not see"):
+    with pytest.raises(DesignError, match="do not observe"):
         require_detectable(1.1 * np.eye(2), np.array([[1.0, 1.0]]))
 
 

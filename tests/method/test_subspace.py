@@ -116,5 +116,5 @@ def test_data_that_do_not_determine_it_are_refused_by_name() -> None:
         np.eye(1),
         2,
     )
-    with pytest.raises(DesignError, match=r"do not see a mode that grows by the factor 1\.1"):
+    with pytest.raises(DesignError, match=r"do not observe a mode that grows by the factor 1\.1"):
         law_of_innovations(blind, np.zeros(1), state_weight=Q, action_weight=R)

@@ -61,7 +61,7 @@ def test_what_cannot_be_done_with_it_is_refused() -> None:
     plant = pdeloop.from_gymnasium("Pendulum-v1", horizon=300)
     with pytest.raises(ValueError, match="its state cannot be set"):
         plant.evaluate(np.zeros((1, 3)), np.zeros((1, 1)))
-    with pytest.raises(ValueError, match="begins from seeds only"):
+    with pytest.raises(ValueError, match="starts from seeds only"):
         plant.reset(np.zeros((1, 3)))
     with pytest.raises(ValueError, match="process_noise cannot force"):
         InstrumentedPlant(plant, Instruments(process_noise=0.1))
@@ -81,7 +81,7 @@ def test_an_optimiser_that_needs_a_target_is_refused_without_one(
     monkeypatch.setenv("PDELOOP_PLANTS", "")
     words = ["train", "--plant", f"{NAME}:rewarded", "--in-process"]
     assert main(words) == 1
-    assert "learns from a quadratic cost about a target, and this plant has none" in (
+    assert "needs a quadratic cost about a target, which this plant does not have" in (
         capsys.readouterr().err
     )
     budget = ["--rollouts", "40", "--evaluation-fields", "2", "--reduced-order", "3"]
@@ -160,7 +160,7 @@ def test_an_environment_that_misbehaves_is_told_in_a_sentence(env: Any, said: st
 
 
 def test_what_is_no_environment_is_refused() -> None:
-    with pytest.raises(ValueError, match="Gymnasium makes no environment 'Nowhere-v1'"):
+    with pytest.raises(ValueError, match="Gymnasium cannot make the environment 'Nowhere-v1'"):
         pdeloop.from_gymnasium("Nowhere-v1")
     with pytest.raises(ValueError, match=r"must be a gymnasium\.Env"):
         pdeloop.from_gymnasium(object())  # type: ignore[arg-type]

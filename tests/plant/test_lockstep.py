@@ -92,7 +92,7 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
             assert protocol.action(bad, now) == []
         with pytest.raises(FrameError, match="expected an action of shape"):
             protocol.action(replace(wrong, values=wrong.values[:1]), now)
-        with pytest.raises(FrameError, match="has this plant"):
+        with pytest.raises(FrameError, match="holds this plant"):
             protocol.start(start(1, run=99), now)
         (again,) = protocol.start(start(1), now)
         assert again.frame.step == state.step
@@ -121,7 +121,9 @@ def test_two_different_actions_for_one_state_void_the_episode():
     (void,) = protocol.action(answer(quiet[3]), 0.0)
     assert void.topic is COST
     assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
-    assert protocol.contradiction.startswith("two different actions came for step 3 of episode 1;")
+    assert protocol.contradiction.startswith(
+        "two different actions arrived for step 3 of episode 1;"
+    )
     again = run_episode(protocol, 2)
     assert again[-1].values.tobytes() == quiet[-1].values.tobytes()
     assert protocol.contradiction == ""
@@ -181,7 +183,7 @@ def test_a_restarted_plant_repeats_the_episode_to_the_bit():
 def test_a_run_holds_the_plant_until_it_ends_or_falls_silent():
     protocol = plant_protocol()
     protocol.start(start(1), 0.0)
-    with pytest.raises(FrameError, match="has this plant"):
+    with pytest.raises(FrameError, match="holds this plant"):
         protocol.start(start(1, run=12), 5.0)
     assert protocol.start(start(1, run=12), 20.0)[0].frame.run == 12
     assert protocol.start(start(2, seeds=(), run=12), 21.0) == []  # release
@@ -297,7 +299,7 @@ def test_a_run_that_is_served_keeps_the_plant_from_another_by_its_actions_too():
     protocol = plant_protocol()
     (sent,) = protocol.start(start(1), 0.0)
     protocol.action(answer(sent.frame), 9.0)  # a run is forgotten after 10 s
-    with pytest.raises(FrameError, match=f"run {RUN} has this plant"):
+    with pytest.raises(FrameError, match=f"run {RUN} holds this plant"):
         protocol.start(start(1, run=RUN + 1), 18.0)
     assert protocol.start(start(1, run=RUN + 1), 19.0)
 
@@ -483,7 +485,7 @@ def test_an_action_that_contradicts_one_of_an_episode_that_ended_takes_its_cost_
     assert send.topic is COST
     assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)
     assert (send.frame.values[:, CostColumn.ENDED] == VOID).all()
-    assert "two different actions came for step 28 of episode 1" in protocol.contradiction
+    assert "two different actions arrived for step 28 of episode 1" in protocol.contradiction
     assert protocol.action(late, 1.0) == []
     run_episode(protocol, 9)
     assert protocol.contradiction == ""
@@ -517,7 +519,7 @@ def test_two_different_starts_void_the_episode(other):
         (void,) = protocol.start(start(1), 0.0)
         assert void.topic is COST
         assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
-    assert protocol.contradiction.startswith("two different starts came for episode 1;")
+    assert protocol.contradiction.startswith("two different starts arrived for episode 1;")
     assert outcome(run_episode(protocol, 2)) == outcome(quiet)
 
 
@@ -532,7 +534,7 @@ def test_a_start_that_contradicts_that_of_an_episode_that_ended_takes_its_cost_b
     assert send.topic is COST
     assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)
     assert (send.frame.values[:, CostColumn.ENDED] == VOID).all()
-    assert "two different starts came for episode 1" in protocol.contradiction
+    assert "two different starts arrived for episode 1" in protocol.contradiction
     assert (protocol.counters["costs taken back"], protocol.counters["episodes void"]) == (1, 0)
     # Whoever asks again is told the same.
     for asked in (start(1), other):

@@ -111,7 +111,7 @@ def test_a_training_designs_and_adapts_for_it() -> None:
 
 
 def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
-    with pytest.raises(ParameterError, match="'gauss_newton' needs weights that are numbers"):
+    with pytest.raises(ParameterError, match="'gauss_newton' needs scalar weights"):
         pdeloop.train(plant=Servo(), optimizer="gauss_newton", rollouts=20)
 
 
@@ -136,7 +136,7 @@ def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str)
 
 
 def test_sensors_and_such_a_cost_do_not_go_together() -> None:
-    with pytest.raises(ValueError, match="sensors need weights that are numbers"):
+    with pytest.raises(ValueError, match="sensors need scalar weights"):
         pdeloop.problem(plant=Servo(), sensors=3).plant()
 
 

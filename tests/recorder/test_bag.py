@@ -374,7 +374,7 @@ def test_what_is_no_bag_is_a_clear_error(tmp_path):
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1")
     (tmp_path / "x.mcap").write_bytes(b"nonsense")
     with pytest.raises(
-        BagError, match="cannot be read, it is damaged: it is empty or no MCAP file"
+        BagError, match="cannot be read, it is damaged: it is empty or not an MCAP file"
     ):
         list(Bag(tmp_path).messages())
 
@@ -500,7 +500,7 @@ def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(tmp_path
     lines = ended.stderr.splitlines()
     assert len(lines) == 6
     assert all("decompresses to more than 100 times" in line for line in lines[:3])
-    assert all("a chunk is not" in line for line in lines[3:])
+    assert all("a chunk does not" in line for line in lines[3:])
     assert int(ended.stdout) < 300
 
 
@@ -700,7 +700,7 @@ def test_what_was_compared_is_numbers_and_what_cannot_be_verified_is_refused(tmp
     main(["bag", "verify", str(OLD), "--json"])
     assert json.loads(capsys.readouterr().out)["compared"]["costs"] == 1 + 8 + 2 * 2 + 3
     assert main(["bag", "verify", str(OLD), "--equation", "kdv"]) == 1
-    assert "--equation is kdv, and that of the run is burgers" in capsys.readouterr().err
+    assert "--equation is kdv, but that of the run is burgers" in capsys.readouterr().err
     without = Path(shutil.copytree(OLD, tmp_path / "bag"))
     (without / "parameters.json").unlink()
     assert main(["bag", "verify", str(without)]) == 1

@@ -18,7 +18,7 @@ from tuner_node.training import Training
 
 GAVE_UP = "gave up after"
 CAUSES = re.compile(
-    rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back"
+    rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|withdrew"
     "|plant has other parameters|actions are not those of the law"
 )
 """What an error says that names a cause."""

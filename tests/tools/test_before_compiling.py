@@ -43,7 +43,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ((*TRAIN, "--reduced-order", "30", "--identification", "dmdc"), "p must be at most"),
         ((*TRAIN, "--sensors", "64"), "sensors must be at most the 32 grid points"),
         ((*TRAIN, "--sensors", "4", "--sensor-delays", "31"), "sensor_delays must be at most"),
-        ((*TRAIN, "--sensor-delays", "2"), "--sensor-delays goes with --sensors"),
+        ((*TRAIN, "--sensor-delays", "2"), "--sensor-delays needs --sensors"),
         ((*TRAIN, "--actuator-positions", "0.5"), "actuator"),
         ((*TRAIN, "--model", "nowhere.npz"), "nowhere.npz"),
         ((*TRAIN, "--model", "file"), "holds no reduced model"),

@@ -53,7 +53,10 @@ def test_any_parameter_can_be_set_and_is_recorded(tmp_path) -> None:
         (("--set", "horizn=20"), "unknown parameter 'horizn'; did you mean 'horizon'?"),
         (("--set", "horizon=many"), "'horizon' is 'many'; expected a whole number"),
         (("--set", "iterations=3"), "parameter 'iterations' is given twice; give it once"),
-        (("--set", "equation=own.py:Own"), "is code, which is not run because a file names it"),
+        (
+            ("--set", "equation=own.py:Own"),
+            "is code, which is not run merely because a file names it",
+        ),
         (
             ("--optimizer", "gauss-newton", "--set", "optimizer_settings.feilds=2"),
             "unknown parameter 'optimizer_settings.feilds' of the optimizer 'gauss_newton'",
@@ -258,7 +261,7 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, capsys):
         (["train", "burgers", "--out", ""], "argument --out: it is empty; expected a path"),
         (["report", "run", "--out", ""], "argument --out: it is empty"),
         (["check", "burgers", "--picture", ""], "argument --picture: it is empty"),
-        (["train", "burgers", "--out", os.fsdecode(b"a\xff")], "'a\\udcff' is no UTF-8"),
+        (["train", "burgers", "--out", os.fsdecode(b"a\xff")], "'a\\udcff' is not valid UTF-8"),
     ],
 )
 def test_what_is_no_path_is_not_understood(capsys, words, said):
@@ -279,7 +282,7 @@ def test_an_equation_that_is_not_the_runs_is_refused(tmp_path, capsys):
     assert train(out) == 0
     capsys.readouterr()
     for command in (["evaluate", str(out)], ["report", str(out)]):
-        assert "--equation is kdv, and that of the run is burgers" in error_of(
+        assert "--equation is kdv, but that of the run is burgers" in error_of(
             capsys, *command, "--equation", "kdv"
         )
     assert not (out / "report").exists()

@@ -204,7 +204,8 @@ def test_a_reader_that_leaves_a_training_is_told_how_to_go_on(tmp_path: Path) ->
     os.close(writing)
     assert done.returncode == 141
     assert done.stderr.splitlines()[-1:] == [
-        "pdeloop: nobody reads the output; continue with: pdeloop train --resume 'a run' --in-process"
+        "pdeloop: the output has no reader; continue with: pdeloop train --resume 'a run' "
+        "--in-process"
     ]
 
 

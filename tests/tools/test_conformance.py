@@ -156,7 +156,7 @@ def random_mean(frame: Frame, node: Node) -> None:
 
 
 def with_ids_of(topic: Topic, *names: str) -> Callable[[Any, Node], Any]:
-    """These ids are not looked at: as if they were those of the last message of a topic."""
+    """These ids are not checked: as if they were those of the last message of a topic."""
 
     def change(message: Any, node: Node) -> Any:
         last = node.last.get(topic)

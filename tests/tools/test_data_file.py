@@ -151,7 +151,7 @@ def test_a_law_with_a_filter_is_identified_and_applied_as_it_is_told(
 ) -> None:
     out, words = tmp_path / "model.npz", ["identify", "--data", str(EXAMPLE)]
     assert main([*words, "--identification", "subspace"]) == FAILED
-    assert "gives a filter, which the law 'affine' does not use" in capsys.readouterr().err
+    assert "designs a filter, which the law 'affine' does not use" in capsys.readouterr().err
     filtered = ["--law", "observer", "--identification", "subspace", "--out", str(out)]
     assert main([*words, *filtered]) == 0
     assert "x = p + L (U^T z - p), and then p = A x + B a" in capsys.readouterr().out

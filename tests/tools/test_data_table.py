@@ -259,7 +259,7 @@ def test_without_a_target_there_is_a_model_and_no_law(
         str(tmp_path / "run"),
     ]
     for refusal, told in (
-        (["identify", *words, "--state-weight", "2"], "--state-weight weigh a law"),
+        (["identify", *words, "--state-weight", "2"], "--state-weight are weights of a law"),
         (["identify", *words, "--identification", "field"], "designs a law for a target"),
         (["identify", *words, "--target", "1,2"], "expected a target of 4 finite numbers"),
         (train, "it has a model without gains"),
@@ -320,7 +320,7 @@ def test_what_is_of_a_file_is_refused_with_a_bag(
     tmp_path: Path, flag: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["identify", "--bag", str(tmp_path), flag, "1"]) == FAILED
-    assert f"{flag} is of --data" in capsys.readouterr().err
+    assert f"{flag} applies to --data only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("numbers", ["", "1,", "1,x", "nan,1", "1;2"])

@@ -101,7 +101,7 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--sensor-delays", "3"], "--sensor-delays goes with --sensors N"),
+        (["--sensor-delays", "3"], "--sensor-delays needs --sensors N"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--view"], "leave out --in-process"),
         (["--pairs", "65"], "'pairs' is 65"),

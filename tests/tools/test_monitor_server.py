@@ -316,7 +316,7 @@ def test_a_plane_its_target_and_the_result_are_there_and_on_a_phone_the_curve_is
         tab.size(390, 844)
         tab.go(server.address)
         said = "document.querySelector('#field-text').textContent"
-        tab.until(f"{said}.includes('the target is there')", 30.0)
+        tab.until(f"{said}.includes('only the target')", 30.0)
         assert tab.ask(painted) > 30
         for step in range(2):
             z = np.cos(np.arange(24.0) + step)[np.newaxis]
@@ -333,7 +333,7 @@ def test_a_plane_its_target_and_the_result_are_there_and_on_a_phone_the_curve_is
             "document.querySelector('#share')?.textContent.includes('25.0 % below LQT')", 30.0
         )
         share = tab.ask("document.querySelector('#share').textContent")
-        assert "37.5 % of the cost without control is left" in share
+        assert "37.5 % of the cost without control remains" in share
         assert tab.ask("document.querySelector('#progress').value") == 12
         assert "improving the law" in tab.ask("document.querySelector('#figures').textContent")
         tops = tab.ask(

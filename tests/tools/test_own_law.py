@@ -129,7 +129,7 @@ def test_evaluate_report_and_export_know_it(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", str(finished), "--fields", "2"]) == 1
-    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    assert "is code, which is not run merely because a file names it" in capsys.readouterr().err
     assert main(["evaluate", str(finished), "--fields", "2", "--law", OWN]) == 0
     run = load_run(finished)
     costs = evaluate(run, fields=2, seed=run.values["evaluation_seed"])
@@ -147,7 +147,7 @@ def test_evaluate_report_and_export_know_it(
         assert same_bits(arrays["U"], run.models[0].U)
     capsys.readouterr()
     assert main(["export", str(finished), "--out", str(tmp_path / "law.c")]) == 1
-    assert "has no gains, so there is none in C" in capsys.readouterr().err
+    assert "has no gains, so it cannot be written in C" in capsys.readouterr().err
     assert not (tmp_path / "law.c").exists()
     with pytest.raises(ValueError, match="this figure shows the gains"):
         pdeloop.plot_gains(run)
@@ -162,7 +162,7 @@ def test_a_file_alone_does_not_run_it(
     out = tmp_path / "run"
     words = ["train", str(problem), *FLAGS, "--in-process", "--out", str(out)]
     assert main(words) == 1
-    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    assert "is code, which is not run merely because a file names it" in capsys.readouterr().err
     assert not out.exists()
     assert main([*words, "--law", f"{tmp_path}/own.py:Saturating"]) == 0
     monkeypatch.setenv(OWN_LAWS.variable, "")
@@ -180,7 +180,7 @@ def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     words = ["train", str(SMALL), "--law", "feedforward", "--optimizer", optimizer]
     assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
     told = capsys.readouterr().err
-    assert f"adapts no law but {adapted}, and the law is 'feedforward'" in told
+    assert f"adapts only {adapted}, but the law is 'feedforward'" in told
     assert "such as two_point" in told
     assert told.count("\n") == 1 and not (tmp_path / "run").exists()
 

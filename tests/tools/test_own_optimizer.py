@@ -113,7 +113,7 @@ def test_a_file_alone_does_not_run_it(tmp_path: Path, capsys, monkeypatch) -> No
     out = tmp_path / "run"
     words = ["train", str(problem), "--rollouts", "9", "--in-process", "--out", str(out)]
     assert main(words) == 1
-    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    assert "is code, which is not run merely because a file names it" in capsys.readouterr().err
     assert not out.exists()
     assert main([*words, "--optimizer", f"{tmp_path}/own.py:RandomSearch"]) == 0
     monkeypatch.setenv(OWN_OPTIMIZERS.variable, "")

@@ -172,7 +172,7 @@ def test_an_object_of_the_interface_alone_is_refused_wherever_a_plant_is_taken()
 
 def test_a_file_without_its_class_is_told_what_is_missing(own: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"own.py' is a file; give the class in it too, as .*own.py:Cl"
+        ValueError, match=r"own.py' is a file; name the class in it as well, as .*own.py:Cl"
     ):
         OWN_PLANTS.load(str(own))
 
@@ -183,7 +183,7 @@ def test_code_that_only_a_file_names_is_not_run(own: Path, tmp_path: Path, capsy
     own.write_text(f"open({str(tmp_path / 'mark')!r}, 'w').close()\n{OWN}")
     assert main(["check", str(problem)]) == 1
     told = capsys.readouterr().err
-    assert f"the plant '{own}:Rod' is code, which is not run because a file names it" in told
+    assert f"the plant '{own}:Rod' is code, which is not run merely because a file names it" in told
     assert not (tmp_path / "mark").exists()
     assert main(["check", str(problem), "--plant", f"{own}:Rod"]) in (0, 1)
     assert (tmp_path / "mark").exists()
@@ -244,7 +244,7 @@ def test_python_and_the_command_line_train_to_the_same_bits(
         assert main([*monkeypatched, "--plant", name]) == 0
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path / "a"), "--plant", f"{PLANTS}/other.py:Other"]) == 1
-    assert "and that of the run is" in capsys.readouterr().err
+    assert "but that of the run is" in capsys.readouterr().err
 
 
 def test_an_object_whose_arguments_no_file_can_hold_is_trained_in_its_program_alone(
@@ -307,7 +307,7 @@ def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
 
 def test_a_program_that_trains_when_it_is_loaded_as_a_plant_is_stopped(own: Path) -> None:
     own.write_text(OWN + "\npdeloop.train(plant=Rod(), rollouts=9)\n")
-    with pytest.raises(ValueError, match="trains while it is executed for what it defines") as told:
+    with pytest.raises(ValueError, match="trains while it is being imported") as told:
         values_of(own)
     assert isinstance(told.value.__cause__, RuntimeError)
     assert not isinstance(told.value.__cause__, OwnCodeError)

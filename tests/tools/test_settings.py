@@ -101,12 +101,12 @@ def test_evaluate_has_the_policies_under_another_parameter(
     thick = costs("--set", "physical.viscosity=0.1")
     assert (thick["none"] != plain["none"]).all()
     for setting, words in (
-        ("rollouts=20", "'rollouts' changes nothing about policies"),
+        ("rollouts=20", "'rollouts' has no effect on trained policies"),
         ("n_a=2", "the changed plant has"),
         ("n_z=64", "the changed plant has"),
         ("physical.depth=1", "depth"),
-        ("equation=kdv", "'equation' changes nothing about policies"),
-        ("optimizer_settings.fields=5", "changes nothing about policies"),
+        ("equation=kdv", "'equation' has no effect on trained policies"),
+        ("optimizer_settings.fields=5", "has no effect on trained policies"),
     ):
         refused(capsys, words, "evaluate", str(trained), "--set", setting)
 
@@ -145,13 +145,13 @@ def test_study_and_reproduce_set_a_parameter_of_all_trainings(
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("dmdc_rank=5", "of the identification dmdc, and this one is regression"),
-        ("dmdc_order=5", "of the identification dmdc"),
+        ("dmdc_rank=5", "applies to the identification dmdc, but this one is regression"),
+        ("dmdc_order=5", "applies to the identification dmdc"),
         ("sensor_delays=2", "there are no sensors"),
-        ("real_time_factor=1", "about nodes"),
-        ("pin=1", "about nodes"),
-        ("action_timeout=0.1", "about nodes"),
-        ("max_attempts=3", "about nodes"),
+        ("real_time_factor=1", "applies to nodes"),
+        ("pin=1", "applies to nodes"),
+        ("action_timeout=0.1", "applies to nodes"),
+        ("max_attempts=3", "applies to nodes"),
         ("plant_fingerprint=3", "how the training is started"),
     ],
 )
@@ -179,7 +179,7 @@ def test_train_refuses_what_would_change_nothing(
 def test_the_python_interface_refuses_what_would_change_nothing(
     parameters: dict[str, object],
 ) -> None:
-    with pytest.raises(ValueError, match="changes nothing here: "):
+    with pytest.raises(ValueError, match="has no effect here: "):
         pdeloop.train(str(SMALL), **parameters)
 
 

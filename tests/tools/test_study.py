@@ -189,7 +189,7 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
     ("change", "sentence"),
     [
         ({"problems": []}, "'problems' is"),
-        ({"problems": ["kdv", "kdv"]}, "names that differ"),
+        ({"problems": ["kdv", "kdv"]}, "different names"),
         ({"seeds": 0}, "'seeds' is 0"),
         ({"seeds": 10**12}, "at most 1000000, or a list"),
         ({"seeds": [1, "2"]}, "'seeds' is"),

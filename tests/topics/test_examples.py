@@ -114,7 +114,9 @@ def test_a_pde_of_ones_own_trains_from_its_file(
     monkeypatch.setenv(ALLOWED, "")
     assert main(["evaluate", str(tmp_path / "run")]) == 1
     said = capsys.readouterr().err
-    assert re.match(r"pdeloop: the equation '.*' is code, which is not run because a file", said)
+    assert re.match(
+        r"pdeloop: the equation '.*' is code, which is not run merely because a file", said
+    )
     equation = command[command.index("--equation") :][:2]
     assert main(["evaluate", str(tmp_path / "run"), *equation]) == 0
 

@@ -76,7 +76,7 @@ def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorde
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out), "--plant", name), LIMIT)
     assert "no difference, to the bit" in verified
     refused = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT, code=1)
-    assert "is code, which is not run because a file names it" in refused
+    assert "is code, which is not run merely because a file names it" in refused
 
 
 def test_a_plant_that_fails_ends_its_node_and_the_training_with_the_cause(

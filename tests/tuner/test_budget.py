@@ -166,7 +166,7 @@ def test_the_results_say_what_the_rollouts_were_for(tmp_path, capsys):
     words = ["--rollouts", "17", "--seeds", "2", "--out", str(out)]
     assert main(["train", str(SMALL), "--in-process", *words]) == 0
     shown = capsys.readouterr().out
-    assert "17 rollouts a seed (exploration 1, check 2, adaptation 14)" in shown
+    assert "17 rollouts per seed (exploration 1, check 2, adaptation 14)" in shown
     result = json.loads((out / "result.json").read_text())
     spent = {"exploration": 1, "check": 2, "adaptation": 14, "evaluation": 30, "total": 17}
     assert result["rollouts"] == [spent, spent]

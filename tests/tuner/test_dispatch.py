@@ -168,7 +168,7 @@ def test_two_different_targets_of_the_run_s_plant_end_the_run():
     assert served.target(0, target, 0.0) == served.target(0, target, 1.0) == []
     assert served.target(0, replace(other, plant=6), 0.0) == []
     assert served.target(0, replace(target, plant=6), 0.0) == []  # not this run's plant
-    with pytest.raises(DispatchError, match="two different targets came for the plant 5"):
+    with pytest.raises(DispatchError, match="two different targets arrived for the plant 5"):
         served.target(0, other, 2.0)
 
 
@@ -243,7 +243,7 @@ def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
     assert served.result() is not None
     ((_, second),) = starts(served.assign(batch(2), 1.0))
     with pytest.raises(
-        DispatchError, match=f"took back the cost of episode {episode_name(first.episode)}"
+        DispatchError, match=f"withdrew the cost of episode {episode_name(first.episode)}"
     ):
         served.cost(0, replace(void_of(first), step=costs_of(first).step), 1.0)
     served.cost(0, costs_of(second), 1.0)
@@ -260,7 +260,7 @@ def test_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_
     cost = costs_of(start)
     served.cost(0, cost, 1.0)
     assert served.cost(0, void_of(start), 2.0) == []
-    with pytest.raises(DispatchError, match="took back the cost of episode"):
+    with pytest.raises(DispatchError, match="withdrew the cost of episode"):
         served.cost(0, replace(void_of(start), step=cost.step), 3.0)
 
 
@@ -451,7 +451,7 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
     with pytest.raises(
-        DispatchError, match=f"took back episode {episode_name(again.episode)}.*two st"
+        DispatchError, match=f"withdrew episode {episode_name(again.episode)}.*two st"
     ):
         served.failure(0, ModelFailure(RUN, again.episode, False, "two states came"), 0.0)
     for known in (start, again):  # a controller that was started anew has lost the states

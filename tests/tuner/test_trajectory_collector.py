@@ -160,7 +160,7 @@ def test_a_state_of_a_wrong_size_that_came_before_the_target_is_not_taken():
     feed(served, 0, start)
     ((_, again),) = starts(served.cost(0, costs_of(start), 0.0))
     assert again.episode == start.episode + 1
-    assert "two different states came for step 3" in served.notes[-1]
+    assert "two different states arrived for step 3" in served.notes[-1]
 
 
 def test_the_cost_of_an_attempt_whose_samples_were_lost_does_not_end_the_next_one():
@@ -190,7 +190,7 @@ def test_two_different_samples_of_one_step_repeat_the_episode(kind, first):
         forge()
     ((_, again),) = starts(served.cost(0, costs_of(start), 0.0))
     assert again.episode == start.episode + 1
-    assert f"two different {kind}s came for step 3" in served.notes[-1]
+    assert f"two different {kind}s arrived for step 3" in served.notes[-1]
     feed(served, 0, again)
     served.cost(0, costs_of(again), 0.0)
     assert served.result() is not None

@@ -186,4 +186,4 @@ def test_a_viewer_that_sees_nothing_any_more_is_stale():
     assert good.values["subscribers"] == 3
     assert good.values["samples/s"] == 0.5
     stale = health.report(8.0, 3)
-    assert (stale.level, stale.message) == (Level.STALE, "nothing heard for 7 s")
+    assert (stale.level, stale.message) == (Level.STALE, "no messages for 7 s")

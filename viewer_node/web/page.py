@@ -68,7 +68,7 @@ def axes_of(values: Mapping[str, Any]) -> Axes:
 
 
 def _ends(axis: Axis) -> list[float]:
-    """Places of its first and last point; of an axis that somebody told of, however long."""
+    """Places of its first and last point; of an axis that was received, however long."""
     first = 0.0 if axis.periodic or axis.walls else 0.5 * axis.spacing
     return [first, first + (axis.size - 1) * axis.spacing]
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The web server of the live page: on 127.0.0.1 only, and for no other page than its own.
+"""The web server of the live page: on 127.0.0.1 only, and for its own page only.
 
 GET /, /NAME    the page and its files, all of them from this package
 GET /ws         a WebSocket: what is new (viewer_node.web.page), at most FRAMES times a second; and
@@ -38,7 +38,7 @@ from viewer_node.operation import VERBS
 from viewer_node.web.page import Page
 
 FRAMES = 20.0
-"""Pictures a second at the most."""
+"""Maximum pictures per second."""
 MOST_PAGES = 16
 """Pages that may be open at the same time."""
 MOST_CONNECTIONS = 128

@@ -108,7 +108,7 @@ export class FieldChart {
     const { facts, controllers, episode } = this.model;
     const { header } = episode;
     const names = episode.panels.map((i) => facts.names[i] ?? "u").join(", ");
-    this.caption = episode.target.length ? `${names}: no state yet, the target is there` : "no state has come yet";
+    this.caption = episode.target.length ? `${names}: no state yet, only the target` : "no state yet";
     let words = "Field in space and time: nothing yet";
     if (header) {
       const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner

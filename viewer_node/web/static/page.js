@@ -9,10 +9,10 @@ const html = htm.bind(h);
 
 const STATES = {
   searching: ["", "looking for a training", "No training runs on this machine. Start one: pdeloop train burgers"],
-  empty: ["warn", "no nodes", "Nobody publishes the loop's topics in this domain and namespace."],
+  empty: ["warn", "no nodes", "No node publishes the loop's topics in this domain and namespace."],
   waiting: ["warn", "waiting for the first message", ""],
   running: ["good", "running", ""],
-  silent: ["warn", "nothing heard", ""],
+  silent: ["warn", "no messages", ""],
   paused: ["warn", "paused", ""],
   ended: ["", "ended", ""],
 };
@@ -161,7 +161,7 @@ function Result({ status, curve, controllers }) {
   const cost = adapted ?? mean.at(-1) ?? null;
   const said = [];
   if (evaluated && lqt) said.push(below(lqt, adapted, controllers.lqt));
-  if (evaluated && none) said.push(`${((100 * adapted) / none).toPrecision(3)} % of the cost without control is left`);
+  if (evaluated && none) said.push(`${((100 * adapted) / none).toPrecision(3)} % of the cost without control remains`);
   if (!evaluated && cost !== null) said.push("on the training's own fields; all controllers are compared at the end");
   if (!evaluated && cost === null && checked.lqt !== undefined) {
     said.push(`first check: ${text(checked.lqt)} with ${controllers.lqt}`);
@@ -180,7 +180,7 @@ function Result({ status, curve, controllers }) {
     <section id="result" class="panel result" aria-label="Result and progress">
       <div class="outcome">
         <p id="cost">
-          ${cost === null ? "no cost of an adapted law yet" : html`<b>${text(cost)}</b> mean stage cost ${evaluated ? "of the adapted law" : "now"}`}
+          ${cost === null ? "no cost of an adapted law yet" : html`<b>${text(cost)}</b> mean stage cost ${evaluated ? "of the adapted law" : "of the current law"}`}
         </p>
         <p id="share" class="muted">${said.join(" · ")}</p>
         ${evaluated && html`<${Costs} costs=${references} controllers=${controllers} />`}
