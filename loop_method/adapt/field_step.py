@@ -17,36 +17,28 @@ from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
-from loop_method.adapt.proposal import LEAST_FALL, Proposal
-from loop_method.adapt.sensitivity import ISOTROPY
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.proposal import Proposal
+from loop_method.adapt.settings import GaussNewtonSettings
 
-SETTINGS = ModelBasedSettings(isotropy=ISOTROPY)
-# Trust region of a law that is improved on a model of the field, per lambda; see `improve`.
-_MODEL_TRUST_SCALE = 3e-2
-# The newest rollouts that such a model is about.
-COMPARED = 8
-# Further initial fields are this many times as far from the mean of the measured ones.
-EXTRAPOLATION = 1.5
-# Chaos: the error of a rollout is more than this many times that of its pieces; noise adds up more
-# slowly.
-_GROWTH, _PIECES = 20.0, 8
-# One of three measured states is an initial field, the other two judge.
-_HELD_OUT = 3
+DEFAULTS = GaussNewtonSettings()
 
 
 def field_model(
-    context: Context, data: Sequence[Record], first: str, most: float
+    context: Context,
+    data: Sequence[Record],
+    first: str,
+    settings: GaussNewtonSettings = DEFAULTS,
 ) -> tuple[Belief | None, bool]:
     """The model of the whole field that predicts the rollouts, and whether it does as a whole.
 
-    first: the kind to try first; most: the largest error E.
+    first: the kind to try first.
     """
+    most = settings.believed_noisy if context.noise else settings.believed
     whole = believe(context, data, first)
     if whole is None or whole.error <= most:
         return whole, True
-    parts = believe(context, data, first, _PIECES)
-    chaotic = parts is not None and parts.error <= min(most, whole.error / _GROWTH)
+    parts = believe(context, data, first, settings.pieces)
+    chaotic = parts is not None and parts.error <= min(most, whole.error / settings.chaotic_growth)
     return (parts if chaotic else None), False
 
 
@@ -57,18 +49,19 @@ def propose(
     data: Sequence[Record],
     policy: Array,
     damping: float,
+    settings: GaussNewtonSettings = DEFAULTS,
 ) -> Proposal | None:
     """The best law on the model near to a policy, or None where that gains nothing."""
     loop = belief.loop(context)
     fields, others = initial_fields(data), None
     if whole and not is_chaotic(loop, fields):
-        chosen = extrapolated_fields(fields[-COMPARED:])
+        chosen = extrapolated_fields(fields[-settings.newest :], settings.extrapolation)
     else:
-        every = measured_states(data, SETTINGS.chaotic_fields * _HELD_OUT)
-        held_out = np.arange(len(every)) % _HELD_OUT > 0
+        every = measured_states(data, settings.chaotic_fields * settings.chaotic_share)
+        held_out = np.arange(len(every)) % settings.chaotic_share > 0
         chosen, others = every[~held_out], every[held_out]
     first = loop.theta(policy)
-    found = improved(loop, first, chosen, damping)
+    found = improved(loop, first, chosen, damping, settings)
     if found is None:
         return None
     theta, fall = found
@@ -76,32 +69,36 @@ def propose(
         with np.errstate(invalid="ignore"):
             before, after = (loop.costs(law, others).mean() for law in (first, theta))
             fall = before - after
-        if not fall > LEAST_FALL * before:  # also where it is not finite
+        if not fall > settings.least_fall * before:  # also where it is not finite
             return None
     kind = belief.model.kind
     return Proposal(loop.policy(theta, policy), fall, 1, 0.0, belief.error, kind, kind, whole)
 
 
 def improved(
-    loop: ClosedLoop, theta: Array, fields: Array, damping: float
+    loop: ClosedLoop,
+    theta: Array,
+    fields: Array,
+    damping: float,
+    settings: GaussNewtonSettings = DEFAULTS,
 ) -> tuple[Array, float] | None:
     """The best law on a model near to theta, and by how much its cost is lower."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
-        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS),
-        trust=_MODEL_TRUST_SCALE * damping,
+        *(loop, theta, fields, weights, curvature_of(loop), settings),
+        trust=settings.trust * damping,
     )
     return None if found is None else (found.theta, found.before - found.after)
 
 
-def extrapolated_fields(fields: Array) -> Array:
-    """The initial fields (F, n_z), and as many that lie further from their mean.
+def extrapolated_fields(fields: Array, reach: float) -> Array:
+    """The initial fields (F, n_z), and as many that lie `reach` times as far from their mean.
 
     A law that is best on a few fields is not on their neighbours; on a model, more of them cost no
     rollouts.
     """
     mean = fields.mean(axis=0)
-    return np.concatenate([fields, mean + EXTRAPOLATION * (fields - mean)])
+    return np.concatenate([fields, mean + reach * (fields - mean)])
 
 
 def agrees_with_rejections(

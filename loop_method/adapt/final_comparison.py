@@ -24,7 +24,7 @@ from loop_method.adapt.base import Context, Record, Rollout, State
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.renewal import confirmed_fraction
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import ImprovementSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -186,7 +186,7 @@ def on_model(
     known: Sequence[Record],
     numbers: Sequence[int],
     rng: np.random.Generator,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
 ) -> Comparison:
     """The comparison where a model predicts rollouts; a law that is not better by then is not run.
 
@@ -204,7 +204,7 @@ def on_model(
         Fresh fields for which there are rollouts.
     rng : numpy.random.Generator
         Of the fields that are drawn.
-    settings : ModelBasedSettings
+    settings : ImprovementSettings
         Constants.
     """
     loop, fields = belief.loop(context), initial_fields(known)
@@ -244,7 +244,7 @@ def on_same_fields(
     base: str,
     close: bool,
     numbers: Sequence[int],
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
 ) -> Comparison:
     """The comparison by rollouts alone, from the same fields where there are enough for all laws.
 
@@ -258,7 +258,7 @@ def on_same_fields(
         Whether no control may be as good.
     numbers : sequence of int
         As many fresh fields as there are rollouts.
-    settings : ModelBasedSettings
+    settings : ImprovementSettings
         Constants.
     """
     moved = not np.array_equal(laws[ADAPTED], laws[base])
@@ -275,7 +275,7 @@ def on_same_fields(
 
 
 def rollouts_to_keep(
-    budget: int, first_step: int, whole: bool, laws: int, settings: ModelBasedSettings
+    budget: int, first_step: int, whole: bool, laws: int, settings: ImprovementSettings
 ) -> int:
     """How many rollouts of a budget a search leaves for the comparison.
 

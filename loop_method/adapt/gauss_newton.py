@@ -53,7 +53,7 @@ from loop_method.adapt.final_comparison import (
 )
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.search_state import NONE, SearchState, Stamps
-from loop_method.adapt.settings import GaussNewtonSettings, ModelBasedSettings
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.adapt.trajectories import Records
 from loop_method.adapt.verdict import ADAPTED, FIRST, Verdict
 from loop_method.adapt.verdict import NONE as NO_CONTROL
@@ -61,14 +61,7 @@ from loop_method.seeds import field_seed
 
 __all__ = ["GaussNewton"]
 
-_DAMPING = (1e-4, 100.0)  # smallest, largest after a rejection
-_ABORT = 1.05
-_MEMORY = 40
-# An accepted step that gains less than this share of the cost is small: what is left to gain is less
-# than how much fields differ, so more of them have to judge.
-_SMALL = 0.02
 _LAST = "last."
-_CONSTANTS = ModelBasedSettings()
 _CONFIRMING = 0x434F4E46  # "CONF": of the fields that are drawn for the verdict
 
 
@@ -87,7 +80,7 @@ class GaussNewton(Optimizer):
         Basis, target, weights, horizon and the exploratory trajectory.
     settings : GaussNewtonSettings
         `fields`: more fit the distribution better, at M rollouts a step. One is added after each
-        accepted step that gains less than 2 % of the cost: a short step needs more to be judged.
+        accepted step that gains little, as fields then differ by more than is left to gain.
     first_field : int
         Number of the first of these fields: a law can have been made on those before.
     verdict : bool
@@ -116,10 +109,12 @@ class GaussNewton(Optimizer):
         require_positive(rollouts=rollouts)
         if context is None:
             raise ValueError("Gauss-Newton needs the context: trajectories were not asked for")
-        settings = settings or GaussNewtonSettings()
+        self._settings = settings = settings or GaussNewtonSettings()
         self._first = checked_policy(policy0 if context.refused is None else context.refused)
-        self._now = SearchState.begin(self._first, settings.fields, first_field)
-        self._proposer = Proposer(context, self._now.policy)
+        self._now = SearchState.begin(
+            self._first, settings.fields, first_field, settings.first_damping
+        )
+        self._proposer = Proposer(context, self._now.policy, settings)
         self._sensors, self._context = context.sensors, context
         # With sensors the first law is compared with no control by the rollouts of the search.
         self._verdict = verdict and not context.sensors
@@ -133,8 +128,8 @@ class GaussNewton(Optimizer):
         self._comparison: Comparison | None = None
         self._seed = seed
         self._budget = rollouts
-        self._field_count = settings.fields
-        self._records = Records(_MEMORY, 3.0 * float(np.abs(context.exploration.states).max()))
+        largest = 3.0 * float(np.abs(context.exploration.states).max())
+        self._records = Records(settings.remembered, largest)
 
     @classmethod
     def first_step(cls, settings: GaussNewtonSettings) -> int:
@@ -240,7 +235,7 @@ class GaussNewton(Optimizer):
 
     def _judge(self, row: Row) -> bool:
         """Accept or reject the candidate, or let it run on; whether the decision has fallen."""
-        now = self._now
+        now, settings = self._now, self._settings
         ran = now.trials != NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
@@ -249,23 +244,23 @@ class GaussNewton(Optimizer):
         if self._sensors or contest:
             lost = ran.sum() * trial >= ran.size * self._mean_cost(now.incumbents)
         else:
-            lost = trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent)
+            lost = trial >= settings.abort * incumbent or (ran.all() and trial >= incumbent)
         if lost:
             now.from_none = now.from_none or contest
             if not contest:
-                now.damping = min(4.0 * now.damping, _DAMPING[1])
+                now.damping = min(settings.damping_rejected * now.damping, settings.largest_damping)
             now.compared = now.trials.copy()
             now.accepted = False
         elif ran.all():
             fall = incumbent - trial
-            if not contest and fall > 0.5 * now.fall:
-                now.damping = max(now.damping / 3.0, _DAMPING[0])
-            elif not contest and fall <= 0.2 * now.fall:
-                now.damping *= 2.0
+            if not contest and fall > settings.good_ratio * now.fall:
+                now.damping = max(now.damping / settings.damping_fall, settings.least_damping)
+            elif not contest and fall <= settings.poor_ratio * now.fall:
+                now.damping *= settings.damping_rise
             now.policy = now.candidate.copy()
             now.compared, now.incumbents = now.incumbents, now.trials.copy()
             now.accepted = True
-            self._renew_fields(fall < _SMALL * incumbent)
+            self._renew_fields(fall < settings.small_gain * incumbent)
         else:
             return False
         row["accepted"] = now.accepted
@@ -278,7 +273,7 @@ class GaussNewton(Optimizer):
     def _renew_fields(self, small: bool) -> None:
         """A fresh field in place of the oldest, or in addition to it after a small step."""
         now = self._now
-        grow = small and len(now.fields) < 2 * self._field_count
+        grow = small and len(now.fields) < 2 * self._settings.fields
         if self._left <= len(now.fields) + grow:
             return
         if grow:
@@ -308,9 +303,9 @@ class GaussNewton(Optimizer):
         if self._verdict:
             known = self._context.measured
             opposed = self._base == FIRST and not self._contested
-            close = opposed and none_is_close(known, self._first, _CONSTANTS.close)
-            step, whole = 2 * self._field_count, self._now.whole
-            kept = rollouts_to_keep(self._budget, step, whole, 2 + close, _CONSTANTS)
+            close = opposed and none_is_close(known, self._first, self._settings.close)
+            step, whole = 2 * self._settings.fields, self._now.whole
+            kept = rollouts_to_keep(self._budget, step, whole, 2 + close, self._settings)
         return self._budget - kept - self._records.count
 
     def _finish(self, row: Row) -> None:
@@ -323,12 +318,12 @@ class GaussNewton(Optimizer):
             # One thread: a threaded LAPACK rounds differently for another number of threads.
             with threadpool_limits(limits=1):
                 comparison = self._proposer.comparison(
-                    *(self._laws, known, now.believed, fresh[: _CONSTANTS.judging], rng)
+                    *(self._laws, known, now.believed, fresh[: self._settings.judging], rng)
                 )
         if comparison is None:
             base, measured = self._base, [*self._context.measured, *known]
-            close = base == FIRST and none_is_close(measured, self._first, _CONSTANTS.close)
-            comparison = on_same_fields(self._laws, base, close, fresh, _CONSTANTS)
+            close = base == FIRST and none_is_close(measured, self._first, self._settings.close)
+            comparison = on_same_fields(self._laws, base, close, fresh, self._settings)
         else:
             row["fraction"] = comparison.fraction
         if comparison.names:

@@ -24,7 +24,7 @@ from scipy import linalg
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import ImprovementSettings
 from loop_method.design.finite_horizon import action_curvature
 
 FAR = 10.0
@@ -82,7 +82,7 @@ def improve(
     fields: Array,
     weights: Array,
     curvature: Array,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
     least_gain: float | None = None,
     trust: float = 0.0,
 ) -> Improvement | None:
@@ -98,7 +98,7 @@ def improve(
         Initial fields; those from which the law to begin with is not finite are left out.
     curvature : (n_a, n_a) array
         G.
-    settings : ModelBasedSettings
+    settings : ImprovementSettings
         Constants of the descent.
     least_gain : float, optional
         In place of that of the settings.
@@ -136,7 +136,7 @@ def _descend(
     fields: Array,
     weights: Array,
     coordinates: Coordinates,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
     least_gain: float,
     trust: float,
 ) -> Improvement:

@@ -30,17 +30,15 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.reduce.channels import NUMBERED, followed_the_state, never_moved
 from loop_method.reduce.identifiability import NotIdentifiableError
 
 __all__ = ["LocalModel", "extended_basis", "fit"]
 
 IndexArray = NDArray[np.int64]
+DEFAULTS = GaussNewtonSettings()
 
-# Ridges on the scaled variables, per unit weight: enough to bound directions that the data does not
-# move.
-_LINEAR_RIDGE = 1e-5
-_ACTION_RIDGE = 1e-8
 # Share of the mean square of an input, or a combination of inputs, not explained by the state.
 _DETERMINED = 1e-13
 # Samples whose features are in memory at a time.
@@ -120,12 +118,15 @@ def fit(
     ridges: Sequence[float],
     *,
     leading: int = 0,
+    linear_ridge: float = DEFAULTS.linear_ridge,
+    action_ridge: float = DEFAULTS.action_ridge,
 ) -> list[LocalModel]:
     """Fit one model per ridge, and with `leading` above 0 one with a cubic part per ridge after them.
 
     x (N, r), a (N, n_a), change (N, r): x_k, a_k and x_{k+1} - x_k of any number of trajectories,
     with weights (N,), not negative; ridges: of the quadratic and cubic part per unit weight,
-    `numpy.inf` for an affine model; leading: l, coordinates that the cubic part acts on.
+    `numpy.inf` for an affine model; leading: l, coordinates that the cubic part acts on; linear_ridge,
+    action_ridge: of state and inputs, enough to bound directions that the data do not move.
 
     NotIdentifiableError where the effects of some inputs cannot be told apart: a ridge would share them
     out.
@@ -157,8 +158,8 @@ def fit(
             size = affine if np.isinf(ridge) else most
             penalty = np.full(size, ridge)
             penalty[0] = 0.0
-            penalty[1 : 1 + r] = _LINEAR_RIDGE
-            penalty[1 + r : affine] = _ACTION_RIDGE
+            penalty[1 : 1 + r] = linear_ridge
+            penalty[1 + r : affine] = action_ridge
             matrix = gram[:size, :size].copy()
             matrix[np.diag_indices(size)] += penalty
             factor = linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)

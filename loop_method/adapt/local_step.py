@@ -25,29 +25,13 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.local_model import LocalModel, extended_basis, fit
-from loop_method.adapt.proposal import LEAST_FALL, Proposal
+from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensitivity import ReducedTrajectory, damped_step
+from loop_method.adapt.settings import GaussNewtonSettings
 
-# Ridges of the quadratic part.
-RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-# Forgetting over an episode: gamma = exp(-kappa / T).
-KAPPAS = (0.0, 5.0, 15.0, 50.0)
-# A comparison with a rollout that costs more than this many times the incumbent is not local.
 LOCAL = 3.0
-# After an accepted step, the least forgetting whose error is within this factor and margin of the
-# best.
-_ENOUGH = (1.5, 0.03)
-# Models are averaged whose error is within this factor and margin of the best, and no further from
-# it than the last.
-_ALIKE = (3.0, 0.03, 0.15)
-_WORST = 2.0
-# Coordinates of the local models and of the sensitivities, at least.
-_MODES = 32
-# Coordinates that the cubic part of a model acts on, at most.
-_CUBIC_MODES = 12
-# Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
-_AGEING = 0.9
-_AGEING_FLOOR = 0.3
+"""A comparison with a rollout that costs more than this many times another one is not local."""
+DEFAULTS = GaussNewtonSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +52,7 @@ def propose(
     *,
     damping: float,
     accepted: bool,
+    settings: GaussNewtonSettings = DEFAULTS,
 ) -> Proposal | None:
     """The first step that gains enough, else the one that gains most, or None if none is finite.
 
@@ -81,14 +66,19 @@ def propose(
         How much each of them counts.
     incumbents, compared, damping, accepted
         As of `Proposer.propose`.
+    settings : GaussNewtonSettings
+        Constants.
     """
-    V = extended_basis(loop.U, [record.states for record in data], max(_MODES, loop.U.shape[1]))
-    models = _fit(data, shares, V, len(incumbents))
-    errors = mismatches(models, _comparisons(loop, V, incumbents, compared), loop.horizon)
+    V = extended_basis(
+        loop.U, [record.states for record in data], max(settings.modes, loop.U.shape[1])
+    )
+    models = _fit(data, shares, V, len(incumbents), settings)
+    pairs = _comparisons(loop, V, incumbents, compared, settings.local_cost)
+    errors = mismatches(models, pairs, loop.horizon, settings)
     paths = [path_of(loop, record, V) for record in incumbents if len(record.actions)]
-    policy, least = incumbents[0].policy, LEAST_FALL * loop.mean_cost_of(incumbents)
+    policy, least = incumbents[0].policy, settings.least_fall * loop.mean_cost_of(incumbents)
     proposal = None
-    for kappa, chosen in choices(errors, accepted):
+    for kappa, chosen in choices(errors, accepted, settings):
         step, fall = damped_step(
             [models[i] for i in chosen],
             paths,
@@ -97,12 +87,13 @@ def propose(
             action_weight=loop.action_weight,
             gamma=float(np.exp(-kappa / loop.horizon)),
             damping=damping,
+            isotropy=settings.isotropy,
         )
         candidate = loop.moved(policy, step)
         if not (np.isfinite(candidate).all() and np.isfinite(fall)):
             continue
         if proposal is None or fall > proposal.fall:
-            error = float(errors[chosen, KAPPAS.index(kappa)].min())
+            error = float(errors[chosen, settings.forgettings.index(kappa)].min())
             proposal = Proposal(candidate, fall, len(chosen), kappa, error)
         if fall >= least:
             break
@@ -110,15 +101,24 @@ def propose(
 
 
 def _fit(
-    data: Sequence[Record], shares: Sequence[float], V: Array, fields: int
+    data: Sequence[Record],
+    shares: Sequence[float],
+    V: Array,
+    fields: int,
+    settings: GaussNewtonSettings,
 ) -> list[LocalModel]:
     """The local models on V; after this many rollouts, a rollout ages by one."""
     newest = max(record.stamp for record in data)
     ages = [(newest - record.stamp) // fields for record in data]
-    young = [max(_AGEING**age, _AGEING_FLOOR) for age in ages]
+    young = [max(settings.ageing**age, settings.least_weight) for age in ages]
     weights = [own * share for own, share in zip(young, shares, strict=True)]
     x, a, after, weight = steps_of(data, weights, V)
-    return fit(x, a, after - x, weight, RIDGES, leading=min(_CUBIC_MODES, V.shape[1]))
+    return fit(
+        *(x, a, after - x, weight, settings.ridge_values),
+        leading=min(settings.cubic_modes, V.shape[1]),
+        linear_ridge=settings.linear_ridge,
+        action_ridge=settings.action_ridge,
+    )
 
 
 def steps_of(
@@ -139,6 +139,7 @@ def _comparisons(
     V: Array,
     incumbents: Sequence[Record],
     compared: Sequence[Record | None],
+    local: float,
 ) -> list[Comparison]:
     """Pairs of whole rollouts: two fields, and two policies on one field."""
     chosen = []
@@ -146,7 +147,7 @@ def _comparisons(
         neighbour, other = incumbents[(i + 1) % len(incumbents)], compared[i]
         if neighbour is not record and neighbour.usable and record.usable:
             chosen.append((record, neighbour))
-        if other is not None and record.usable and other.cost < LOCAL * record.cost:
+        if other is not None and record.usable and other.cost < local * record.cost:
             chosen.append((record, other))
     return [
         Comparison(
@@ -169,9 +170,15 @@ def path_of(loop: ClosedLoopProblem, record: Record, V: Array) -> ReducedTraject
     return ReducedTrajectory(x, record.actions, features, K, free)
 
 
-def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizon: int) -> Array:
+def mismatches(
+    models: Sequence[LocalModel],
+    pairs: Sequence[Comparison],
+    horizon: int,
+    settings: GaussNewtonSettings = DEFAULTS,
+) -> Array:
     """E of every model and kappa, (models, kappas); zeros without pairs."""
-    errors = np.zeros((len(models), len(KAPPAS)))
+    kappas, worst = settings.forgettings, settings.worst
+    errors = np.zeros((len(models), len(kappas)))
     if not pairs:
         return errors
     x = np.stack([pair.first.x for pair in pairs])
@@ -181,7 +188,7 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizo
     free = None
     if pairs[0].first.free is not None:
         free = np.stack([pair.first.free for pair in pairs if pair.first.free is not None])
-    gammas = np.exp(-np.array(KAPPAS) / horizon)
+    gammas = np.exp(-np.array(kappas) / horizon)
     for i, model in enumerate(models):
         # A model that is unstable along the trajectory overflows: it counts as the worst.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -195,12 +202,14 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizo
                 free=free,
             )
             error = np.sum((predicted - measured) ** 2, axis=(2, 3)) / size
-        error = np.where(np.isfinite(error), np.minimum(error, _WORST), _WORST)
+        error = np.where(np.isfinite(error), np.minimum(error, worst), worst)
         errors[i] = error.mean(axis=1)
     return errors
 
 
-def choices(errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
+def choices(
+    errors: Array, accepted: bool, settings: GaussNewtonSettings = DEFAULTS
+) -> list[tuple[float, list[int]]]:
     """Forgetting, and the models to average over with it; the choice to use first comes first.
 
     Parameters
@@ -210,14 +219,17 @@ def choices(errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
     accepted : bool
         Whether the last candidate was accepted: if so little forgetting is preferred, as it sees
         the whole effect of a step, and otherwise the smallest error.
+    settings : GaussNewtonSettings
+        Constants.
     """
+    kappas, margin = settings.forgettings, settings.alike_margin
     best = errors.min(axis=0)
     order = [int(j) for j in np.argsort(best, kind="stable")]
     if accepted:
-        first = int(np.argmax(best <= _ENOUGH[0] * best.min() + _ENOUGH[1]))
+        first = int(np.argmax(best <= settings.enough_factor * best.min() + margin))
         order = [first, *(j for j in order if j != first)]
-    alike = np.minimum(_ALIKE[0] * best + _ALIKE[1], best + _ALIKE[2])
-    return [(KAPPAS[j], [int(i) for i in np.flatnonzero(errors[:, j] <= alike[j])]) for j in order]
+    alike = np.minimum(settings.alike_factor * best + margin, best + settings.alike_distance)
+    return [(kappas[j], [int(i) for i in np.flatnonzero(errors[:, j] <= alike[j])]) for j in order]
 
 
 def predict_difference(

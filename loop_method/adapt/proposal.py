@@ -9,8 +9,6 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Row
 
 LOCAL = "local"
-# A step that predicts less than this share of the cost is not worth its rollouts.
-LEAST_FALL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from loop_method.adapt.final_comparison import Comparison, Laws, on_model
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.sensed_step import SensedProposals
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.adapt.trajectories import cleaned
 from loop_method.adapt.verdict import Verdict
 from loop_method.models.denoising import denoised
@@ -40,6 +40,8 @@ class Proposer:
     context : Context
     policy : (n_a, 2 n_s) array
         Any policy of the training, for its shape.
+    settings : GaussNewtonSettings, optional
+        Constants.
 
     Attributes
     ----------
@@ -49,7 +51,10 @@ class Proposer:
         None where the states are not one reading of each of a few sensors.
     """
 
-    def __init__(self, context: Context, policy: Array) -> None:
+    def __init__(
+        self, context: Context, policy: Array, settings: GaussNewtonSettings | None = None
+    ) -> None:
+        self._settings = settings = settings or GaussNewtonSettings()
         U = np.array(context.U, dtype=np.float64)
         target = np.array(context.target, dtype=np.float64)
         n_a, columns = policy.shape
@@ -71,8 +76,6 @@ class Proposer:
         self.loop = ClosedLoopProblem(*(U, target, *weights, context.horizon, context.action_limit))
         # Few readings cannot be cleaned; what is fitted to them knows of their noise.
         self._noise = 0.0 if context.sensors else context.noise
-        limits = ModelBasedSettings()
-        self._believed = limits.believed_noisy if self._noise else limits.believed
         self._context = replace(context, noise=self._noise)
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
@@ -82,9 +85,9 @@ class Proposer:
         # One component, of which each sensor's last reading is the state.
         if can_be_sensed(context):
             centres = context.actuator_centres(n_a)
-            largest_cost = local_step.LOCAL * self.loop.cost_of(self._before[0])
+            largest_cost = settings.local_cost * self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(
-                self.loop, centres, context.noise, largest_cost, context.field_models
+                *(self.loop, centres, context.noise, largest_cost, context.field_models), settings
             )
 
     def propose(
@@ -133,7 +136,7 @@ class Proposer:
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         believed, whole = "", False
         if first is not None:
-            belief, whole = field_step.field_model(self._context, measured, first, self._believed)
+            belief, whole = field_step.field_model(self._context, measured, first, self._settings)
             if belief is not None:
                 believed = belief.model.kind
                 if (
@@ -143,10 +146,13 @@ class Proposer:
                 ):
                     known = self._without_noise(measured)
                     return field_step.propose(
-                        *(self._context, belief, whole, known, policy, damping),
+                        *(self._context, belief, whole, known, policy, damping, self._settings),
                     )
         proposal = local_step.propose(
-            *(loop, data, shares, incumbents, compared), damping=damping, accepted=accepted
+            *(loop, data, shares, incumbents, compared),
+            damping=damping,
+            accepted=accepted,
+            settings=self._settings,
         )
         return proposal and replace(proposal, believed=believed, whole=bool(believed) and whole)
 
@@ -163,11 +169,11 @@ class Proposer:
         records : as of `propose`; believed : kind of the model to try first.
         """
         measured = self._measurements(records)
-        belief, whole = field_step.field_model(self._context, measured, believed, self._believed)
+        belief, whole = field_step.field_model(self._context, measured, believed, self._settings)
         if belief is None or not whole:
             return None
         known = self._without_noise(measured)
-        return on_model(self._context, belief, laws, known, numbers, rng, field_step.SETTINGS)
+        return on_model(self._context, belief, laws, known, numbers, rng, self._settings)
 
     def verdict(
         self, last: Comparison, laws: Laws, before: Sequence[Record], fresh: Sequence[Record]
@@ -178,7 +184,7 @@ class Proposer:
         """
         every = self._without_noise([*(measured := self._measurements(before)), *fresh])
         known, new = every[: len(measured)], every[len(measured) :]
-        return last.verdict(self._context, laws, known, new, field_step.SETTINGS.confidence)
+        return last.verdict(self._context, laws, known, new, self._settings.confidence)
 
     def _measurements(self, records: Sequence[Record]) -> list[Record]:
         """All rollouts of more than a state, as they were measured."""

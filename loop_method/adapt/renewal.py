@@ -27,7 +27,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import ImprovementSettings
 
 _Descent: TypeAlias = Callable[[Sequence[Array], Array, int], tuple[Array, int] | None]
 
@@ -69,7 +69,7 @@ def renew(
     parts: Sequence[Array],
     fields: Array,
     rng: np.random.Generator,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
     *,
     components: int = 1,
     periodic: bool = True,
@@ -90,7 +90,7 @@ def renew(
         so that no law of a part ever sees its fields.
     rng : numpy.random.Generator
         Of the fields that are drawn.
-    settings : ModelBasedSettings
+    settings : ImprovementSettings
         Constants.
     components : int
         Fields that stand one after the other in a state.
@@ -127,7 +127,7 @@ def confirmed_fraction(
     first: Array,
     fields: Array,
     rng: np.random.Generator,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
     *,
     components: int = 1,
     periodic: bool = True,
@@ -166,7 +166,7 @@ def held_out_fraction(
     first: Array,
     parts: Sequence[Array],
     fields: Array,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
 ) -> tuple[float, float, float]:
     """The fraction of the way from the first law, and `change` and `deviation` of a `Renewal`.
 
@@ -234,7 +234,7 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 def _descent(
     loop: ClosedLoop,
     rng: np.random.Generator,
-    settings: ModelBasedSettings,
+    settings: ImprovementSettings,
     components: int,
     periodic: bool,
     least_gain: float,

@@ -19,7 +19,6 @@ NONE = -1
 STAMPS = ("fields", "incumbents", "trials", "compared")
 LATER = ("whole", "from_none", "reason", "ended")
 """What older checkpoints lack."""
-FIRST_DAMPING = 1.0
 
 
 @dataclass(eq=False)
@@ -44,7 +43,7 @@ class SearchState:
     trials: Stamps
     compared: Stamps
     fall: float = 0.0
-    damping: float = FIRST_DAMPING
+    damping: float = 1.0
     accepted: bool = True
     proposed: bool = False
     tells: int = 0
@@ -56,11 +55,12 @@ class SearchState:
     ended: bool = False
 
     @classmethod
-    def begin(cls, policy: Array, count: int, first: int) -> SearchState:
+    def begin(cls, policy: Array, count: int, first: int, damping: float) -> SearchState:
         """Before the first rollout, with this many fields from number `first` on."""
         incumbents, trials, compared = np.full((3, count), NONE, dtype=np.int64)
         numbers = first + np.arange(count, dtype=np.int64)
-        return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, compared)
+        laws = policy.copy(), policy.copy()
+        return cls(*laws, numbers, incumbents, trials, compared, damping=damping)
 
     def arrays(self) -> State:
         """A copy of everything, as a checkpoint holds it."""

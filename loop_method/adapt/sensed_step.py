@@ -13,9 +13,10 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
-from loop_method.adapt.field_step import EXTRAPOLATION, extrapolated_fields, improved
+from loop_method.adapt.field_step import extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.models.sensed import KIND, SHARED, interpolated, sensed_model
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -35,6 +36,8 @@ class SensedProposals:
         Mean stage cost of a rollout above which it is not fitted.
     settings : FieldModelSettings
         Constants of the model's internal steps.
+    own : GaussNewtonSettings, optional
+        Constants of a step.
 
     Attributes
     ----------
@@ -49,9 +52,11 @@ class SensedProposals:
         noise: float,
         largest_cost: float,
         settings: FieldModelSettings = DEFAULTS,
+        own: GaussNewtonSettings | None = None,
     ) -> None:
         self._loop, self._centres, self._noise = loop, centres, noise
         self._largest_cost, self._settings = largest_cost, settings
+        self._own = own or GaussNewtonSettings()
         self.equation: Array = np.zeros(SHARED)
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
@@ -63,6 +68,7 @@ class SensedProposals:
             return None
         shared, fields, error = fitted
         self.equation = shared
+        reach = self._own.extrapolation
         loop, (sensors, n_s) = self._loop, self._loop.U.shape
         n, largest = fields.shape[1], float(np.abs(fields).max())
         U = np.zeros((n, n_s))
@@ -74,14 +80,13 @@ class SensedProposals:
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            model=sensed_model(
-                shared, sensors, self._centres, EXTRAPOLATION * largest, self._settings
-            ),
+            model=sensed_model(shared, sensors, self._centres, reach * largest, self._settings),
             noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
         theta = between.theta(policy)
-        found = improved(between, theta, extrapolated_fields(np.stack(list(own.values()))), damping)
+        wide = extrapolated_fields(np.stack(list(own.values())), reach)
+        found = improved(between, theta, wide, damping, self._own)
         if found is None:
             return None
         candidate = between.policy(found[0], policy)

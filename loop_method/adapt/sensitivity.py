@@ -32,9 +32,6 @@ from scipy import linalg
 from loop_interfaces.arrays import Array
 from loop_method.adapt.local_model import LocalModel
 
-# Share of the trust region that bounds all gains alike, relative to the one in input energy.
-ISOTROPY = 0.3
-
 
 @dataclass(frozen=True, eq=False)
 class ReducedTrajectory:
@@ -124,16 +121,17 @@ def damped_step(
     action_weight: float,
     gamma: float,
     damping: float,
+    isotropy: float = 0.3,
 ) -> tuple[Array, float]:
     """The damped Gauss-Newton step of theta, and the fall of the cost that it predicts.
 
-        (H + lambda D) d = -g,        D = 2 r I (x) (F + 0.3 tr(F) / (n_s + 1) I),        F = mean
+        (H + lambda D) d = -g,        D = 2 r I (x) (F + iota tr(F) / (n_s + 1) I),        F = mean
         phi phi^T
 
     g and H are averaged over paths and models. An average over models that disagree has a large H
     where they do, and so a small step. F alone measures a step by the input energy that it adds;
-    its second term bounds the gains in directions of s that the rollouts hardly excite, through
-    which the closed loop would otherwise leave the range of the linearisation.
+    its second term, with iota the isotropy, bounds the gains in directions of s that the rollouts
+    hardly excite, through which the closed loop would otherwise leave the range of the linearisation.
 
     Returns
     -------
@@ -160,7 +158,7 @@ def damped_step(
                 g += share * expansion.gradient
                 H += share * expansion.curvature
             energy += path.features.T @ path.features / (len(path.features) * len(paths))
-        energy[np.diag_indices(n_f)] += ISOTROPY * np.trace(energy) / n_f
+        energy[np.diag_indices(n_f)] += isotropy * np.trace(energy) / n_f
         matrix = H + damping * 2.0 * action_weight * np.kron(np.eye(n_a), energy)
         matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
         nothing = np.full((n_a, n_f), np.nan), np.nan

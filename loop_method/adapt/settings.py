@@ -5,27 +5,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from loop_method.settings import Settings, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelBasedSettings(Settings):
-    """The constants of `model_based`.
+class ImprovementSettings(Settings):
+    """The constants of improving a law on a model, and of the verdict on it.
 
     Nothing has a unit: costs and gains are scaled by those of the law that an improvement begins with.
     """
 
-    first_renewal: int = setting(
-        6,
-        "rollouts before the first improvement, explorations included; then at least twice as many "
-        "each time",
-        2,
-        1_000_000,
-    )
     judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
-    enough_fields: int = setting(
-        48, "number of measured fields at which improvements stop", 2, 1_000_000
-    )
     believed: float = setting(
         0.05,
         "largest error E at which a model is used; above it, local steps are taken",
@@ -37,13 +29,6 @@ class ModelBasedSettings(Settings):
         "the same with measurement noise",
         0.0,
         1.0,
-    )
-    readings_trust: float = setting(
-        1.0,
-        "weight of the distance from the start of a step on a model of readings; for a linear "
-        "plant the step is 1/(1 + weight) of the full one",
-        0.0,
-        1e6,
     )
     mixtures: int = setting(
         24,
@@ -105,12 +90,132 @@ class ModelBasedSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussNewtonSettings(Settings):
+class ModelBasedSettings(ImprovementSettings):
+    """The constants of `model_based`."""
+
+    first_renewal: int = setting(
+        6,
+        "rollouts before the first improvement, explorations included; then at least twice as many "
+        "each time",
+        2,
+        1_000_000,
+    )
+    enough_fields: int = setting(
+        48, "number of measured fields at which improvements stop", 2, 1_000_000
+    )
+    readings_trust: float = setting(
+        1.0,
+        "weight of the distance from the start of a step on a model of readings; for a linear "
+        "plant the step is 1/(1 + weight) of the full one",
+        0.0,
+        1e6,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussNewtonSettings(ImprovementSettings):
     """The constants of `gauss_newton`."""
 
+    isotropy: float = setting(
+        0.3,
+        "share of the identity in the second moment of [s; 1] that scales the gains",
+        1e-12,
+        1.0,
+    )
     fields: int = setting(
         3,
         "initial fields M on which a policy is judged at first; their number grows to 2M",
         1,
         1000,
     )
+    abort: float = setting(
+        1.05,
+        "multiple of the incumbent's running mean at which a candidate is given up",
+        1.0,
+        100.0,
+    )
+    small_gain: float = setting(
+        0.02, "share of the cost below which an accepted step adds a field", 0.0, 1.0
+    )
+    remembered: int = setting(40, "newest rollouts, to which models are fitted", 1, 1_000_000)
+    first_damping: float = setting(1.0, "damping to begin with", 1e-12, 1e12)
+    least_damping: float = setting(1e-4, "smallest damping", 1e-12, 1e12)
+    largest_damping: float = setting(100.0, "largest damping after a rejection", 1e-12, 1e12)
+    good_ratio: float = setting(
+        0.5, "ratio of measured to predicted fall above which the damping is reduced", 0.0, 10.0
+    )
+    poor_ratio: float = setting(0.2, "the same up to which it is raised", 0.0, 10.0)
+    damping_fall: float = setting(3.0, "divisor of the damping after a good step", 1.0, 1e6)
+    damping_rise: float = setting(2.0, "factor of the damping after a poor step", 1.0, 1e6)
+    damping_rejected: float = setting(4.0, "factor of the damping after a rejection", 1.0, 1e6)
+    least_fall: float = setting(
+        1e-3, "predicted fall, as a share of the cost, below which a step is not tried", 0.0, 1.0
+    )
+    trust: float = setting(
+        0.03,
+        "weight of the distance of a step on a model of the whole field, per damping",
+        0.0,
+        1e6,
+    )
+    newest: int = setting(8, "newest initial fields of a step on such a model", 1, 1000)
+    extrapolation: float = setting(
+        1.5, "ratio of the distances from their mean of further fields and of these", 0.0, 100.0
+    )
+    pieces: int = setting(
+        8, "pieces of a rollout that a model of a chaotic plant has to predict", 2, 1000
+    )
+    chaotic_growth: float = setting(
+        20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
+    )
+    chaotic_share: int = setting(
+        3,
+        "interval of the measured states of a chaotic plant that make a law; the others judge it",
+        2,
+        100,
+    )
+    modes: int = setting(32, "coordinates of a local model; never fewer than the law's", 1, 512)
+    cubic_modes: int = setting(12, "maximum number of coordinates of its cubic part", 0, 64)
+    ridges: int = setting(6, "ridges of the quadratic and cubic part that are tried", 1, 100)
+    least_ridge: float = setting(
+        1e-6, "smallest of these ridges, relative to a unit weight", 1e-15, 1e6
+    )
+    largest_ridge: float = setting(1e-1, "largest of these ridges", 1e-15, 1e6)
+    linear_ridge: float = setting(1e-5, "ridge of the linear part", 0.0, 1.0)
+    action_ridge: float = setting(1e-8, "ridge of the inputs", 0.0, 1.0)
+    ageing: float = setting(
+        0.9, "weight of a rollout against one that is M rollouts newer", 1e-6, 1.0
+    )
+    least_weight: float = setting(0.3, "smallest such weight", 0.0, 1.0)
+    low_forgetting: float = setting(
+        5.0, "smallest forgetting kappa that is tried besides 0", 0.0, 1e3
+    )
+    middle_forgetting: float = setting(15.0, "the next one", 0.0, 1e3)
+    high_forgetting: float = setting(50.0, "the largest one", 0.0, 1e3)
+    local_cost: float = setting(
+        3.0, "maximum cost of a rollout compared with the incumbent, per cost of that", 1.0, 1e6
+    )
+    worst: float = setting(2.0, "E that counts for a local model that diverges", 1.0, 1e6)
+    enough_factor: float = setting(
+        1.5,
+        "after an acceptance, the smallest kappa whose E is at most this times the minimum is used",
+        1.0,
+        1e3,
+    )
+    alike_factor: float = setting(
+        3.0, "models whose E is at most this times the minimum are averaged", 1.0, 1e3
+    )
+    alike_margin: float = setting(0.03, "added to both of these bounds", 0.0, 2.0)
+    alike_distance: float = setting(
+        0.15, "maximum difference of these E from the minimum", 0.0, 2.0
+    )
+
+    @property
+    def ridge_values(self) -> tuple[float, ...]:
+        """The ridges, equally spaced in their logarithm."""
+        found = np.geomspace(self.least_ridge, self.largest_ridge, self.ridges)
+        return tuple(float(f"{ridge:.12g}") for ridge in found)
+
+    @property
+    def forgettings(self) -> tuple[float, ...]:
+        """The values of kappa."""
+        return (0.0, self.low_forgetting, self.middle_forgetting, self.high_forgetting)

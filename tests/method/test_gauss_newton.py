@@ -20,9 +20,11 @@ from loop_method.adapt import (
     Trajectory,
     field_step,
     final_comparison,
+    local_step,
 )
 from loop_method.adapt.base import Record
 from loop_method.adapt.proposer import Proposer
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.design.lqt import track
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import parameters, same_bits, train_here
@@ -343,6 +345,64 @@ def test_a_clearly_worse_candidate_is_given_up_after_one_rollout() -> None:
     assert row["accepted"] is False
     assert row["damping"] == 4 * damping
     assert np.array_equal(optimizer.policy, before)
+
+
+def test_the_damping_is_set_by_the_settings() -> None:
+    plant = Plant()
+    settings = GaussNewtonSettings(
+        first_damping=2.0,
+        damping_rejected=5.0,
+        largest_damping=7.0,
+        damping_fall=4.0,
+        good_ratio=0.0,
+    )
+    for candidate, damping in ((1e4, 7.0), (0.0, 0.5)):
+        optimizer = make(plant, settings=settings)
+        row = optimizer.tell(measure(plant, optimizer.ask()))
+        assert row["damping"] == 2.0
+        while "accepted" not in row:
+            (asked,) = optimizer.ask()
+            row = optimizer.tell(
+                [replace(plant.run(asked.policy, asked.field_seed), cost=candidate)]
+            )
+        assert row["accepted"] is (candidate == 0.0) and row["damping"] == damping
+
+
+def test_a_candidate_is_given_up_where_the_settings_say() -> None:
+    plant = Plant()
+    for abort, rollouts in ((1.05, 1), (1.5, 3)):
+        optimizer = make(plant, settings=GaussNewtonSettings(abort=abort))
+        results = measure(plant, optimizer.ask())
+        optimizer.tell([replace(result, cost=10.0) for result in results])
+        row: dict[str, Any] = {}
+        while "accepted" not in row:
+            (asked,) = optimizer.ask()
+            row = optimizer.tell([replace(plant.run(asked.policy, asked.field_seed), cost=12.0)])
+        assert row["accepted"] is False and row["rollouts"] == 3 + rollouts
+
+
+def test_all_kinds_of_steps_are_given_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+    settings = GaussNewtonSettings(modes=5, pieces=4)
+
+    def field_model(*known: Any) -> tuple[None, bool]:
+        given.append(known[-1])
+        return None, False
+
+    def propose(*_: Any, **named: Any) -> None:
+        given.append(named["settings"])
+
+    monkeypatch.setattr(field_step, "field_model", field_model)
+    monkeypatch.setattr(local_step, "propose", propose)
+    plant = Plant()
+    optimizer = make(plant, settings=settings)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    assert given == [settings, settings]
+
+
+def test_the_ridges_are_equally_spaced_in_their_logarithm() -> None:
+    assert GaussNewtonSettings().ridge_values == (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+    assert GaussNewtonSettings(ridges=1, least_ridge=0.5).ridge_values == (0.5,)
 
 
 def diverged(plant: Plant, rollout: Rollout, tail: str) -> RolloutResult:

@@ -11,7 +11,6 @@ import pytest
 
 from loop_method.adapt.local_model import LocalModel, extended_basis, fit
 from loop_method.adapt.local_step import (
-    KAPPAS,
     Comparison,
     choices,
     mismatches,
@@ -22,9 +21,11 @@ from loop_method.adapt.sensitivity import (
     damped_step,
     expand,
 )
+from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.reduce.identifiability import NotIdentifiableError
 
 R, N_A, N_S, STEPS = 4, 2, 3, 12
+KAPPAS = GaussNewtonSettings().forgettings
 
 
 def planted(seed: int = 0, bend: float = 0.1) -> LocalModel:
