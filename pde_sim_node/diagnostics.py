@@ -26,7 +26,8 @@ class PlantDiagnostics:
         pacer = lockstep.pacer
         if pacer and pacer.missed > self._missed and level is Level.OK:
             level = Level.WARN
-            message += f"; {pacer.missed - self._missed} states too late for real time"
+            late = pacer.missed - self._missed
+            message += f"; {late} state{'s' * (late > 1)} too late for real time"
         self._missed = pacer.missed if pacer else 0
         return Status(
             level,

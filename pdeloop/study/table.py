@@ -28,10 +28,10 @@ from pdeloop.study.training import differences, environment
 
 CAVEAT = (
     f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
-    "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
+    "and with it LQT's cost, varies strongly between seeds: with few seeds such an interval is wide, "
     "and still too narrow."
 )
-ABOVE = "A negative percentage is one above LQT."
+ABOVE = "A negative percentage means a cost above LQT."
 MARK = "*"
 """Mark of results computed in other environments."""
 AVERAGES = ("ratio of the means", "mean of the ratios")
@@ -126,7 +126,7 @@ def above(found: Mapping[str, Any] | None) -> bool:
 
 
 def beside_no_control(table: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Controllers that cost no less than no control, which a share of LQT's cost does not show.
+    """Controllers no cheaper than no control, which a reduction against LQT does not show.
 
     A sentence for each LQT law and each adapted controller, or for its worst seed.
     """
@@ -138,14 +138,14 @@ def beside_no_control(table: Sequence[Mapping[str, Any]]) -> list[str]:
         known = CONTROLLERS.get(row["variant"])
         name = row["variant"] if known is None else known.name
         for whose, cost, so in (
-            ("LQT", row["lqt"], "; a share below it says little"),
+            ("LQT", row["lqt"], "; a reduction against it says little"),
             (name, row["cost"], ""),
             (f"{name} in its worst seed", row["worst"], ""),
         ):
             if cost is not None and cost >= none:
                 found.append(
-                    f"{row['problem']}: {whose} costs {cost_text(cost)}, no less than no control "
-                    f"({cost_text(none)}){so}."
+                    f"{row['problem']}: {whose} costs {cost_text(cost)}, at least as much as no "
+                    f"control ({cost_text(none)}){so}."
                 )
                 if whose == name:
                     break

@@ -199,7 +199,7 @@ def test_states_that_are_late_for_real_time_are_a_warning_once():
     (send,) = protocol.tick(0.3)
     late = health.report(0.3)
     assert late.level is Level.WARN
-    assert "1 states too late for real time" in late.message
+    assert "1 state too late for real time" in late.message
     assert health.report(0.35).level is Level.OK
 
 

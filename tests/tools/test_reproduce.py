@@ -24,13 +24,15 @@ def test_what_costs_no_less_than_no_control_is_named():
     row = {"problem": "p", "variant": "lqt_po", "none": 4.0, "lqt": 2.0, "cost": 1.0, "worst": 1.5}
     assert beside_no_control([row]) == []
     poor = {**row, "lqt": 8.0}
-    words = "p: LQT costs 8, no less than no control (4); a share below it says little."
+    words = (
+        "p: LQT costs 8, at least as much as no control (4); a reduction against it says little."
+    )
     assert beside_no_control([poor, {**poor, "variant": "pure_po"}]) == [words]
     assert beside_no_control([{**row, "worst": 4.5}]) == [
-        "p: LQT-PO in its worst seed costs 4.5, no less than no control (4)."
+        "p: LQT-PO in its worst seed costs 4.5, at least as much as no control (4)."
     ]
     assert beside_no_control([{**row, "cost": 4.0, "worst": 4.5}]) == [
-        "p: LQT-PO costs 4, no less than no control (4)."
+        "p: LQT-PO costs 4, at least as much as no control (4)."
     ]
     assert (
         beside_no_control([{**row, "cost": None, "worst": None}]) == []

@@ -292,7 +292,7 @@ function Nodes({ status }) {
 function Card({ role, name, present, level = 0, heard, restarts, rivals, message, values = [], ended }) {
   const lost = name && !ended ? "bad" : "muted";
   const facts = [present ? "present" : name ? "gone" : "not seen"];
-  if (heard !== null) facts.push(heard < 1.5 ? "heard now" : `last heard ${Math.round(heard)} s ago`);
+  if (heard !== null) facts.push(heard < 1.5 ? "heard just now" : `last heard ${Math.round(heard)} s ago`);
   if (restarts) facts.push(restarts === 1 ? "joined again once" : `joined again ${restarts} times`);
   if (rivals) facts.push(`${rivals + 1} processes publish its topic`);
   return html`
