@@ -26,23 +26,23 @@ from pdeloop.output import print_json
 
 PROGRAMS = {
     "first_run": "where the first `make run` in a fresh clone spends its time",
-    "rtt": "rounds per second of the loop, compared with a bare ping-pong",
-    "batch": "environment steps per second against the batch",
-    "train": "a whole training: topics against in-process",
+    "rtt": "rounds per second of the loop, next to a bare ping-pong",
+    "batch": "environment steps per second against the size of the batch",
+    "train": "a whole training: over topics against in process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
-    "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
-    "field_models": "which model of the whole field is believed, and how well it predicts",
+    "baselines": "optimisers and other methods at equal rollouts, with intervals over seeds",
+    "field_models": "the selected model of the whole field and its error",
     "choices": "how often the law that a training returns is the wrong one",
-    "general": "held-out plants and initial fields: first law, adapted law and what is possible",
-    "scale": "what messages, bags, fits, memory and files cost as the state grows",
+    "general": "held-out plants and initial fields: first law, adapted law and limit",
+    "scale": "messages, bags, fits, memory and files as the state grows",
     "published": "tasks with published figures, side by side",
-    "optimum": "what the policy class and any controller at all could reach, by exact gradients",
+    "optimum": "limits of the policy class and of any controller, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
-    "estimator": "what an estimator with the true plant reaches with few sensors and noise",
-    "few_sensors": "trainings with few sensors and noise, each seed by itself",
-    "linearised": "what the LQR law of the exact linearisation at the target costs",
-    "environments": "steps a second of the Gymnasium environments",
-    "participants": "memory and processor time of many idle nodes that know each other",
+    "estimator": "cost of an estimator with the true plant, few sensors and noise",
+    "few_sensors": "trainings with few sensors and noise, seed by seed",
+    "linearised": "cost of the LQR law of the exact linearisation at the target",
+    "environments": "steps per second of the Gymnasium environments",
+    "participants": "memory and processor time of many idle nodes",
     "kernel": "time of a step, compared with other implementations",
 }
 
@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     """The parser of all programs."""
     root = argparse.ArgumentParser(
         prog="python -m benchmarks",
-        description="Measure. What is compared runs in turns in one run; figures are medians.",
+        description="Measure. Competitors take turns in one run; figures are medians.",
         epilog="example: python -m benchmarks rtt --turns 3",
     )
     programs = root.add_subparsers(required=True, metavar="PROGRAM", parser_class=_Program)

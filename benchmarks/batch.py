@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks batch`: environment steps per second against the batch, and where its knee is.
+"""`python -m benchmarks batch`: environment steps per second against the batch size, with its knee.
 
 A round of M environments takes t(M) = c + w M + s(M): what a message costs whatever is in it, what
 it costs for each environment (copies, the control law), and the solver. The batch pays as long as c

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks few_sensors`: trainings with few sensors and noise, each seed by itself.
+"""`python -m benchmarks few_sensors`: trainings with few sensors and noise, seed by seed.
 
 Costs are those of the closing evaluation on ten held-out fields, the same for all seeds and for
 `python -m benchmarks estimator`, which gives the bound. Finished trainings are kept in a folder, so

@@ -42,6 +42,14 @@ def test_the_first_page_names_each_document() -> None:
         assert page == "index.md" or f"({page})" in first, page
 
 
+def test_no_heading_begins_with_a_digit() -> None:
+    """Its anchor would: no CSS selector may, and the theme's script stops at such a page."""
+    for page in DOCS.rglob("*.md"):
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+        assert not re.search(r"^#+ [`*(]*\d", text, re.MULTILINE), page
+        assert re.search(r"^# \S", text, re.MULTILINE), page
+
+
 def test_a_link_that_leaves_the_documents_leads_to_the_repository() -> None:
     spec = importlib.util.spec_from_file_location("site_hooks", DOCS / "site_hooks.py")
     assert spec and spec.loader
