@@ -115,12 +115,26 @@ def parser() -> argparse.ArgumentParser:
         "topics.",
         epilog="example: pdeloop train burgers (every command has an example in its --help)",
     )
-    root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
+    root.add_argument(
+        "--version",
+        action=_Version,
+        nargs=0,
+        default=argparse.SUPPRESS,
+        help="show program's version number and exit",
+    )
     commands = root.add_subparsers(required=True, metavar="COMMAND")
     for name in COMMANDS:
         # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
         importlib.import_module(f"pdeloop.commands.{name}").add(commands)
     return root
+
+
+class _Version(argparse.Action):
+    """Looks the version up when it is asked for; argparse's own action has to be given it."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(f"pdeloop {_version()}")
+        parser.exit()
 
 
 def _version() -> str:

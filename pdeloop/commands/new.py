@@ -15,7 +15,6 @@ from string import Template
 from loop_interfaces.files import FileError, write_atomically
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
-from pde_sim_node.plants.loading import PLANTS
 from pdeloop.commands.common import Commands, command
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
@@ -69,8 +68,11 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
 def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
     """ParameterError if a problem or plant, its module or its class cannot have this name."""
     another = "; take another name"
-    if plant and name in PLANTS:
-        raise ParameterError(f"'{name}' is a shipped plant{another}")
+    if plant:
+        from pde_sim_node.plants.loading import PLANTS
+
+        if name in PLANTS:
+            raise ParameterError(f"'{name}' is a shipped plant{another}")
     if module in {problem.replace("-", "_") for problem in shipped_problems()}:
         raise ParameterError(f"'{name}' is a shipped problem{another}")
     if iskeyword(module) or _is_module(module):

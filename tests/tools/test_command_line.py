@@ -159,6 +159,13 @@ def test_ctrl_c_finds_little_to_interrupt_before_it_is_caught() -> None:
     assert python("-c", code).stdout.strip() == "[]"
 
 
+def test_the_help_of_all_commands_and_their_completion_wait_for_no_numerics() -> None:
+    slow = ("numpy", "scipy", "numba", "rclpy", "matplotlib", "importlib.metadata")
+    code = "import sys; from pdeloop.cli import parser; parser(); "
+    done = python("-c", f"{code} print([name for name in {slow} if name in sys.modules])")
+    assert done.stdout.strip() == "[]"
+
+
 def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys) -> None:
     def interrupted() -> argparse.ArgumentParser:
         raise KeyboardInterrupt
