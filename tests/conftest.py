@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pdeloop.training_run import load_compiled, resolve
 from tests.support.colcon_workspace import Workspace, build
+from tests.support.compiled import COMPILED
 from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
 from tests.support.small import RECORDED, REPRODUCED, SMALL
@@ -28,9 +28,13 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """What nearly all tests use is compiled by one of several workers, not by each of them."""
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        made_once(tmp_path_factory, "compiled", lambda _: load_compiled(resolve(str(SMALL), {})))
+    """What nearly all tests use is compiled once, its parts by as many workers, not by each of them."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    first = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw")) % len(COMPILED)
+    names = list(COMPILED)
+    for name in (*names[first:], *names[:first]):
+        made_once(tmp_path_factory, f"compiled-{name}", lambda _, name=name: COMPILED[name]())
 
 
 @pytest.fixture(autouse=True)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -58,22 +59,27 @@ def rollouts_of(
     return true, measured
 
 
-TRUE, ROLLOUTS = rollouts_of(reaction_diffusion(), 5)
+@cache
+def noisy() -> tuple[list[Array], list[Measured]]:
+    """Five of them, made when a test needs them, and not in each worker that collects the tests."""
+    return rollouts_of(reaction_diffusion(), 5)
 
 
 def error_in(model: SpectralModel, states: Sequence[Array]) -> float:
-    exact = [Measured(z, r.actions) for z, r in zip(states, ROLLOUTS, strict=True)]
+    _, rollouts = noisy()
+    exact = [Measured(z, r.actions) for z, r in zip(states, rollouts, strict=True)]
     return float(errors(model, exact, TARGET, 2.0).mean())
 
 
 def test_noise_leaves_the_equation_right() -> None:
-    known = with_clean(ROLLOUTS, NOISE)
+    true, rollouts = noisy()
+    known = with_clean(rollouts, NOISE)
     model = fit_noisy(known, CUBIC, SETTINGS, NOISE)
     assert model is not None
-    assert error_in(model, TRUE) < 0.02
+    assert error_in(model, true) < 0.02
     # What is fitted as if it were exact is far off: noise is taken for decay.
-    naive = fit_spectral(Samples.of(ROLLOUTS), CUBIC, SETTINGS)
-    assert naive is None or error_in(naive, TRUE) > 100 * error_in(model, TRUE)
+    naive = fit_spectral(Samples.of(rollouts), CUBIC, SETTINGS)
+    assert naive is None or error_in(naive, true) > 100 * error_in(model, true)
     low = slice(1, 6)
     assert model.symbols[0, low].real == pytest.approx(
         reaction_diffusion().linear[low].real, abs=8e-3
@@ -81,7 +87,8 @@ def test_noise_leaves_the_equation_right() -> None:
 
 
 def test_the_same_rollouts_give_the_same_bits() -> None:
-    known = with_clean(ROLLOUTS[:2], NOISE)
+    _, rollouts = noisy()
+    known = with_clean(rollouts[:2], NOISE)
     first, second = (fit_noisy(known, CUBIC, SETTINGS, NOISE) for _ in range(2))
     assert first is not None and second is not None
     assert first.symbols.tobytes() == second.symbols.tobytes()
@@ -96,15 +103,17 @@ def test_the_choice_believes_it_and_says_what_noise_does_not_explain() -> None:
 
 
 def test_the_error_of_the_true_model_is_nothing_but_noise() -> None:
-    exact = [Measured(r.states, r.actions, clean=z) for r, z in zip(ROLLOUTS, TRUE, strict=True)]
-    share = NOISE**2 * sum(r.states.size for r in ROLLOUTS)
-    share /= sum(float(np.sum(r.states**2)) for r in ROLLOUTS)
+    true, rollouts = noisy()
+    exact = [Measured(r.states, r.actions, clean=z) for r, z in zip(rollouts, true, strict=True)]
+    share = NOISE**2 * sum(r.states.size for r in rollouts)
+    share /= sum(float(np.sum(r.states**2)) for r in rollouts)
     assert errors(reaction_diffusion(), exact, TARGET, 2.0).mean() > 0.5 * share
     assert errors(reaction_diffusion(), exact, TARGET, 2.0, NOISE).mean() < 0.05 * share
 
 
 def test_filtered_states_are_better_than_measured_ones() -> None:
-    known = with_clean(ROLLOUTS, NOISE)
+    true, rollouts = noisy()
+    known = with_clean(rollouts, NOISE)
     found = filtered(
         reaction_diffusion(),
         known,
@@ -112,14 +121,15 @@ def test_filtered_states_are_better_than_measured_ones() -> None:
         np.full(POINTS // 2 + 1, 0.1),
         SETTINGS.far,
     )
-    error = np.mean([np.mean((z - t)[20:] ** 2) for z, t in zip(found.states, TRUE, strict=True)])
+    error = np.mean([np.mean((z - t)[20:] ** 2) for z, t in zip(found.states, true, strict=True)])
     # Without an error of the model, a gain g leaves at most g / (2 - g) of the noise.
     assert error < 0.1 / 1.9 * NOISE**2
     assert not found.lost
 
 
 def test_a_gain_of_one_is_what_was_measured() -> None:
-    known = with_clean(ROLLOUTS[:1], NOISE)
+    _, rollouts = noisy()
+    known = with_clean(rollouts[:1], NOISE)
     ones = np.ones(POINTS // 2 + 1)
     found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones, SETTINGS.far)
     np.testing.assert_allclose(found.states[0], known[0].states, atol=1e-12)

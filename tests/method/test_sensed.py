@@ -86,7 +86,7 @@ def _equally_spaced(n_a: int) -> Array:
 
 def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
     """u_t = -u_xxx + 3 (u^2)_x on a domain of length 20; the soliton is not seen in the beginning."""
-    problem = pdeloop.problem("kdv", sensors=SENSORS)
+    problem = pdeloop.problem("kdv", sensors=SENSORS, horizon=50)
     plant = problem.plant()
     model, fields, error = _fitted(problem, 1000)
     assert error < 1e-5
@@ -113,7 +113,7 @@ def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
 def test_actuators_need_not_be_equally_spaced() -> None:
     positions = [0.1, 0.22, 0.55]
     strong = {"actuator_positions": positions, "n_a": 3, "exploration_variance": 4.0}
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=50, **strong)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=30, **strong)
     model, _, error = _fitted(problem, 1000)
     assert error < 1e-4
     x = np.arange(len(model.B)) / len(model.B)

@@ -4,6 +4,8 @@
 `tests.support.loop_harness` starts that process with this module.
 """
 
+import gc
+
 import controller_node.node
 import pde_sim_node.node
 import recorder_node.node
@@ -11,8 +13,7 @@ import tests.support.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
 from pdeloop import cli
-from pdeloop.training_run import load_compiled, resolve
-from tests.support.small import SMALL
+from tests.support.compiled import COMPILED
 
 MAINS = {
     "controller_node": controller_node.node.main,
@@ -24,4 +25,7 @@ MAINS = {
 }
 
 cli.parser()  # imports what the commands need
-load_compiled(resolve(str(SMALL), {}))  # loads what is compiled
+for load in COMPILED.values():
+    load()
+gc.collect()
+gc.freeze()  # a collection in a forked process would write to, and so copy, all of this

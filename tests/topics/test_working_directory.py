@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -54,6 +55,18 @@ WORDS: dict[str, tuple[str, ...]] = {
     "check": ("check", str(SMALL), "--picture", "check.png"),
 }
 """What each command is called with, in an order in which it finds what it needs."""
+ONE_AFTER_THE_OTHER = """
+import json, sys
+from pdeloop.cli import main
+
+if __name__ == "__main__":  # processes that it starts load this file, too
+    for words in json.loads(sys.argv[1]):
+        sys.argv[1:] = words
+        code = main()
+        if code:
+            sys.exit(f"{words} ended with {code}")
+"""
+"""The script `pdeloop` for several commands, whose imports are as lazy and take longer than they do."""
 BENCHMARK = ("train", "--problem", str(SMALL), "--turns", "1", "--iterations", "1")
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node")
 
@@ -87,10 +100,14 @@ def test_no_command_and_no_node_runs_a_file_of_the_working_directory(
     assert set(WORDS) == set(COMMANDS)
     (tmp_path / "study.yaml").write_text(STUDY)
     taken = set_traps(tmp_path, third_party() | set(sys.stdlib_module_names))
-    train, *others = WORDS.values()
-    loop.wait(loop.program(str(BIN / "pdeloop"), *train), LIMIT)
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    (folder / "commands.py").write_text(ONE_AFTER_THE_OTHER)
+    in_script = [words for name, words in WORDS.items() if name not in ("train", "monitor")]
+    loop.wait(loop.program(str(BIN / "pdeloop"), *WORDS["train"]), LIMIT)
     started = [loop.program(str(BIN / name), "--help") for name in NODES]
-    started += [loop.program(str(BIN / "pdeloop"), *words) for words in others]
+    started.append(loop.program(str(BIN / "pdeloop"), *WORDS["monitor"]))
+    started.append(loop.program(sys.executable, str(folder / "commands.py"), json.dumps(in_script)))
     for process in started:
         finish(loop, process)
     assert not taken.exists(), taken.read_text()
@@ -111,7 +128,7 @@ def test_completion_runs_no_file_of_the_working_directory(tmp_path: Path) -> Non
     assert not taken.exists(), taken.read_text()
 
 
-@pytest.mark.parametrize("words", [("pdeloop", *TRAIN), ("benchmarks", *BENCHMARK)])
+@pytest.mark.parametrize("words", [("pdeloop", *TRAIN, "--in-process"), ("benchmarks", *BENCHMARK)])
 def test_modules_that_python_starts_run_no_file_of_the_working_directory(
     words: tuple[str, ...], loop: Processes, tmp_path: Path
 ) -> None:
