@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,13 @@ def _one(colour: Any) -> Any:
     """A colour on dark."""
     if isinstance(colour, str) and colour == "none":
         return colour
-    rgba = np.array(to_rgba(colour))
+    return _on_dark(to_rgba(colour))
+
+
+@cache
+def _on_dark(colour: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """A figure has thousands of artists in a dozen colours."""
+    rgba = np.array(colour)
     for controller in CONTROLLERS.values():
         if np.allclose(rgba[:3], to_rgba(controller.colour)[:3], atol=2e-3):
             return (*to_rgba(controller.on_dark)[:3], float(rgba[3]))
