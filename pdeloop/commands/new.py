@@ -27,9 +27,9 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
 
     plant: of a plant instead, which --plant names.
 
-    name: of the problem and its folder, small letters, digits, '-' and '_'; into: where the folder
-    goes. ParameterError for another name, one that a shipped problem, Python, pytest or the class's
-    own file uses, and a folder that exists.
+    name: of the problem and its folder, lower-case letters, digits, '-' and '_'; into: where the
+    folder goes. ParameterError for another name, one that a shipped problem, Python, pytest or the
+    class's own file uses, and a folder that exists.
     """
     if len(name) > 60 or not _NAME.fullmatch(name):
         raise ParameterError(

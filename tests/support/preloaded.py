@@ -5,6 +5,10 @@
 """
 
 import gc
+import inspect
+
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.type_support import check_for_type_support
 
 import controller_node.node
 import pde_sim_node.node
@@ -27,5 +31,8 @@ MAINS = {
 cli.parser()  # imports what the commands need
 for load in COMPILED.values():
     load()
+# Looks through all modules, as rclpy does for a node's first line of a log.
+inspect.getmodule(inspect.currentframe())
+check_for_type_support(ParameterEvent)  # imports a generator of code, as each node would
 gc.collect()
 gc.freeze()  # a collection in a forked process would write to, and so copy, all of this

@@ -135,7 +135,7 @@ def test_the_test_that_new_writes_fails_where_the_step_is_too_coarse(folder: Pat
         ("../x", "cannot be the name"),
         ("9x", "cannot be the name"),
         ("2d-heat", "beginning with a letter"),
-        ("My-PDE", "small letters"),
+        ("My-PDE", "lower-case letters"),
         ("None", "cannot be the name"),
         ("wärme", "cannot be the name"),
         ("\udcff", "cannot be the name"),
