@@ -59,12 +59,15 @@ run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
 # Four workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own.
-test: setup packages
-	$(BIN)/python -m pytest -n 4 --dist worksteal
+PYTEST := $(BIN)/python -m pytest -n 4 --dist worksteal
+
+# All tests, each of them once; with COVERAGE=1, those without topics are run by `coverage`.
+test: setup packages $(if $(COVERAGE),coverage)
+	$(PYTEST) $(if $(COVERAGE),-m topics)
 
 # The tests without topics, with their coverage of the pure modules (pyproject.toml).
 coverage: setup packages
-	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not topics" -p pytest_cov --cov
+	$(PYTEST) -m "not topics" -p pytest_cov --cov
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, a C compiler for exported laws, zsh and fish for
