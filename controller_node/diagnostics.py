@@ -6,7 +6,7 @@ from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 from loop_interfaces.episodes import episode_name
 
 SILENT = 5.0
-"""Seconds without a state, within an episode, after which what is known of the plant is old."""
+"""Seconds without a state, within an episode, after which the plant counts as silent."""
 WAITING = 2.0
 """Seconds that a state may wait for what its answer needs, before it is a warning."""
 

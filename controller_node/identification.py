@@ -123,7 +123,7 @@ def identify(
     p : int
         Rank of "dmdc"; 0: n_s + n_a.
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
     settings : IdentificationSettings
         How an order is suggested.
 
@@ -212,7 +212,7 @@ def designed(
     settings : DesignSettings
         Method, order, which is lowered to the size of the state where that is smaller, and weights.
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
     further : sequence of (states (N + 1, n_z), actions (N, n_a))
         Other trajectories, for a model of the whole field alone: POD modes of several fields together
         are those of none.

@@ -22,7 +22,7 @@ from loop_method.laws.calls import action, one_thread, updated
 
 
 class MemoryUnknownError(Exception):
-    """An action depends on what is not known of the episode; the text says on what.
+    """An action depends on states of the episode that are not known; the text names them.
 
     contradicted: because two different states arrived for one step, so that what was answered may be
     wrong; otherwise because steps were missed.

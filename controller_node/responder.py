@@ -298,7 +298,7 @@ class Responder:
         return lacking
 
     def _run(self, number: int, more: int) -> RunState:
-        """The record of a run, with room for `more` bytes. FrameError if there is none."""
+        """The record of a run, with room for `more` bytes; FrameError if there is no room."""
         run = self._runs.setdefault(number, RunState())
         forget(self._runs, number, self._served[0])
         if not self._has_room(number, more):

@@ -78,14 +78,14 @@ CHANNEL = np.dtype(
         ("first", np.int64),  # slot of the message that has waited longest
         ("waiting", np.int64),  # how many messages wait
         ("dropped", np.int64),  # how many it could not hold
-        # What was answered since the channel was armed.
+        # Messages answered since the channel was armed.
         ("answered", np.int64),
         ("answered_at", np.int64),  # the last one; ns on the monotonic clock
     ]
 )
 SOURCES = cache, simd, native
 CAPACITY = 16
-"""Messages that the mailbox holds: twice what the middleware keeps for a reader of its own."""
+"""Capacity of the mailbox, in messages: twice the middleware's for a reader of its own."""
 SLOTS = CAPACITY + 1
 LARGE = 2**20
 """Bytes of a message in the mailbox whose memory is given back as soon as it was read."""
@@ -136,7 +136,7 @@ def unlock(channel: Any) -> None:
 
 @jit
 def answered(channel: Any, message: int) -> bool:
-    """Let the handler answer the message in a slot, and publish what it says."""
+    """Let the handler answer the message in a slot, and publish the answer."""
     raw, length = read_word(message, BUFFER), read_word(message, LENGTH)
     if call_c(channel.handle, (channel.plan, raw, length)) == 0:
         return False
@@ -186,7 +186,7 @@ def on_messages(channels: Any, count: int) -> None:
 on_new_message = MachineCode(on_messages, types.void(pointer_to(CHANNEL), types.intp), *SOURCES)
 
 
-# What the node's own thread calls.
+# Calls of the node's own thread.
 
 
 @cached_njit(*SOURCES)

@@ -36,7 +36,7 @@ def field_range(values: NDArray[np.floating], target: NDArray[np.floating]) -> t
     Parameters
     ----------
     values
-        Of a component, of any shape; what is not finite is left out.
+        Of a component, of any shape; values that are not finite are ignored.
     target
         Its target, of any shape; empty if it is not known.
 

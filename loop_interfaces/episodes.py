@@ -22,6 +22,6 @@ def episode_name(number: int) -> str:
 
 
 def episode_number(name: str) -> int:
-    """The number of the episode that `episode_name` writes so. ValueError if it is none."""
+    """The number of the episode with this `episode_name`. ValueError if there is none."""
     start, _, index = name.rpartition(".")
     return int(start or 0) * EPISODES_PER_START + int(index)

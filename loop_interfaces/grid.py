@@ -33,7 +33,7 @@ class Axis:
     size : int
         Grid points.
     periodic : bool
-        Whether the end is the beginning again. Then the points are i L / n.
+        Whether the axis is periodic. Then the points are i L / n.
     walls : bool
         Of an axis that is not periodic: whether its first and last points lie on the walls, at
         i L / (n - 1), or the points are centres of cells, at (i + 1/2) L / n.

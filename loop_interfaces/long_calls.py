@@ -36,7 +36,7 @@ class LongCalls:
         self._thread: threading.Thread | None = None
 
     def tell(self, text: str) -> None:
-        """What is done with the sentence; a node logs it."""
+        """The use of the sentence; a node logs it."""
         print(text, file=sys.stderr, flush=True)
 
     @contextmanager

@@ -27,7 +27,7 @@ class ModelRows:
     """A reduced model, its warm-start gains and its target.
 
     A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a and K_b (n_a, n_s), s_r (n_s,). L (n_s, n_s): the
-    estimate after a measurement is p + L (U^T z - p), with p the one before it; None: there is none.
+    estimate after a measurement is p + L (U^T z - p), with p the prediction; None: no filter.
     """
 
     A: Array

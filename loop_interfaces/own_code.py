@@ -88,7 +88,7 @@ class OwnCode:
         return name
 
     def configured(self, name: str, environment: Mapping[str, str] = os.environ) -> Any:
-        """Load what a problem's parameters name, if it may be run.
+        """Load the code that a problem's parameters name, if it may be run.
 
         Raises
         ------

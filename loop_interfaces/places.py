@@ -101,7 +101,7 @@ def parse(text: str) -> list[Box]:
     Raises
     ------
     ValueError
-        The text is none of boxes.
+        The text does not describe boxes.
 
     Examples
     --------

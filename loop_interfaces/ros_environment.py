@@ -48,7 +48,7 @@ class RosEnvironmentError(ValueError):
 
 
 def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """The environment of a node that is to start in this one, and what was left out, in words.
+    """The environment of a node to be started in this one, and what was removed, in words.
 
     RosEnvironmentError where it cannot work. What has the project's profile already is complete.
     """
@@ -103,7 +103,7 @@ def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]
 
 
 def with_log_folder(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """The environment with a folder where ROS can write its logs, and what was said about it.
+    """The environment with a folder where ROS can write its logs, and a remark about it.
 
     RosEnvironmentError where the folder that ROS_LOG_DIR names cannot be written.
     """

@@ -180,7 +180,7 @@ def _plain(number: float) -> str:
 
 
 def assignment(text: str) -> tuple[str, Value]:
-    """Name and value of a text 'NAME=VALUE'; its parameter says later what the value has to be.
+    """Name and value of a text 'NAME=VALUE'; its parameter checks the value later.
 
     >>> assignment("physical.viscosity=1e-3")
     ('physical.viscosity', 0.001)

@@ -100,7 +100,7 @@ class CostColumn(IntEnum):
 
 
 WRITER_DEPTH = 1
-"""Only the newest sample has a meaning; what was lost is sent again by the protocol."""
+"""Only the newest sample has a meaning; the protocol repeats lost ones."""
 READER_DEPTH = 8
 """A message of ours must not be pushed out by one of a node that should not be there."""
 
@@ -122,7 +122,7 @@ TARGET = Topic("target", ("x",), latched=True)
 PAUSED = Topic("episode/paused", ("paused",), latched=True)
 """One number: 1 while an operator has paused the plant, 0 otherwise. For information only."""
 
-# Volatile, depth 1: in lock-step only the newest sample has a meaning; the plant repeats what is lost.
+# Volatile, depth 1: in lock-step only the newest sample has a meaning; the plant repeats lost ones.
 STATE = Topic("state", ("env", "x"), latched=False)
 ACTION = Topic("action", ("env", "actuator"), latched=False)
 
@@ -154,7 +154,7 @@ VIEW_NUMBERS = {
     "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
     "step": "k of the newest sample",
 }
-"""Names of the numbers that a viewer publishes below `view/`, and what they are."""
+"""Names and meanings of the numbers that a viewer publishes below `view/`."""
 
 VIEWS = {
     "view/field": "visualization_msgs/msg/Marker",

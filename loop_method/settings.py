@@ -27,15 +27,15 @@ def setting(
     Parameters
     ----------
     default
-        Its value where none is given; its type is that of the constant.
+        Default value; its type is that of the constant.
     description
-        What it means, for tables and errors.
+        Meaning, for tables and errors.
     minimum, maximum
         Its range, ends included; None: unbounded.
     unit
         Of its value.
     choices
-        The values that text may have.
+        Admissible values of a text.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def setting(
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """The constants of a method that can be set; derive from it, and declare each with `setting`.
+    """Base class of a method's constants; declare each with `setting`.
 
     Raises
     ------

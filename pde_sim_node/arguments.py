@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Checks of the plant's arguments: the value, or a ValueError that says what is right."""
+"""Checks of the plant's arguments: the value, or a ValueError that says what is expected."""
 
 import math
 import numbers

@@ -36,25 +36,24 @@ MEAN_DRAWS = 100
 
 
 class Dynamics(ABC):
-    """One environment of a plant, z_{k+1} = f(z_k, a_k), to be derived from.
+    """Base class of one environment of a plant, z_{k+1} = f(z_k, a_k).
 
-    A class derived from it says how many numbers a state and an action have, how a state begins and
-    how it advances. Batches of environments, seeds, costs, divergences, noise, sensors and everything
-    else of a plant come with that. What a class does not set has the value that is given here. They
-    may be set in ``__init__`` as well, whose arguments are the plant's parameters (`physical.NAME` in
-    a problem's file).
+    A derived class defines the sizes of state and action, the initial state and the step. Batches of
+    environments, seeds, costs, divergence, noise, sensors and everything else of a plant are provided.
+    Attributes that a class does not set have the values given here. They may also be set in
+    ``__init__``, whose arguments are the plant's parameters (`physical.NAME` in a problem's file).
 
-    The same arguments must give the same bits: randomness only from the ``rng`` that is handed over,
-    no state that outlasts a call. `step` is called with one LAPACK thread.
+    The same arguments must give the same bits: take random numbers only from the given ``rng``, and
+    keep no state between calls. `step` is called with one LAPACK thread.
 
     Attributes
     ----------
     n_a : int
-        Size of an action; has to be set.
+        Size of an action; required.
     n_z : int
-        Size of a state; has to be set unless ``grid`` is.
+        Size of a state; required unless ``grid`` is set.
     grid : Grid or None
-        What the numbers of a state are; None: a plain vector.
+        Meaning of a state's numbers; None: a plain vector.
     target : array of n_z numbers, or number
         State z_r to be tracked, or the target of the output; one row per step: the target of each step.
     horizon : int
@@ -70,16 +69,16 @@ class Dynamics(ABC):
     terminal_weight : number, diagonal or matrix
         Weight of the state after the last step.
     action_low, action_high : number or (n_a,)
-        Bounds of the actions. An action outside of them is moved to the nearest one that is allowed.
+        Bounds of the actions. An action outside is replaced by the nearest admissible one.
     zero_mean : bool
-        Whether the actions of a step are made to have mean zero.
+        Whether the actions of a step must have mean zero.
     divergence_bound : float
         A new state that is not finite or exceeds this magnitude anywhere ends the rollout.
     supports : (n_z, n_a) or None
         Where each actuator acts, for pictures.
     batched : bool
-        Whether `step` takes M states (M, n_z) and actions (M, n_a) at once. What it returns for one of
-        them must not depend on the others, to the last bit, which a matrix product does not promise.
+        Whether `step` takes M states (M, n_z) and actions (M, n_a) at once. The result for
+        one must not depend on the others, to the last bit; a matrix product does not guarantee this.
 
     Examples
     --------
@@ -105,7 +104,7 @@ class Dynamics(ABC):
     batched: ClassVar[bool] = False
 
     def __new__(cls, *arguments: Any, **named: Any) -> Dynamics:
-        """Remember the arguments, by which the plant is made again in other processes."""
+        """Remember the arguments, with which other processes make the plant again."""
         made = super().__new__(cls)
         if arguments or named:
             object.__setattr__(made, "_given", (arguments, named))
@@ -132,7 +131,7 @@ class Dynamics(ABC):
         Parameters
         ----------
         z : (n_z,)
-            z_k, a copy, which must stay as it is.
+            z_k, a copy, which must not be changed.
         a : (n_a,)
             a_k.
 
@@ -143,7 +142,7 @@ class Dynamics(ABC):
         """
 
     def actuated(self, a: Array) -> Array:
-        """The action that the actuators take in place of one that is asked for, and that costs.
+        """The action that is applied, and counted in the cost, for a requested one.
 
         Parameters
         ----------
@@ -153,8 +152,8 @@ class Dynamics(ABC):
         Returns
         -------
         (n_a,)
-            What `step` is given. Unless a class says otherwise the nearest action that ``action_low``,
-            ``action_high`` and ``zero_mean`` allow.
+            The action passed to `step`; by default the nearest one that ``action_low``,
+            ``action_high`` and ``zero_mean`` admit.
         """
         allowed = ActionSet(self.n_a, self.action_low, self.action_high, self.zero_mean)
         nearest: Array = allowed.project(a[np.newaxis])[0]
@@ -166,7 +165,7 @@ class Dynamics(ABC):
         Returns
         -------
         (n_z,), or the grid's shape
-            The average of 100 draws, unless a class says otherwise.
+            By default the average of 100 draws.
         """
         drawn = [self.initial_state(np.random.default_rng(seed)) for seed in range(MEAN_DRAWS)]
         mean: Array = np.mean(drawn, axis=0)

@@ -70,7 +70,7 @@ def standard_normal(
 class InstrumentedPlant:
     """A plant behind instruments, itself a plant.
 
-    As the plant, but `reset` and `step` return what is measured, `target` is the target of that, and
+    As the plant, but `reset` and `step` return the measurement, `target` is its target, and
     actions saturate. `states` are the true ones. An environment is forced only after a step that did
     not diverge, and has diverged as well if the forcing takes it beyond the bound.
 
@@ -184,7 +184,7 @@ class InstrumentedPlant:
         return self._published
 
     def step(self, actions: Array) -> Array:
-        """Hold the saturated actions for one sampling time; returns what is measured then."""
+        """Hold the saturated actions for one sampling time; returns the measurement after it."""
         limit = self.instruments.action_limit
         self.plant.step(np.clip(actions, -limit, limit) if limit else actions)
         if self._forcing:

@@ -227,7 +227,7 @@ class Lockstep:
         if frame.episode <= self.episode:
             return self._start_again(frame, rows, signed, now)
         replaced: list[Publication] = []
-        if self.active:  # what it comes to is known once the last state is sent
+        if self.active:  # its result is known once the last state is sent
             replaced = [self._finish(now, void=self.step < self.plant.horizon)]
         seeds = rows[:, StartColumn.SEED].astype(np.int64)
         self._state = self.plant.reset(seeds, noise_seeds(rows))
@@ -304,7 +304,7 @@ class Lockstep:
         self.deadline = now + self._patience
 
     def tick(self, now: float) -> list[Publication]:
-        """Do what is due: send the state that is ready, or again; give the episode up.
+        """Perform due work: send the state that is ready, repeat it, or give up the episode.
 
         With a pace, also call it once right after `action`, so that a state which is ready too late is
         distinguished from one that is sent too late.

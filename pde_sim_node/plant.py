@@ -60,7 +60,7 @@ class EpisodeCosts:
 class Instruments:
     """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
 
-    See loop_interfaces.parameters.INSTRUMENTS; 0 is none of it.
+    See loop_interfaces.parameters.INSTRUMENTS; 0 means none.
     """
 
     measurement_noise: float = 0.0

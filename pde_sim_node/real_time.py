@@ -39,7 +39,7 @@ class RealTimePacer:
         self._asked = False
 
     def clear(self) -> None:
-        """Forget what was counted."""
+        """Reset the counters."""
         self.count = 0
         self.missed = 0
         self.largest = 0.0

@@ -29,7 +29,7 @@ class Episode:
     """The record of an episode: the rows of its start, and the following of its actions.
 
     signature: what they carry if the controller signs; taken: a digest of the one that was taken at
-    each step; cost: what they came to, once it has ended.
+    each step; cost: the episode's cost, once it has ended.
     """
 
     rows: np.ndarray

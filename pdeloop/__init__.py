@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Control of PDEs from Python: what the command line does, on arrays (docs/python.md).
+"""Control of PDEs from Python: the command line's functions on arrays (docs/python.md).
 
 >>> import pdeloop
 >>> burgers = pdeloop.problem("burgers")

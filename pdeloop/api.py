@@ -73,7 +73,7 @@ class Problem:
         """A plant of M = `batch` environments, at the start of an episode with the fields 0 .. M - 1.
 
         `Plant.reset` begins another episode, of any M. `states` (M, n_z) are the fields, `step`
-        takes actions (M, n_a), and `episode_costs` has what it cost so far.
+        takes actions (M, n_a), and `episode_costs` has the costs so far.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ def problem(
     cost: Mapping[str, Any] | None = None,
     **parameters: Any,
 ) -> Problem:
-    """A shipped problem or one from a YAML file, with other parameters where they are given.
+    """A shipped problem, or one from a YAML file, with given parameters replaced.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def problem(
         A plant of your own: an object of a class derived from `Dynamics`, or a name
         ('file.py:Class'), whose code is then run. Without a `source` the rest is as the class has it.
     physical
-        The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
+        The parameters of the equation, like {"viscosity": 1e-3}, or of the named plant.
     cost
         Of an equation's plant, what is another cost than that of the numbers `state_weight` and
         `action_weight` and the equation's target: arguments of `loop_interfaces.cost.Cost` by name,
@@ -324,12 +324,12 @@ def train(
     law
         The control law: a class derived from `Law`, or a name; the problem's if not given.
     out
-        Folder of the results, as the command line keeps them; none is kept if not given.
+        Folder of the results, in the command line's layout; by default nothing is kept.
     over_topics
-        With the nodes in processes of their own, over ROS 2 topics, instead of in this process. Their
+        Run the nodes as separate processes over ROS 2 topics instead of in this process. Their
         logs are in `out`, which must then be given.
     progress
-        Where to show it, like sys.stdout; it is silent if not given.
+        Stream for progress messages, like sys.stdout; by default there are none.
     parameters
         As of `problem`: seed, seeds, rollouts, optimizer, optimizer_settings={"fields": 5}, ...
 

@@ -18,7 +18,7 @@ from pdeloop.output import aligned
 SHOWN = 30
 """Parameters that the text names at most."""
 IGNORED = {"out", "resume", "plant_fingerprint", "pairs", "problem"}
-"""Parameters that say where a run was, not what it was."""
+"""Parameters of a run's place, not of its content."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,25 +64,25 @@ def read_measurements(
     sample_time: float | None = None,
     target: ArrayLike | None = None,
 ) -> Measurements:
-    """The measurements in one file or several, of one plant.
+    """The measurements of one plant, in one or several files.
 
     In a .npz file are the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), which may
     be missing, and `sample_time` (s), with one axis more in front of states and actions where there
     are several trajectories.
 
     A .csv file has a line of names, t, z..., a..., then a line for each instant, t in s or an instant
-    like 2026-01-31 12:00:00.5. A time that does not grow begins another trajectory, and the actions of
-    a trajectory's last line are not used. The line whose t is the word target has z_r. Columns are
-    separated by commas, semicolons, tabs or spaces, and with anything but commas the decimal mark may
-    be a comma.
+    like 2026-01-31 12:00:00.5. A time that does not increase starts a new trajectory, and the actions
+    of a trajectory's last line are not used. The line whose t is the word target has z_r. Columns are
+    separated by commas, semicolons, tabs or spaces; except with commas, the decimal mark may be a
+    comma.
 
     Parameters
     ----------
     paths
-        Of the files, which end in .npz, or in .csv, .tsv, .txt or .dat.
+        The files, which end in .npz, .csv, .tsv, .txt or .dat.
     time, states, inputs
         Names of columns, or of arrays, separated by commas; patterns such as "T*" for columns. If one
-        is given, other columns are left out.
+        is given, other columns are ignored.
     sample_time
         Seconds between two states, where the files do not have it.
     target : (n_z,)
@@ -95,7 +95,7 @@ def read_measurements(
     Raises
     ------
     FileError
-        One cannot be read, is too large, or is not that; one sentence.
+        A file cannot be read, is too large, or has another content; one sentence.
     """
     if not paths:
         raise FileError("no file given; expected a .npz or a .csv file")

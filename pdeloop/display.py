@@ -80,7 +80,7 @@ class Display:
 class ProgressFile:
     """Follows a progress.jsonl that another process appends to.
 
-    past: also what is in it already.
+    past: also its existing lines.
     """
 
     def __init__(self, path: Path, *, past: bool = False) -> None:

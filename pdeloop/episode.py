@@ -69,15 +69,15 @@ def rollout(
     Parameters
     ----------
     plant
-        Whose episode it is; one that is under way there ends. Or the `Dynamics` to make one of.
+        The plant, whose current episode ends; or a `Dynamics`, from which a plant is made.
     law
-        Is called once a step, in order, with the plant's own array, which it must not change.
+        Called once per step, in order, with the plant's own array, which it must not change.
     seeds : (M,) int, or (M, n_z)
-        Of the initial fields: 0 or more draws one, -1 is the mean field. Or the fields themselves.
+        Seeds of the initial fields (-1: the mean field), or the fields themselves.
     noise : (M,) int, optional
-        Of the noise of each environment, where the plant has noise.
+        Seeds of the noise of each environment, if the plant has noise.
     keep
-        Whether to keep states and actions; costs are always.
+        Whether to keep states and actions; costs are always kept.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def rollout(
     Raises
     ------
     ValueError
-        No plant, no law or no seeds are given, or the law gives actions of another shape or that are
+        There is no plant, law or seed, or the law returns actions of another shape or that are
         not finite.
 
     Examples
@@ -142,7 +142,7 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     Parameters
     ----------
     plant
-        Whose target z_r and limit of the actions it has.
+        The plant, for its target z_r and action limit.
     U : (state_size, n_s)
         Basis of the reduced state, that of a reduced model.
     policy : (n_a, 2 n_s), or (M, n_a, 2 n_s)

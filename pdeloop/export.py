@@ -23,7 +23,7 @@ LAWS = ("adapted", "lqt")
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
 """Columns of a curve."""
 FORMULA = tuple("=+-@\t\r")
-"""What a formula begins with in a spreadsheet."""
+"""First characters of a formula in a spreadsheet."""
 _C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
 
 

@@ -48,7 +48,7 @@ class FinishedRun:
     costs : dict of (S, fields) array
         Mean stage costs of the closing evaluation, by controller: none, lqt, adapted.
     rollouts : list of dict
-        What those of each seed were for (tuner_node.budget), empty where an older version did not
+        Rollouts of each seed by purpose (tuner_node.budget), empty if an older version did not
         count them.
     """
 
@@ -91,7 +91,7 @@ class FinishedRun:
         return counted or [0] * len(self.policies)
 
     def trajectories(self) -> Iterator[EpisodeRecord]:
-        """The complete episodes in the run's bag, in their order, each when it is asked for.
+        """The complete episodes in the run's bag, in order, one at a time.
 
         Yields
         ------

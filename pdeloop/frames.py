@@ -50,7 +50,7 @@ class Frames:
         Of their curves and actions.
     fields : (C, T + 1, n_z), optional
         All that will be drawn: then the axes hold them from the first picture on, and fields on one
-        axis are also drawn in space and time. Otherwise the axes grow with what is drawn.
+        axis are also drawn in space and time. Otherwise the axes grow with the data.
     largest
         Magnitude of the actions that the axes hold from the first picture on.
     """

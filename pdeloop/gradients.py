@@ -68,7 +68,7 @@ class Gradients:
     Parameters
     ----------
     plant
-        Used for the rollouts, which end its episode; or a `Dynamics` with a method `pull_back`.
+        The plant, whose current episode ends; or a `Dynamics` with a method `pull_back`.
 
     Raises
     ------

@@ -133,7 +133,7 @@ class Identified:
         return "\n".join([*lines, "", *self._law_lines()])
 
     def _law_lines(self) -> list[str]:
-        """A description of the law and its use, or the reason why there is none."""
+        """A description of the law and its use, or the reason for its absence."""
         loop = self.closed_loop
         if loop is None:
             return [

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A picture of what was identified: orders, the model against the data, and the law on the model."""
+"""Figure of an identification: orders, the model against the data, and the law on the model."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class Transport:
         RECORD_EVERY.check(self.record_every)
 
     def require(self) -> None:
-        """Refuse what the nodes would end with: no ROS, a wrong ROS domain."""
+        """Refuse what would end the nodes: no ROS, a wrong ROS domain."""
         if self.in_process:
             return
         if importlib.util.find_spec("rclpy") is None:

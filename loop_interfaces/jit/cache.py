@@ -75,7 +75,7 @@ def jit(function: F) -> F:
 
 
 def jit_in_closure(function: F) -> F:
-    """As `jit`, for what a cached function closes over.
+    """As `jit`, for functions that a cached function closes over.
 
     What is closed over is a part of the key on disk. A function has the same one in each process, and
     what Numba makes of it has not: so the function stays as it is.
@@ -91,7 +91,7 @@ def inlined_njit(function: F) -> F:
 
 
 def named_by_sources(function: F, *sources: ModuleType | Callable[..., Any]) -> F:
-    """The function, with a name on disk that belongs to it and to what it is made of."""
+    """The function, with a name on disk that depends on it and on its parts."""
     function.__qualname__ += f"-{fingerprint(function, *sources)}"
     return function
 

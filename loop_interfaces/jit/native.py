@@ -58,7 +58,7 @@ def load_acquire(typing_context: Any, address: Any) -> Any:
 
 @intrinsic
 def store_release(typing_context: Any, address: Any, word: Any) -> Any:
-    """Write the word at an address; who sees it sees what was written before."""
+    """Write the word at an address; a thread that reads it also sees earlier writes."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         builder.store_atomic(args[1], builder.inttoptr(args[0], WORD.as_pointer()), "release", 8)

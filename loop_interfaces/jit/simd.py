@@ -54,7 +54,7 @@ class LanesModel(models.PrimitiveModel):
 
 
 def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Numba's decorator; what it makes is called without the first argument, the typing context."""
+    """Numba's decorator; the result is called without the first argument, the typing context."""
     made: Callable[..., Any] = numba_intrinsic(function)
     return made
 

@@ -111,7 +111,7 @@ class _BatchPublisher:
         self._flushed = time.monotonic()
 
     def poll(self, now: float) -> bool:
-        """True if there are subscribers; publishes what has waited for long."""
+        """True if there are subscribers; publishes samples that have waited too long."""
         if now - self._flushed > AGE:
             self.flush()
         return self._publisher.get_subscription_count() > 0
@@ -192,7 +192,7 @@ class SampleBatcher:
 
 
 class Sender:
-    """Publishes frames on one topic; what it sends also goes to the batcher."""
+    """Publishes frames on one topic, and passes them to the batcher."""
 
     def __init__(
         self, node: Node, topic: Topic, namespace: str = "", batcher: SampleBatcher | None = None

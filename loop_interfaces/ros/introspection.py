@@ -46,12 +46,12 @@ def full_name(endpoint: Any) -> str:
 
 
 def process_of(endpoint: Any) -> bytes:
-    """The process of an endpoint in the ROS graph: what the ids of all its endpoints begin with."""
+    """The process of an endpoint in the ROS graph: the common prefix of the ids of its endpoints."""
     return bytes(endpoint.endpoint_gid)[:12]
 
 
 def matched_processes(node: Node, publisher: Publisher) -> set[bytes]:
-    """The processes whose subscriptions receive what the publisher sends from now on.
+    """The processes whose subscriptions receive the publisher's messages from now on.
 
     The graph shows the subscribers, the publisher how many of them it is matched with: none is named
     before all are.
@@ -141,7 +141,7 @@ class Introspection:
     def offer(self, name: str, act: Callable[[], str]) -> None:
         """A std_srvs/Trigger service, after which the node reports at once.
 
-        act: does it and says what it did; a ValueError says why not.
+        act: acts and returns what was done; ValueError if it is not possible.
         """
 
         def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

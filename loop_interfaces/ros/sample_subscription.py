@@ -37,7 +37,7 @@ _SINGLES: dict[int, tuple[Any, str]] = {
 
 
 class SerializedSubscription:
-    """Takes serialised messages of one raw subscription, with what the middleware says of each.
+    """Takes serialised messages of one raw subscription, with the middleware's information on each.
 
     depth: the most that one `take` gives.
     """

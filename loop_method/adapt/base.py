@@ -48,7 +48,7 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """An episode that an optimiser wants.
+    """An episode requested by an optimiser.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class RolloutResult:
     Attributes
     ----------
     cost : float
-        Its mean stage cost; of no meaning if it diverged.
+        Its mean stage cost; meaningless if it diverged.
     diverged : bool
         True if the plant's state left its bound.
     trajectory : Trajectory or None
@@ -193,7 +193,7 @@ class Context:
 
 
 class Optimizer(Protocol):
-    """The interface of an optimiser: what its class declares, and what an object of it does.
+    """The interface of an optimiser: declarations of its class, and methods of its objects.
 
     A history row holds JSON numbers, booleans and strings; a cost that is not finite is left out of
     it. Every row has `rollouts` (told so far, in total) and `diverged` (how many of those told now
@@ -233,7 +233,7 @@ class Optimizer(Protocol):
     judges_first_law: ClassVar[bool] = False
     """True if it always compares the first law with no control itself."""
     in_coordinates: ClassVar[bool] = False
-    """True if it can be given coordinates in an orthonormal basis of what was measured in place of
+    """True if it can work on coordinates in an orthonormal basis of the measured states in place of
     states of more than 2,048 numbers (`loop_method.adapt.in_coordinates`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
@@ -270,7 +270,7 @@ class Optimizer(Protocol):
 
     @property
     def policy(self) -> Array:
-        """The policy so far, of the shape it began with; always finite."""
+        """The current policy, in its initial shape; always finite."""
 
     @property
     def tells(self) -> int:
@@ -278,7 +278,7 @@ class Optimizer(Protocol):
 
     @property
     def done(self) -> bool:
-        """True once there is nothing more to ask."""
+        """True once no further rollouts are needed."""
 
     def ask(self) -> list[Rollout]:
         """The rollouts needed next.

@@ -50,7 +50,7 @@ class Belief:
         return cls(model, error, int(checked_array(state, "components", "i", ())))
 
     def check(self, context: Context) -> None:
-        """A ValueError if the model is of another plant's size: what is compiled does not look."""
+        """ValueError if the model has another plant's size, which compiled code does not check."""
         n_a = context.exploration.actions.shape[1]
         known, expected = (self.model.n_z, self.model.n_a), (len(context.target), n_a)
         own_state = isinstance(self.model, (ReadingsModel, SensedModel))

@@ -123,7 +123,7 @@ class ClosedLoopProblem:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop(ClosedLoopProblem):
-    """A model of the plant under such laws, and what they cost on it.
+    """A model of the plant under such laws, and their cost on it.
 
     A class derived from it says how a law remembers, or what of a model's state is seen.
 
@@ -160,7 +160,7 @@ class ClosedLoop(ClosedLoopProblem):
         return np.zeros((self.model.n_a + n_p, self.U.shape[1] + n_p + 1))
 
     def curvature(self, own: Array) -> Array:
-        """What a change of the law's outputs [a; u] costs, from that of an action, (n_a, n_a)."""
+        """Cost matrix of a change of the law's outputs [a; u], from that of an action, (n_a, n_a)."""
         return own
 
     def costs(self, theta: Array, fields: Array) -> Array:

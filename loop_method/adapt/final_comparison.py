@@ -47,7 +47,7 @@ Laws = Mapping[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What is rolled out to decide, and what is known before.
+    """The deciding rollouts, and what is known before them.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Comparison:
         shape: tuple[int, ...],
         context: Context,
     ) -> Comparison | None:
-        """The comparison in a checkpoint, None where it has none; ValueError for what is none."""
+        """The comparison in a checkpoint, None if it has none; ValueError if it is not one."""
         if not arrays:
             return None
         names = [str(name) for name in checked_array(arrays, "names", "U", (None,))]
@@ -199,7 +199,7 @@ def on_model(
     laws : mapping
         First law, found law and no control.
     known : sequence of Record
-        All rollouts, without what of their noise can be told from them.
+        All rollouts, denoised.
     numbers : sequence of int
         Fresh fields for which there are rollouts.
     rng : numpy.random.Generator

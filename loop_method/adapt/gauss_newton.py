@@ -239,7 +239,7 @@ class GaussNewton(Optimizer):
         ran = now.trials != NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
-        # What the first law costs says nothing of the models.
+        # The cost of the first law carries no information about the models.
         contest = self._contested and np.array_equal(now.candidate, self._first)
         if self._sensors or contest:
             lost = ran.sum() * trial >= ran.size * self._mean_cost(now.incumbents)
@@ -309,7 +309,7 @@ class GaussNewton(Optimizer):
         return self._budget - kept - self._records.count
 
     def _finish(self, row: Row) -> None:
-        """After the last step: what is rolled out to decide what is returned."""
+        """After the last step: the rollouts that decide which law is returned."""
         now, known, comparison = self._now, self._records.all(), None
         left = max(self._budget - self._records.count, 0)
         fresh = (int(now.fields.max()) + 1 + np.arange(left)).tolist()

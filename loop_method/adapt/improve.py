@@ -153,7 +153,7 @@ def _descend(
 
     def objective(y: Array) -> tuple[float, Array]:
         nonlocal best, least
-        at, cost, gradient = theta, before, by_theta  # the descent begins with what is known
+        at, cost, gradient = theta, before, by_theta  # the descent starts from known values
         if y.any():
             at = theta + coordinates.theta(unit * y)
             cost, gradient = loop.gradient(at, fields, weights)

@@ -122,7 +122,7 @@ class InCoordinates(Optimizer):
         self._own.restore({name.removeprefix(_OWN): state[name] for name in names})
 
     def _seen(self, trajectory: Trajectory) -> Trajectory:
-        """In coordinates, the basis grown by what is new."""
+        """In coordinates, with the basis extended by new directions."""
         states, finite = trajectory.states, True
         if isinstance(trajectory, LowRankTrajectory):
             states = trajectory.modes * linalg.norm(trajectory.coordinates, axis=0)[:, None]

@@ -92,7 +92,7 @@ def mixtures(
     rng : numpy.random.Generator
         Of the draws.
     components : int
-        Fields that stand one after the other in a state.
+        Number of fields in a state, stored one after the other.
     periodic : bool
         Whether they are on a ring; else rho is 0.
     """

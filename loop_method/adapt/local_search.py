@@ -172,7 +172,7 @@ class LocalSearch:
         return Rollout(policy.copy(), field_seed(self._seed, number))
 
     def _confirm(self, after: Array, row: Row) -> None:
-        """Keep what the steps found where it is better by more than chance."""
+        """Keep the law of the steps if it is better by more than chance."""
         before = self._costs_before
         if not np.isfinite(after).all():
             better, row["reason"] = False, "a rollout of the adapted law diverged"

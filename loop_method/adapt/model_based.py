@@ -66,7 +66,7 @@ class ModelBased(Optimizer):
     seed : int
         Determines the initial fields.
     rollouts : int
-        The budget, without what the context knows already.
+        The budget, without the rollouts that the context has already.
     settings : ModelBasedSettings, optional
         Constants.
     context : Context
@@ -141,7 +141,7 @@ class ModelBased(Optimizer):
 
     @property
     def done(self) -> bool:
-        """True once there is nothing more to ask."""
+        """True once no further rollouts are needed."""
         return self._progress.stage == ENDED
 
     def ask(self) -> list[Rollout]:
@@ -160,7 +160,7 @@ class ModelBased(Optimizer):
         return [self._rollout(law, own + i) for i, law in enumerate(laws)]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
-        """Take the rollouts in, and do what comes after them."""
+        """Take the rollouts, and carry out the next stage."""
         asked = self.ask()
         require_results(results, len(asked))
         for result in results:
@@ -207,7 +207,7 @@ class ModelBased(Optimizer):
         return Rollout(policy.copy(), field_seed(self._seed, number))
 
     def _measured(self, added: Sequence[Record]) -> Row:
-        """The mean cost of some rollouts, and what the model said of them before."""
+        """The mean cost of some rollouts, and the model's earlier prediction of it."""
         row: Row = {"role": self._progress.stage}
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
@@ -227,7 +227,7 @@ class ModelBased(Optimizer):
         ]
 
     def _data(self) -> list[Record]:
-        """All rollouts, without what of their noise can be told from the fields."""
+        """All rollouts, denoised."""
         noise, measured = self._context.noise, self._measurements()
         return cleaned(measured, noise, line=self._context.line) if noise else measured
 
@@ -281,7 +281,7 @@ class ModelBased(Optimizer):
         return belief.error <= most
 
     def _without_model(self, row: Row, final: bool) -> None:
-        """What follows where no model has ever been believed: local steps, if they can be taken."""
+        """The continuation where no model was ever accepted: local steps, if possible."""
         unknown = "its cost" if self._context.cost is not None else ""
         unknown = "its law" if isinstance(self._context.law, Observer) else unknown
         if unknown:

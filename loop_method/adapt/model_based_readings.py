@@ -46,13 +46,13 @@ class ModelBasedReadings(ModelBased):
         return []
 
     def _fields(self) -> Array:
-        """Where rollouts began, with what no model foresaw in them."""
+        """Initial states of rollouts, with their innovations."""
         if self._progress.belief is None:
             return super()._fields()
         return self._progress.belief.loop(self._context).beginnings(self._data())
 
     def _is_believed(self, belief: Belief) -> bool:
-        """Always: what a law costs is measured after every step."""
+        """Always: the cost of a law is measured after every step."""
         return True
 
     def _without_model(self, row: Row, final: bool) -> None:

@@ -19,7 +19,7 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.laws.observer import Observer
 
 ROUND = 1e-2
-"""Share of the identity in what a change of the memory costs, which the gains alone leave out."""
+"""Share of the identity in the cost matrix of a change of the memory, beyond that of the gains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class ObservedLoop(ClosedLoop):
         return self.law.model.B
 
     def curvature(self, own: Array) -> Array:
-        """What a change of [a; u] costs, from that of an action alone, (n_a, n_a).
+        """Cost matrix of a change of [a; u], from that of an action alone, (n_a, n_a).
 
         A prediction that is wrong by one moves the action by K.
         """
@@ -68,7 +68,7 @@ class ObservedLoop(ClosedLoop):
         return np.asarray(linalg.block_diag(own, moved), dtype=np.float64)
 
     def _noise_of(self, count: int) -> Array:
-        """What the noise adds to U^T z, whose columns need not be orthonormal."""
+        """Effect of the noise on U^T z, where the columns of U need not be orthonormal."""
         drawn = super()._noise_of(count)
         if not self.noise:
             return drawn

@@ -37,7 +37,7 @@ class Progress:
     improved : array or None
         The law after the last descent, with which the next one begins.
     parts : list of arrays
-        The same for each part of the fields, from those of the others.
+        The same for each part of the fields, from the other parts.
     held_out : (3,) array
         Fraction, change and deviation of the last renewal.
     begun : int

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A policy to try, and what the history says of it."""
+"""A policy to try, and its entries in the history."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class Proposer:
             )
         weights = context.state_weight, context.action_weight
         self.loop = ClosedLoopProblem(*(U, target, *weights, context.horizon, context.action_limit))
-        # Few readings cannot be cleaned; what is fitted to them knows of their noise.
+        # Few readings cannot be denoised; the fits to them account for the noise.
         self._noise = 0.0 if context.sensors else context.noise
         self._context = replace(context, noise=self._noise)
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
@@ -196,7 +196,7 @@ class Proposer:
         return cleaned(measured, self._noise, line=self._context.line)
 
     def _clean(self, record: Record) -> Record:
-        """The rollout without what of its noise can be told from the fields."""
+        """The denoised rollout."""
         if not self._noise:
             return record
         if record not in self._cleaned:  # every proposal asks for all remembered rollouts

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A new law from what was measured: a model of the whole field, and a descent on it.
+"""A new law from measurements: a model of the whole field, and a descent on it.
 
 How far the law may move from the first one is chosen on measured fields that did not make it. The
 fields are dealt out to a few parts; a law is made for each part from the fields of the others, and the
@@ -93,7 +93,7 @@ def renew(
     settings : ImprovementSettings
         Constants.
     components : int
-        Fields that stand one after the other in a state.
+        Number of fields in a state, stored one after the other.
     periodic : bool
         Whether they are on a ring.
     final : bool

@@ -152,7 +152,7 @@ def sensed_from(
     size = float(np.mean([np.mean(own**2) for own in readings]))
 
     def learned() -> Smoothing:
-        # What the model does not foresee of a reading is noise to a filter.
+        # The unpredicted part of a reading is noise to a filter.
         noise = float(np.sqrt(context.noise**2 + error * size))
         return Smoothing(shared, centres, noise, context.target).learned(known)
 

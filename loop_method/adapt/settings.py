@@ -14,7 +14,7 @@ from loop_method.settings import Settings, setting
 class ImprovementSettings(Settings):
     """The constants of improving a law on a model, and of the verdict on it.
 
-    Nothing has a unit: costs and gains are scaled by those of the law that an improvement begins with.
+    All are dimensionless: costs and gains are scaled by those of the initial law.
     """
 
     judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
@@ -48,10 +48,10 @@ class ImprovementSettings(Settings):
     )
     iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
     memory: int = setting(40, "gradient differences that L-BFGS keeps", 1, 1000)
-    window: int = setting(5, "L-BFGS steps that together must gain least_gain", 1, 100)
+    window: int = setting(5, "L-BFGS steps that together must reach least_gain", 1, 100)
     least_gain: float = setting(
         1e-3,
-        "share of the cost by which a window must reduce it for the descent to continue",
+        "relative reduction of the cost that a window must reach for the descent to continue",
         0.0,
         1.0,
     )
@@ -138,7 +138,7 @@ class GaussNewtonSettings(ImprovementSettings):
         0.02, "share of the cost below which an accepted step adds a field", 0.0, 1.0
     )
     remembered: int = setting(40, "newest rollouts, to which models are fitted", 1, 1_000_000)
-    first_damping: float = setting(1.0, "damping to begin with", 1e-12, 1e12)
+    first_damping: float = setting(1.0, "initial damping", 1e-12, 1e12)
     least_damping: float = setting(1e-4, "smallest damping", 1e-12, 1e12)
     largest_damping: float = setting(100.0, "largest damping after a rejection", 1e-12, 1e12)
     good_ratio: float = setting(
@@ -162,7 +162,7 @@ class GaussNewtonSettings(ImprovementSettings):
         1.5, "ratio of the distances from their mean of further fields and of these", 0.0, 100.0
     )
     pieces: int = setting(
-        8, "pieces of a rollout that a model of a chaotic plant has to predict", 2, 1000
+        8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
     )
     chaotic_growth: float = setting(
         20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
@@ -175,7 +175,7 @@ class GaussNewtonSettings(ImprovementSettings):
     )
     modes: int = setting(32, "coordinates of a local model; never fewer than the law's", 1, 512)
     cubic_modes: int = setting(12, "maximum number of coordinates of its cubic part", 0, 64)
-    ridges: int = setting(6, "ridges of the quadratic and cubic part that are tried", 1, 100)
+    ridges: int = setting(6, "number of ridges tried for the quadratic and cubic part", 1, 100)
     least_ridge: float = setting(
         1e-6, "smallest of these ridges, relative to a unit weight", 1e-15, 1e6
     )
@@ -187,14 +187,14 @@ class GaussNewtonSettings(ImprovementSettings):
     )
     least_weight: float = setting(0.3, "smallest such weight", 0.0, 1.0)
     low_forgetting: float = setting(
-        5.0, "smallest forgetting kappa that is tried besides 0", 0.0, 1e3
+        5.0, "smallest non-zero forgetting kappa that is tried", 0.0, 1e3
     )
     middle_forgetting: float = setting(15.0, "the next one", 0.0, 1e3)
     high_forgetting: float = setting(50.0, "the largest one", 0.0, 1e3)
     local_cost: float = setting(
         3.0, "maximum cost of a rollout compared with the incumbent, per cost of that", 1.0, 1e6
     )
-    worst: float = setting(2.0, "E that counts for a local model that diverges", 1.0, 1e6)
+    worst: float = setting(2.0, "E assigned to a local model that diverges", 1.0, 1e6)
     enough_factor: float = setting(
         1.5,
         "after an acceptance, the smallest kappa whose E is at most this times the minimum is used",

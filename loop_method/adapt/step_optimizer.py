@@ -30,10 +30,10 @@ _STREAM = 0x53544550  # "STEP"; large, as in loop_method.seeds
 
 
 class StepOptimizer(Optimizer):
-    """An optimiser all of whose steps want as many rollouts, and improve the policy by their outcome.
+    """Base class of optimisers whose steps all have the same number of rollouts.
 
-    A class derived from it has a `name`, and defines `rollouts` and `update`. The budget, the counts,
-    the history and checkpoints are here.
+    A derived class has a `name` and defines `rollouts` and `update`. The budget, the counts,
+    the history and checkpoints are handled here.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class StepOptimizer(Optimizer):
 
     @property
     def generator(self) -> np.random.Generator:
-        """A generator of random numbers for this step, at its beginning each time it is asked for."""
+        """A random number generator for this step, in its initial state at each access."""
         return np.random.default_rng([self._seed, _STREAM, self._tells])
 
     @property
@@ -126,7 +126,7 @@ class StepOptimizer(Optimizer):
         return (self._tells + 1) * self.step_rollouts > self._budget
 
     def ask(self) -> list[Rollout]:
-        """The rollouts of this step, as of `Optimizer.ask`.
+        """The rollouts of this step; see `Optimizer.ask`.
 
         Returns
         -------
@@ -135,7 +135,7 @@ class StepOptimizer(Optimizer):
         return [] if self.done else self.rollouts()
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
-        """Take the results of this step, as of `Optimizer.tell`.
+        """Take the results of this step; see `Optimizer.tell`.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class StepOptimizer(Optimizer):
         return row
 
     def state(self) -> State:
-        """What a checkpoint needs: the policy, the number of steps, and what is `kept`.
+        """Content of a checkpoint: the policy, the number of steps, and the `kept` arrays.
 
         Returns
         -------
@@ -176,7 +176,7 @@ class StepOptimizer(Optimizer):
         return {"policy": self.policy, "tells": np.array(self._tells), **own}
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Continue from a state, as of `Optimizer.restore`.
+        """Continue from a state; see `Optimizer.restore`.
 
         Parameters
         ----------

@@ -143,7 +143,7 @@ class Records:
     def restore(
         self, arrays: Arrays, n_z: int, shape: tuple[int, ...], n_a: int | None = None
     ) -> None:
-        """Remember what a `state` does; a ValueError if it is not one.
+        """Restore the content of a `state`; ValueError if it is not one.
 
         shape: of the policies, whose rows are as many as actuators if n_a does not say how many.
         """
@@ -186,7 +186,7 @@ class Records:
 
 
 def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
-    """Rollouts without what of their noise can be told from their states.
+    """Denoised rollouts.
 
     line: whether the states are fields on one axis, of which initial ones are known best by their
     spectra.

@@ -58,7 +58,7 @@ class FieldLaw:
         Its law, with the linearised model on U; None if the model is not accurate enough.
     cost, other_cost : float
         Mean stage costs that the model predicts from the initial fields of the trajectories, of its
-        law and of the law to compare with; infinite where there is none, or it runs away.
+        law and of the law to compare with; infinite where there is none, or it diverges.
     """
 
     fitted: FittedModel | None

@@ -65,7 +65,7 @@ def finite_horizon_of(
 def action_curvature(
     A: Array, B: Array, state_weight: float, action_weight: float, horizon: int
 ) -> Array:
-    """R + B^T P B (n_a, n_a): what an action that differs from the optimal one costs, to second order.
+    """R + B^T P B (n_a, n_a): the cost of a deviation from the optimal action, to second order.
 
     Examples
     --------

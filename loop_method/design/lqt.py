@@ -50,7 +50,7 @@ class DesignError(ValueError):
 
 
 class Gains(NamedTuple):
-    """The gains of a = K_a s + K_b s_r, and what they follow from.
+    """The gains of a = K_a s + K_b s_r, and the quantities they follow from.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ def track(
     Parameters
     ----------
     model : ReducedModel
-        Must be stabilisable; its modes may be unstable as long as the actuators reach them.
+        Must be stabilisable; unstable modes are allowed if the actuators reach them.
     state_weight, action_weight : float
         Positive; Q = state_weight I on the full state and R = action_weight I.
     cost : Cost, optional

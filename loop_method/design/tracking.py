@@ -68,8 +68,8 @@ def track_horizon(
 
     Examples
     --------
-    With one step to go nothing that an action does is seen any more, and two steps before the end the
-    action looks at the next target:
+    With T = 2 the last action affects no state in the cost, and the first one anticipates the next
+    target:
 
     >>> cost = Cost(1, 1, 2, action_weight=1.0, target=[[0.0], [3.0]])
     >>> K, b = track_horizon([[1.0]], [[1.0]], cost, [[1.0]])

@@ -44,28 +44,28 @@ Parts: TypeAlias = Mapping[str, Array]
 
 
 class Law(ABC):
-    """A law of one reduced model, to be derived from.
+    """Base class of control laws, for one reduced model.
 
-    A class derived from it gives where theta starts and how an action follows; the rest has defaults.
-    It is asked for one environment at a time. All methods are pure functions: the same arguments give
-    the same bits, and nothing is kept from one call to the next. theta = 0 must be no control, a = 0,
-    with which every law is compared. Actions need not respect the action limit: whoever sends them
-    saturates them. Numbers that are not finite, or beyond 1e9, count as 1e9: such a rollout diverges.
+    A derived class defines the initial theta and the action; everything else has defaults.
+    A law handles one environment at a time. All methods are pure functions: the same arguments give
+    the same bits, and nothing is kept between calls. theta = 0 must mean no control, a = 0, with which
+    every law is compared. Actions need not respect the action limit: they are saturated before they
+    are sent. Numbers that are not finite, or beyond 1e9, count as 1e9: the rollout diverges.
 
     Parameters
     ----------
     model : ModelRows
-        What is known of the plant: A, B, U, the LQ-tracking gains K_a and K_b, s_r = U^T z_r, and the
+        The model of the plant: A, B, U, the LQ-tracking gains K_a and K_b, s_r = U^T z_r, and the
         filter gain L if the class is `filtered`.
     horizon : int
-        Steps T of an episode, as the parameters have it. An action is also asked for at k = T.
+        Steps T of an episode. An action is also requested at k = T.
 
     Attributes
     ----------
     memory_size : int
-        Numbers of the memory; 0: the law has none.
+        Size of the memory; 0: no memory.
     cost : Cost or None
-        The plant's cost, where it is more than numbers and a constant target; not yet in `__init__`.
+        The plant's cost, if not just scalar weights and a constant target; set after `__init__`.
 
     Examples
     --------
@@ -129,7 +129,7 @@ class Law(ABC):
         """
 
     def memory_start(self) -> Array:
-        """The memory at the beginning of an episode: zeros unless a class says otherwise.
+        """The memory at the beginning of an episode; zeros by default.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class Law(ABC):
         return np.zeros(self.memory_size)
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
-        """The memory after a step; only of a law with a `memory_size`.
+        """The memory after a step; only for a law with a `memory_size`.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class Law(ABC):
     def pull_back(
         self, theta: Parts, z: Array, memory: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array]:
-        """The transposed derivative of `action`, for those who need derivatives; not needed elsewhere.
+        """The transposed derivative of `action`; needed only for gradients.
 
         Parameters
         ----------

@@ -76,7 +76,7 @@ class Measured:
         the closed loop that it predicts; without a law, as for an exploration, by what it predicts
         under the measured actions.
     clean : array, optional
-        The states without what of their noise can be told from them; none: there is no noise.
+        The denoised states; none: there is no noise.
     """
 
     states: Array

@@ -66,7 +66,7 @@ def fit_field_model(
     settings : FieldModelSettings
         Constants of the fits.
     components : int
-        Fields that stand one after the other in a state.
+        Number of fields in a state, stored one after the other.
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
         the error beyond what it explains, and kinds that know of noise are fitted as `noisy_fit` says.
@@ -109,7 +109,7 @@ def fit_field_model(
 def with_clean(
     rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
 ) -> list[Measured]:
-    """The rollouts with their states without what of the noise can be told from them."""
+    """The rollouts with denoised states."""
     rollouts = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
     clean = cleaned_states([r.states for r in rollouts], noise, components, line=line)
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Measured states without what of their noise can be told from them, before any model is known."""
+"""Denoising of measured states, before any model is known."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def smoothed(fields: Array, noise: float, components: int = 1) -> Array:
     noise : float
         Standard deviation of the noise on every number.
     components : int
-        Fields that stand one after the other in a state.
+        Number of fields in a state, stored one after the other.
     """
     parts = fields.reshape(len(fields), components, -1)
     spectra = np.fft.rfft(parts)

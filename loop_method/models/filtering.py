@@ -30,7 +30,7 @@ from loop_method.models.base import FieldModel, Measured
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """States of rollouts, (L + 1, n_z) each, and what the model said of them beforehand.
+    """States of rollouts, (L + 1, n_z) each, and the model's predictions of them.
 
     power: mean power of the innovations at each wavenumber, of Fourier transforms over the number of
     points; lost: predictions that were not finite, in whose place the last state stood.
@@ -51,7 +51,7 @@ def filtered(
     """The states of rollouts, each with one state more than actions.
 
     first: their initial states; shares: g, of each wavenumber; far: a prediction
-    this many times beyond the measured states is none.
+    this many times beyond the measured states is rejected.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]

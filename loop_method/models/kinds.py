@@ -49,7 +49,7 @@ class Kind:
         Those of each point or wavenumber, by which kinds are compared first, and those that all share.
     fit_noisy : callable, optional
         The model of rollouts whose states have noise of a known standard deviation, or None; without
-        it, `fit` is given the states without what of their noise can be told from them.
+        it, `fit` is given the denoised states.
     """
 
     name: str

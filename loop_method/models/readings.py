@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A model of what few sensors measure, and what of a rollout it does not foresee.
+"""A model of few sensors' readings, and its innovations in a rollout.
 
     x_{k+1} = A x_k + B a_k + G e_k,        U^T y_k = C x_k + e_k
 

@@ -78,7 +78,7 @@ class SensedModel(SpectralModel):
     sensors : int
         n_y.
     noise : float
-        Standard deviation of what the model does not foresee of a reading, its noise included.
+        Standard deviation of the unpredicted part of a reading, including noise.
     spread : (33,) array
         Standard deviations of the Fourier coefficients of an initial field: its mean, cosines, sines.
     """

@@ -12,7 +12,7 @@ from loop_method.settings import Settings, setting
 class FieldModelSettings(Settings):
     """Constants of fitting and choosing models of the whole field.
 
-    None has a unit: fields, inputs and time are scaled by what the data hold. E is the squared error of
+    All are dimensionless: fields, inputs and time are scaled by the data. E is the squared error of
     a simulated rollout over the sum of |z - z_r|^2.
     """
 

@@ -115,7 +115,7 @@ def hardly_independent(names: Sequence[str], shares: Sequence[float]) -> str:
 
 
 def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
-    """Message about inputs that a truncation to p directions cuts; shares: what it keeps of them."""
+    """Message about inputs cut by a truncation to p directions; shares: the part kept of each."""
     kept = ", ".join(f"{100 * share:.2g} %" for share in shares[:SHOWN])
     return (
         f"the rank p = {p} keeps {kept} of a move of {listed(names)}, and as little of the effect: "

@@ -52,7 +52,7 @@ def truncated_dmdc(
     n_s : int
         Modes of the reduced state.
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
 
     Raises
     ------

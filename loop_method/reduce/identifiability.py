@@ -227,7 +227,7 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
 
 
 def _explained(columns: Array, column: Array) -> tuple[Array, Array]:
-    """Weights of the columns that explain another one best, and what they leave of it."""
+    """Weights of the columns that explain another one best, and its residual."""
     if not columns.shape[1]:
         return np.empty(0), column
     weights = linalg.lstsq(columns, column)[0]
@@ -252,7 +252,7 @@ def _state_basis(z: Array, s: Array, drift: bool, n_a: int) -> Array:
 
 
 def _rounding(left: Array, channel: Array, size: float) -> bool:
-    """True if what is left of a channel that was scaled by `size` is no more than its rounding."""
+    """True if the residual of a channel scaled by `size` is no more than its rounding."""
     norm = float(linalg.norm(left))
     return norm < DEPENDENT or norm * size <= ROUNDED * _step(channel) * np.sqrt(len(left))
 

@@ -124,10 +124,10 @@ def study_orders(
         z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
         A duplicated trajectory counts once.
     orders : iterable of int
-        Those to try, of which the ones remain that the data determine without the held-out steps:
-        n_s + n_a of them must be left, for one.
+        Candidates; those that the data do not determine without the held-out steps are dropped
+        (at least n_s + n_a steps must remain).
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
     settings : IdentificationSettings
         `order_pieces`, `order_folds` and `order_share`.
 
@@ -138,7 +138,7 @@ def study_orders(
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, inputs whose effects cannot be told apart, or too few
+        Shapes that do not fit, NaN or infinity, inputs whose effects cannot be separated, or too few
         steps for any of the orders.
 
     Examples

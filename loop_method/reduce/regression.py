@@ -48,7 +48,7 @@ def exact_regression(
         Modes of the reduced state. All steps together must be at least n_s + n_a, as many as there are
         unknowns in a row of [A B].
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
 
     Returns
     -------

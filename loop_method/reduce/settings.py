@@ -12,7 +12,7 @@ from loop_method.settings import Settings, setting
 class IdentificationSettings(Settings):
     """Constants of the reduced model and of the first law.
 
-    None has a unit: errors are relative to what the data hold.
+    All are dimensionless: errors are relative to the data.
     """
 
     order_pieces: int = setting(

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""States of very many numbers as coordinates in an orthonormal basis of those that were measured.
+"""Large states as coordinates in an orthonormal basis of the measured ones.
 
 The states of a trajectory, and those of all trajectories of one plant, have much in common: with
 orthonormal rows W that span them, z = W^T x, and all that a linear law, a model and a quadratic cost
@@ -46,7 +46,7 @@ def factored(states: Array) -> tuple[Array, Array]:
 
 
 class SnapshotBasis:
-    """Orthonormal rows that grow by what they do not span of the states they are shown.
+    """Orthonormal rows, extended by the components of new states outside their span.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
 FOLDS = 4
 """Parts of the trajectories, each held out once."""
 RESOLVED = 1e-10
-"""Least singular value of what the past says of the future, relative to the largest."""
+"""Least singular value of the prediction from the past, relative to the largest."""
 LEAST = 1e-8
 """Least variance of an innovation, relative to that of the measurement."""
 
@@ -104,7 +104,7 @@ def subspace_model(
     past : int
         p; 0: that of the least error.
     channels : Channels
-        Names of states and inputs in what is refused.
+        Names of states and inputs in error messages.
     settings : IdentificationSettings
         `subspace_tolerance`.
 
@@ -194,7 +194,7 @@ def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
 
 
 def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
-    """Sums of squares of what the filter misses one step ahead, and of the changes in a step.
+    """Sums of squares of the filter's one-step errors, and of the changes in a step.
 
     The first steps, p at most, are the filter's to find the state.
     """

@@ -40,7 +40,7 @@ class DynamicsPlant(BatchPlant):
     Raises
     ------
     ValueError
-        The class does not say what is needed, or something unusable; the message names it.
+        The class lacks something, or has something unusable; the message names it.
     """
 
     def __init__(self, dynamics: Dynamics, **settings: Any) -> None:
@@ -123,7 +123,7 @@ class DynamicsPlant(BatchPlant):
 
     @property
     def definition(self) -> Definition:
-        """The object's arguments, the source of its class, and what a problem overrides."""
+        """The object's arguments, the source of its class, and a problem's overrides."""
         settings = {name: getattr(self, name) for name in SETTABLE}
         arguments = {
             f"physical.{name}": described(name, value)

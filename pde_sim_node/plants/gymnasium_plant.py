@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A Gymnasium environment with box spaces as a plant: the state is what it observes."""
+"""A Gymnasium environment with box spaces as a plant: the state is its observation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _OUTCOMES = ("reward", "terminated", "truncated")
 _STEP = f"observation, {', '.join(_OUTCOMES)}, info"
-"""What a step returns."""
+"""Names of a step's results."""
 
 
 def from_gymnasium(
@@ -38,23 +38,23 @@ def from_gymnasium(
     sample_time: float = 1.0,
     divergence_bound: float = 1e6,
 ) -> GymnasiumPlant:
-    """A plant of an environment of Gymnasium's with box spaces.
+    """A plant from a Gymnasium environment with box spaces.
 
     Its state is the observation, and its actions saturate at the bounds of the action space. With a
     target the stage cost is that of every plant, q |o - o_r|^2 + r |a|^2. Without one it is minus the
     reward, from which only optimisers that need costs alone can learn, such as two_point. An
-    environment that terminates has diverged. The mean field is what seed 0 begins with.
+    environment that terminates has diverged. The mean field is the initial state of seed 0.
 
     Parameters
     ----------
     env
-        The environment, of which copies are made, or its id for `gymnasium.make`.
+        The environment, which is copied, or its id for `gymnasium.make`.
     target : (n_z,), optional
         Observation to be tracked.
     state_weight, action_weight
         q and r.
     horizon
-        Steps of an episode; 0: as its specification limits it.
+        Steps of an episode; 0: the limit of its specification.
     sample_time
         Time (s) of a step.
     divergence_bound
@@ -118,7 +118,7 @@ class GymnasiumPlant(BatchPlant):
 
     @property
     def definition(self) -> Definition:
-        """The specification, the source of the environment's class, and what is asked of it."""
+        """The specification, the source of the environment's class, and the settings."""
         spec, inner = self._first.spec, self._first.unwrapped
         names = ("horizon", "sample_time", "state_weight", "action_weight", "divergence_bound")
         values = {name: getattr(self, name) for name in names}
@@ -164,7 +164,7 @@ class GymnasiumPlant(BatchPlant):
     def _returned(
         self, method: str, function: Callable[..., Any], *given: Any, names: str
     ) -> tuple[Any, ...]:
-        """What a method returns: the values of these names."""
+        """A method's results: the values of these names."""
         found = called(f"{self._first}.{method}", function, *given)
         if not isinstance(found, tuple) or len(found) != len(names.split()):
             size = f" of {len(found)}" if isinstance(found, tuple) else ""

@@ -222,7 +222,7 @@ class SpectralPlant(BatchPlant):
             self._bind()
 
     def _bind(self) -> None:
-        # What the compiled step counts counts only where there is no more to the cost.
+        # The compiled step's sum is the cost only where the cost has no further terms.
         counted = self.totals if self.cost.plain else np.zeros(self.batch)
         self._step.bind(self.states, self.actions, counted, self.diverged_step)
 

@@ -80,7 +80,7 @@ def read(path: Path) -> Iterator[Message]:
 
 
 def _name(text: str) -> str:
-    """A topic's name or type, which is printed. ValueError if it is none."""
+    """A topic's name or type, for printing. ValueError if it is not one."""
     if len(text) > MAX_NAME or not text.isprintable():
         raise ValueError(
             f"a topic's name or type is {text[:40]!r}; expected at most {MAX_NAME} characters that "

@@ -144,7 +144,7 @@ def repeated(found: Survey) -> list[str]:
 
 
 def _check_file(file: FileSurvey, told: Extent, findings: Findings) -> None:
-    """One file against what is said of it."""
+    """Compare one file with its description."""
     if not file.finished:
         findings.missing.append(f"the end of {file.name}: it is cut off")
     _check_extent(file.name, file.messages, file.first, file.last, told, findings)

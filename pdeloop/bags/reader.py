@@ -137,7 +137,7 @@ def _in_time(found: list[Path]) -> list[Path]:
 
 
 def _beside(path: Path) -> dict[int, dict[str, Any]]:
-    """The parameters by run in a file that may not be there."""
+    """The parameters by run in a file that may be absent."""
     try:
         return by_run(parse_json(text_of(path) or "{}"))
     except ValueError as error:

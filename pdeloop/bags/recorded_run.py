@@ -30,7 +30,7 @@ _TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
 
 
 class RecordedRun:
-    """The episodes of one run, and what they must be."""
+    """The episodes of one run, compared with their recomputation."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class RecordedRun:
         self._report.notes.append(f"{self._name}: {text}")
 
     def _keep(self, episode: RecordedEpisode) -> None:
-        """Note what the rollouts of an episode were, to be looked for in the training."""
+        """Note the rollouts of an episode, to be found in the training."""
         if episode.start is None or (episode.policy is None and not episode.exploratory):
             return
         policies = None if episode.policy is None else episode.policy.values

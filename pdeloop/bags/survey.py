@@ -92,7 +92,7 @@ def survey(files: Sequence[Path]) -> Survey:
 
 
 def _take_parameters(known: dict[int, dict[str, Any]], message: Message, path: Path) -> None:
-    """Take what the recorder noted of a run's parameters; the latest note of a run has all of them."""
+    """Take the recorder's notes of a run's parameters; the latest note has all of them."""
     try:
         if len(message.data) > MAX_PARAMETERS:
             raise ValueError(f"they have more than {MAX_PARAMETERS} bytes")

@@ -32,7 +32,7 @@ Parameters = Mapping[int, Mapping[str, Any]]
 
 
 def verify(*paths: Path, parameters: Path | None = None) -> Report:
-    """Recompute what was recorded in the folders of bags, or of runs with all their bags.
+    """Recompute the recordings in folders of bags, or of runs with all their bags.
 
     Several bags of one run are one. parameters: a file to use instead of what the bags say, in ROS form
     or a bag's parameters.json. BagError for a bag that cannot be read, ParameterError for parameters

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`pdeloop bag`: what is done with recordings."""
+"""`pdeloop bag`: inspection and verification of recordings."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def add(commands: Commands) -> None:
 
 
 def add_execution(parser: argparse.ArgumentParser) -> None:
-    """The flags that say where a study's trainings run, and what is printed; see `carry_out`."""
+    """The options for where a study's trainings run, and for output; see `carry_out`."""
     name, add = parser.prog.rpartition(" ")[2], parser.add_argument
     add("--out", type=a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
     add("--processes", type=int, metavar="N", help="trainings at the same time [one per core]")

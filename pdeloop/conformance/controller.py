@@ -43,7 +43,7 @@ from pdeloop.conformance.probing import (
 N_Z, STEPS = 64, 300
 """Size of the state, if it is not given, and steps of an exploratory episode."""
 SILENT = 1.0
-"""Seconds in which a controller would publish what it must not publish yet."""
+"""Seconds in which a controller would publish a premature message."""
 ROUNDED = 1e-5
 """Largest difference of numbers that are the same but for rounding, also to float32."""
 SPREAD = 0.5

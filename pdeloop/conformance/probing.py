@@ -157,7 +157,7 @@ class Check(ABC):
         raise NoAnswerError(f"expected {what} within {patience:g} s, got {got}")
 
     def drain(self, *topics: Topic) -> None:
-        """Forget what has come on these topics."""
+        """Discard messages received on these topics."""
         while self.transport.now() < self._end and self.transport.next(*topics, seconds=0.0):
             pass
 

@@ -18,7 +18,7 @@ FRAMES_PER_SECOND = 20
 
 
 class Picture:
-    """The frames of one environment, drawn on one canvas; the axes grow with what is drawn.
+    """The frames of one environment, drawn on one canvas; the axes grow with the data.
 
     A copy, or what a pickle gives, begins with a new canvas.
     """

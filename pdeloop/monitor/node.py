@@ -128,7 +128,7 @@ class MonitorNode:
                 self._take_parameters(peer.values or {})
 
     def _serve(self, request: object) -> None:
-        """Do what the page asks for."""
+        """Carry out a request of the page."""
         if isinstance(request, ShowLoop):
             self._given = True
             self._begin(request.namespace)
