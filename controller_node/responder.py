@@ -1,11 +1,11 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The controller's side of the loop: answer every state. Pure: no ROS, no clock.
 
-It answers every state of an episode whose start it has, also one it has answered before, and the
-answer depends only on (state, policy, model, step) or, in an exploratory episode, on (seed, step). It
-keeps nothing that the latched topics do not give it back after a restart, except the samples of an
-exploratory episode and the memory of a law that has one, which is a function of the episode's states:
-if it missed some, it says so and the episode is run again.
+It answers every state of an episode whose start it has, including repeated ones, and the answer depends
+only on (state, policy, model, step) or, in an exploratory episode, on (seed, step). After a restart the
+latched topics restore everything it keeps, except the samples of an exploratory episode and the memory
+of a law that has one, which is a function of the episode's states: if it missed some, it says so and
+the episode is run again.
 """
 
 from collections import Counter, OrderedDict

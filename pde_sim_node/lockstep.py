@@ -21,8 +21,8 @@ state T advances nothing: it acknowledges the last state.
 Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
 
 A pause is independent of the phase: a paused plant takes the answer it waits for, and sends no further
-state. Nothing is repeated or abandoned during a pause; `episode/paused` tells those who
-wait for the plant.
+state. Nothing is repeated or abandoned during a pause; `episode/paused` informs the nodes
+that wait for the plant.
 """
 
 import math

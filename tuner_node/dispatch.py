@@ -4,8 +4,8 @@
 A batch is cut into chunks of at most `max_batch` rows. Each becomes an episode of a pair that is free,
 and what a pair does not finish is started again with the same rows under a new episode number, on any
 pair. A rollout's cost does not depend on which episode or pair it ran in, so neither does the batch's
-result. Episode numbers only grow, also across restarts of the tuner (`incarnation` is in their upper
-part): an answer to an earlier tuner's episode is recognised.
+result. Episode numbers only increase, also across restarts of the tuner (`incarnation` is in their
+upper part): an answer to an earlier tuner's episode is recognised.
 
     pair        event                               next        what follows
     FREE        a chunk waits                       BUSY        policy and start are sent

@@ -10,11 +10,11 @@
     evaluate  no control, LQT and the adapted policy    done
               on the same sampled fields
 
-The first three share the budget of a seed. A seed whose last warm start is no better than no control
-begins the adaptation with no control. Pure: it knows neither topics nor time, so over topics and in one
-process it is the same training, to the bit.
+The first three share the budget of a seed. A seed whose last warm start is not better than no control
+starts the adaptation from no control. Pure: it uses neither topics nor time, so the training is the
+same to the bit over topics and in one process.
 
-Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
+Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is an addition.
 """
 
 from collections.abc import Callable

@@ -5,7 +5,7 @@
         rollouts = optimizer.ask()                # the same until tell
         row = optimizer.tell([measure(rollout) for rollout in rollouts])
 
-An optimiser runs no rollout and knows no clock, so the same object serves a loop over topics and a
+An optimiser runs no rollouts and uses no clock, so the same object serves a loop over topics and a
 loop in one process. Its randomness is a pure function of (seed, tells), and `state` holds
 everything that `restore` needs to continue as if nothing had happened, to the last bit.
 """

@@ -1,14 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Laws in a closed loop: their cost, and on a model of the plant its exact gradient.
 
-The law is linear in what it knows, the projected state s = U^T z and its memory p, and gives besides
-the action what moves the memory:
+The law is linear in the projected state s = U^T z and its memory p, and returns the action and the
+input of the memory:
 
     [a_k; u_k] = theta [s_k; p_k; 1],        z_{k+1} = f(z_k, a_k),        p_{k+1} = u_k + B a_k,
 
 with f the model, p_0 = s_0, and a_k saturated at the action limit. The affine law has no memory, and
-theta = [K_a b]; `observed_loop` has that of a law with an observer. From an initial field z_0 a law
-costs
+theta = [K_a b]; `observed_loop` has that of a law with an observer. From an initial field z_0 the
+cost is
 
     J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2).
 

@@ -1,12 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The last rollouts of `gauss_newton`: they decide between the first law, the one found and none.
 
-A search judges its steps on a few fields that it also makes them on, so that what it found is compared
-on others:
+A search judges its steps on the few fields from which it computes them, so its result is compared on
+others:
 
-- where a model of the whole field predicts rollouts, as by `model_based`: the law keeps the fraction of
-  its way from the first one that fields left out confirm, and rollouts from fresh fields tell what the
-  model gets wrong (`on_model`);
+- where a model of the whole field predicts rollouts, as in `model_based`: the law moves from the first
+  one by the fraction that held-out fields confirm, and rollouts from fresh fields correct the model's
+  errors (`on_model`);
 - elsewhere the laws are rolled out from the same fresh fields (`on_same_fields`).
 """
 

@@ -2,7 +2,7 @@
 """Gauss-Newton on measured trajectories.
 
 The cost is a sum of squares of measured quantities; only its sensitivity to the gains needs a
-model, and that is fitted to the rollouts as they come in. So a model error bends the direction of a
+model, and that is fitted to the rollouts as they come in. So a model error affects the direction of a
 step, never the cost, and every step is judged by rollouts.
 
 The law is a = K_a s + b with s = U^T z and theta = [K_a b]: K_b acts only through b = K_b s_r. A

@@ -2,8 +2,8 @@
 """An optimiser for large states, which works on their coordinates in a basis.
 
 With orthonormal rows W that span U, the target and the measured states, x = W^T z contains all that an
-optimiser needs: s = U^T z = (W^T U)^T x, and |z - z_r| = |x - W^T z_r|. W grows by what later rollouts
-bring (`loop_method.reduce.snapshots`), and is all in a checkpoint that grows with the size of a state.
+optimiser needs: s = U^T z = (W^T U)^T x, and |z - z_r| = |x - W^T z_r|. W grows with later
+rollouts (`loop_method.reduce.snapshots`); nothing else in a checkpoint grows with the size of a state.
 """
 
 from __future__ import annotations

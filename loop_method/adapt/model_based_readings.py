@@ -1,10 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`model_based` for a law that estimates the state from few readings: short steps from measured laws.
 
-A linear model of the readings is one of the plant near the fields that a law leads it through, and what
-it does not foresee changes with the law. So a step is held to the law that it begins with, the one that
-measured best, whose rollouts are then replayed for the next one. A replayed rollout is itself, so that
-measured costs alone decide.
+A linear model of the readings describes the plant near the fields of one law, and its innovations
+change with the law. So a step stays close to its starting point, the law with the best measured cost,
+and replays the innovations of its rollouts. Under its own law a rollout is reproduced exactly. Measured
+costs alone decide.
 """
 
 from __future__ import annotations

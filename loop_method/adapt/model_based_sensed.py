@@ -2,10 +2,11 @@
 """`model_based` for a law that estimates the state, on a model of the field between few sensors.
 
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
-designed and improved on it as on a model of the whole field, from the initial fields that the readings
-tell and draws that are like them. It begins with the cheapest on the model of the present law and
-those of `observer_design`, and is replaced only where it is cheaper on other draws. Once no equation
-reproduces the rollouts, it continues with a model of the readings (`model_based_readings`).
+designed and improved on it as on a model of the whole field, from the initial fields estimated from the
+readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
+current law and those of `observer_design`; its result is used only if it is cheaper on other draws.
+Once no equation reproduces the rollouts, it continues with a model of the readings
+(`model_based_readings`).
 """
 
 from __future__ import annotations

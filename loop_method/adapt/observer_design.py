@@ -2,18 +2,18 @@
 """A first law with an observer from a model of the field, by statistical linearisation.
 
 The best law of the whole field on the model, a = K x + b with x = V^T z and V the POD modes of
-simulated fields, goes along with a Kalman filter of the linear model that these simulations obey in
-the mean,
+simulated fields, is combined with a Kalman filter for the linear model that fits these simulations on
+average,
 
     x_{k+1} = A x_k + B a_k + c + w_k,    y_k = C x_k + d + v_k,
 
-A, c, C, d by least squares, B that of the model at the target. w is what the regression leaves, and a
-share of the initial second moment a step, as a steady filter does not know when an episode begins; v is
-the noise, and what the modes do not show of a reading. A linearisation at the target would have modes
-that grow in directions that no field takes.
+A, c, C, d by least squares, B that of the model at the target. w is the residual of the regression plus
+a share of the initial second moment per step, because a steady filter does not know when an episode
+begins; v is the noise plus the part of a reading that the modes do not represent. A linearisation at
+the target would have unstable modes in directions that no field takes.
 
-The law begins with p_0 = U^T y_0. The coordinates of the compensator are those in which this is the
-best linear estimate of x_0 from the first readings.
+The law starts with p_0 = U^T y_0. The compensator's coordinates are those in which this is the best
+linear estimate of x_0 from the first readings.
 
 References
 ----------

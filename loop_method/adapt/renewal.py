@@ -1,14 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A new law from measurements: a model of the whole field, and a descent on it.
 
-How far the law may move from the first one is chosen on measured fields that did not make it. The
-fields are dealt out to a few parts; a law is made for each part from the fields of the others, and the
-shares of the way from the first law to that one are compared by what they cost on the model from the
-fields that were left out. That costs no rollout. Of the shares that are better than the first law by
-more than chance the cheapest is taken: without evidence the first law stays.
+The distance that the law moves from the first one is chosen by cross-validation on measured fields.
+The fields are split into a few parts. For each part a law is computed from the other parts, and the
+fractions of the way from the first law to it are compared by their costs on the model from the held-out
+fields, which needs no rollouts. Among the fractions that are better than the first law by more than
+chance, the cheapest is used; without evidence the first law is kept.
 
-Costs differ between fields by far more than between laws, and a law that saves a tenth saves more where
-more is to be paid. So the first law's cost is the control: chance is that of the ratio of mean costs.
+Costs differ far more between fields than between laws, and the saving of a law is proportional to the
+cost. So the cost of the first law is the control variate: chance is that of the ratio of mean costs.
 
 References
 ----------

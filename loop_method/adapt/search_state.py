@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How far a search by `gauss_newton` has come, for checkpoints: its laws, fields and decisions."""
+"""The state of a search by `gauss_newton`, for checkpoints: its laws, fields and decisions."""
 
 from __future__ import annotations
 

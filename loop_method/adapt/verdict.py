@@ -1,15 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The choice of the law to return: the first one, unless another is better by more than chance.
 
-Costs of different initial fields are compared through the model. A law costs, in the mean over the
-distribution,
+Costs of different initial fields are compared through the model. The mean cost of a law over the
+distribution is
 
     m + mean over its own rollouts of (measured - model),
 
 with m the mean of its model costs over all measured fields: the model is a control variate, so that one
-rollout is as informative as many without it. The mean over the fields is the same for all laws, so that
-their difference has little chance in it; for the final law, which these fields made, it is that of
-fields that were left out.
+rollout is as informative as many without it. The fields of that mean are the same for all laws, so the
+difference of two laws has little variance; for the final law, which was computed from these fields,
+the mean is over held-out fields.
 """
 
 from __future__ import annotations

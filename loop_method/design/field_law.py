@@ -1,16 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A first law from a model of the whole field, linearised at the target.
 
-POD modes of an exploratory episode are the directions in which its fields are large, and a law needs
-those that it senses and those that other fields have: a plant that is unstable at its target is
-saturated by the end of the episode, and an episode begins with one field of many. A model of the whole
+POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
+the directions that it senses, also for other fields: a plant that is unstable at its target is
+saturated by the end of the episode, and an episode has only one initial field. A model of the whole
 field (`loop_method.models`) that predicts the episodes is linearised at the target, with e = z - z_r,
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
 
-and the law a = K e + b that minimises the cost over the horizon senses no more than the n_a rows of K.
-They come first in U, and POD modes of the remainder of simulated states, with that law and without
-control, fill the other columns. Where there is no room for more modes than rows, all are POD modes.
+and the law a = K e + b that minimises the cost over the horizon senses only the n_a rows of K. They
+are the first columns of U; the others are POD modes of the remainder of simulated states, with that law
+and without control. If U has too few columns for both, all are POD modes.
 
 References
 ----------

@@ -1,28 +1,26 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fit of an equation with constant coefficients to rollouts with measurement noise.
 
-Two things make the regression of `spectral_fit` fail with noise: within one sampling time the plant
-moves the field hardly further than the noise does, and at wavenumbers without signal the noise of a
-state, which is absent from the next one, looks like fast decay. So
+The regression of `spectral_fit` fails with noise for two reasons: within one sampling time the plant
+changes the field hardly more than the noise does, and at wavenumbers without signal the noise of a
+state, which is absent from the next one, looks like fast decay. Therefore
 
-1. the states between which the terms of the equation are integrated are those that the present
-   equation and the measurements tell together (`filtering`), whose error is a small part of the noise
-   once the equation is nearly right, so that the terms have no errors of their own that would bias
-   their coefficients;
-2. the equation is compared with the measured states over windows of m sampling times, of which the
-   initial state x is unknown,
+1. the terms of the equation are integrated along filtered states, estimated from the current equation
+   and the measurements (`filtering`); once the equation is nearly right their error is a small part of
+   the noise, and hardly biases the coefficients;
+2. the equation is compared with the measured states over windows of m sampling times with unknown
+   initial state x,
 
        F[z_j] = e^{j L} x + sum_p sigma_p W_p(j) + sum_{i < j} e^{(j - 1 - i) L} phi_1(L) F[B a_i + c],
 
-   j = 0 .. m, where W_p(j) is the integral of e^{L (j - s)} F[z(s)^p] from the begin of the window;
+   j = 0 .. m, where W_p(j) is the integral of e^{L (j - s)} F[z(s)^p] from the beginning of the window;
    x, and then B and c, are projected out at every wavenumber;
-3. only wavenumbers count whose power is clearly above that of the noise;
-4. coefficients that are no larger than chance are left out, one after the other: at wavenumbers that
-   are not seen they would have the largest influence, so that more of them are where the equation grows
-   beyond all bounds.
+3. only wavenumbers with clearly more power than the noise are compared;
+4. insignificant coefficients are removed one by one: their influence would be largest at wavenumbers
+   that are not measured, where the equation could grow without bound.
 
-Windows become longer as the equation becomes better; the equation with the smallest innovations is
-taken.
+Windows become longer as the equation improves; the equation with the smallest innovations is
+selected.
 
 References
 ----------

@@ -3,10 +3,10 @@
 
     x_{k+1} = A x_k + B a_k + G e_k,        U^T y_k = C x_k + e_k
 
-(`loop_method.reduce.subspace`). Of a measured rollout the state x_0 that it began with, which nobody
-knows, is the likeliest one; with it the innovations e_k follow from the readings, and with these the
-model gives the readings again. Under another law it is given the same innovations: the noise, what the
-order leaves out and, where it is the same, the nonlinearity.
+(`loop_method.reduce.subspace`). The unknown initial state x_0 of a measured rollout is its most likely
+value. It gives the innovations e_k, with which the model reproduces the readings. Under another law the
+model uses the same innovations: the noise, the dynamics beyond the order and, as an approximation, the
+nonlinearity.
 
 References
 ----------

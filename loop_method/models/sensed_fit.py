@@ -3,13 +3,13 @@
 
 The initial fields of the rollouts are unknown as well: a few Fourier coefficients each. All of them are
 fitted at once to the readings y_k = z_k(sensors) of whole rollouts, and to d, the mean of (z - z_r)^2
-over all points and steps of each, which its cost tells,
+over all points and steps of each, which follows from its cost,
 
     min  mean over rollouts and steps |y_k^model - y_k|^2 / mean |y_k|^2
          + mean over rollouts (0.1 (d^model / d - 1))^2 + a small ridge,
 
 by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then
-further. What lies between the sensors is seen, later, where it passes one.
+further. The field between the sensors is observed later, when it passes one.
 
 References
 ----------

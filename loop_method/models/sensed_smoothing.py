@@ -1,9 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Initial fields of rollouts of which few readings are known, with the equation of the field known.
+"""Initial fields of rollouts from few readings, for a known equation of the field.
 
-Each is found by itself, as in `loop_method.models.sensed_fit`. What readings do not tell of it is as
-large as the other rollouts say: its Fourier coefficients are normal with the standard deviations that
-make all readings likeliest, by the fixed point of MacKay, sigma_k^2 = sum x_k^2 / sum (1 - C_kk /
+Each is estimated separately, as in `loop_method.models.sensed_fit`. The prior comes from all rollouts:
+Fourier coefficients are normal with the standard deviations that maximise the likelihood of all
+readings, by the fixed point of MacKay, sigma_k^2 = sum x_k^2 / sum (1 - C_kk /
 sigma_k^2) with C the covariance of a coefficient given the readings.
 
 References

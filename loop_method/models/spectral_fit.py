@@ -6,13 +6,13 @@ Over a sampling time, the unit of time,
     F[z_{k+1}] - e^L F[z_k] = sum_p sigma_p W_p + phi_1(L) F[B a_k + c],
     W_p = integral_0^1 e^{L (1 - s)} F[z(s)^p] ds,
 
-is linear in the symbols sigma_p and, through sigma_1 W_1, in a change of L. What is between two samples
-is integrated with the current equation (at first there is none) and bent linearly in time, so that it
-ends in the measured z_{k+1}. So a pass is a linear regression, and a few passes suffice, without a
-start: a plant moves the field far within a sampling time, but an equation from bent paths of the wrong
-equation is nearly right. B and c are free at every wavenumber and are projected out first. A pass is no
-contraction where the field changes fast; of all passes the equation that misses the samples least is
-taken.
+is linear in the symbols sigma_p and, through sigma_1 W_1, in a change of L. The path between two
+samples is integrated with the current equation (at first there is none), and corrected linearly in time
+so that it ends in the measured z_{k+1}. So a pass is a linear regression, and a few passes suffice
+without an initial guess: the field changes much within a sampling time, but corrected paths of a wrong
+equation already give a nearly right one. B and c are free at every wavenumber and are projected out
+first. A pass need not be a contraction where the field changes fast, so the equation with the smallest
+residual of all passes is selected.
 
 References
 ----------
