@@ -188,7 +188,12 @@ def identity(name: str) -> tuple[str, str]:
 
 def name_of(kind: type) -> str:
     """The name by which another process can load a class of this one, from its module or file."""
-    module = sys.modules[kind.__module__]
+    module = sys.modules.get(kind.__module__)
+    if module is None:  # executed without being registered, as by importlib's module_from_spec
+        raise ValueError(
+            f"the class {kind.__qualname__} is from the module {shown(kind.__module__)}, which is "
+            f"not in sys.modules; give its name instead, 'path/to/file.py:{kind.__qualname__}'"
+        )
     importable = bool(getattr(module, "__package__", "")) and module.__name__ != "__main__"
     file = getattr(module, "__file__", None)
     source = module.__name__ if importable or not file else file

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import sys
@@ -311,6 +312,16 @@ def test_a_program_that_trains_when_it_is_loaded_as_a_plant_is_stopped(own: Path
         values_of(own)
     assert isinstance(told.value.__cause__, RuntimeError)
     assert not isinstance(told.value.__cause__, OwnCodeError)
+
+
+def test_a_class_of_an_unregistered_module_is_refused_with_the_way_to_name_it(own: Path) -> None:
+    """As with importlib, without the line that puts the module into sys.modules."""
+    spec = importlib.util.spec_from_file_location("unregistered", own)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    with pytest.raises(ValueError, match=r"'unregistered'.* give .*'path/to/file.py:Rod'"):
+        pdeloop.problem(plant=module.Rod())
 
 
 def test_a_script_trains_its_own_class_and_names_its_file(tmp_path: Path) -> None:
