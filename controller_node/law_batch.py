@@ -1,10 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law for the environments of an episode, each with its own theta and model.
 
-A law with a compiled form is computed by it; of any other the object itself is asked, one environment
-after the other. A law's memory is a function of the states and actions of its episode: it is kept
-from one step to the next, as are the actions that were answered, so that one that is asked for twice
-is the same.
+A law with a compiled form is computed by it, any other by its object, environment by environment. A
+law's memory is a function of the states and actions of its episode. It is kept from one step to the
+next, as are the computed actions, so that a repeated request gets the same answer.
 """
 
 from __future__ import annotations

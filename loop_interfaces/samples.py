@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Many serialised messages in one: what the plant publishes for recorders and viewers.
+"""Many serialised messages in one, published by the plant for recorders and viewers.
 
 A reader of its own for every state and action would cost the loop a packet and a wake-up per sample
 and reader. Instead the plant keeps the bytes of the states it sends and of the actions it receives,
@@ -11,8 +11,8 @@ and publishes them together, some hundred at a time, on the topic `samples`
                                              `length` bytes
 
 repeated; kind 0 is a state, 1 an action, and bytes are the message as it was on its own topic. time
-is the simulated time in s that the plant tells on /clock with a state, whether or not somebody
-listens there; NO_TIME of an action and of a plant that tells none.
+is the simulated time in s that the plant publishes on /clock with a state, with or without a
+subscriber; NO_TIME for an action and for a plant without /clock.
 """
 
 import math

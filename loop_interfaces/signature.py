@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Signatures: with which policy, model and target an action was computed, and how a model was.
 
-Tuner, controller and plant compute the same numbers from what each of them knows, so the plant can
-tell whether an action comes from a controller that has what the tuner published:
+Tuner, controller and plant each compute the same numbers, so the plant can recognise whether an action
+comes from a controller that has the tuner's policy, model and target:
 
     D = h(rows, action_limit, policy, h(model))    in the header of `episode/start`, as `plant`
     s = -h(D, z_r)                                 in the header of every `action`, as `time`
@@ -10,8 +10,8 @@ tell whether an action comes from a controller that has what the tuner published
 
 with h the first 53 bits of BLAKE2b over the numbers as little-endian float64. Where the controller
 explores there is neither policy nor model. A simulated time is never negative, so a controller that
-echoes the state's time, or sends 0, differs from one that signs. It does not protect from somebody
-who reads the wire and copies the number.
+echoes the state's time, or sends 0, differs from one that signs. It does not protect against an
+attacker who reads the messages and copies the number.
 """
 
 from collections.abc import Mapping

@@ -12,10 +12,10 @@ With sensors the plant publishes the last d measurements, scaled,
 
     o_k = sqrt(n_x / (n_y d)) [y_k, y_{k-1}, ..., y_{k-d+1}]        (y_0 in place of y_{-1}, ...),
 
-and as its target that of them, o_r. By this delay embedding the dynamics can be read off a state
-that is measured (Takens; for linear systems d is to reach the observability index), and who answers
-needs no memory. The scale makes q |o_k - o_r|^2, summed over an episode, the part of the stage cost
-that the sensors see: every measurement is in d of the o_k, and stands for n_x / n_y grid points.
+and as its target that of them, o_r. With this delay embedding the measured state determines the
+dynamics (Takens; for linear systems d must reach the observability index), and the controller needs
+no memory. The scale makes q |o_k - o_r|^2, summed over an episode, the part of the stage cost
+that the sensors see: every measurement occurs in d of the o_k, and represents n_x / n_y grid points.
 
 w_k is space-time white noise on the grid: du = F(u) dt + sigma dW(x, t) has increments of
 covariance sigma^2 dt delta(x - x'), and on cells of width dx = L / n_x the delta is 1 / dx. So the

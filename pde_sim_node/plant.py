@@ -1,9 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The interface of plants: M environments side by side, each z_{k+1} = f(z_k, a_k).
 
-The loop knows nothing else of it. Implementations are in `pde_sim_node.plants`: the compiled
-`SpectralPlant`, and `DynamicsPlant`, which makes one of what a user writes (`pde_sim_node.dynamics`).
-`pde_sim_node.instruments` puts noise, limits and sensors around any of them.
+The loop uses nothing else of a plant. Implementations are in `pde_sim_node.plants`: the compiled
+`SpectralPlant`, and `DynamicsPlant`, which wraps a user's class (`pde_sim_node.dynamics`).
+`pde_sim_node.instruments` adds noise, limits and sensors to any of them.
 """
 
 from dataclasses import dataclass

@@ -2,9 +2,9 @@
 """Starts and actions that a plant has taken in a run, and the detection of contradictory ones. Pure.
 
 Answers are deterministic: two different ones to a state come from a second or a faulty controller.
-Which of them was taken is chance, and the episode is void. The same holds for two starts of an
-episode. When the other one comes after the end of one of the last episodes, the cost of that episode is
-sent again, void.
+Which of them was taken is random, so the episode is void. The same holds for two starts of an
+episode. If the second one arrives after the end of one of the last episodes, the cost of that episode
+is sent again, void.
 
 Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
 controller signs. If so, only actions with the signature of their episode are taken; if not, a signed

@@ -5,12 +5,12 @@ parameters.yaml    the resolved parameters, in ROS form: what defines the traini
 run.json           the run's id on the network, how often its tuner was started, whether an
                    operator has paused it, the plant's fingerprint if it was given (0: not),
                    what defines the training, and why it cannot be continued, if so
-progress.jsonl     what happened, one JSON object a line, as it happened
+progress.jsonl     events, one JSON object per line, in order
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,);
                    of another law than the affine one `law`, its name, and policies (S, size)
 result.json        costs, reductions, history, seeds, versions, timing, the plant's fingerprint
-logs/              one file a node, when the command line started them
+logs/              one file per node, if the command line started them
 """
 
 import contextlib

@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Collects the trajectories of an episode from the ordinary `state` and `action` topics. Pure.
 
-A sample that was lost is never interpolated: the episode has no trajectories then, and is run again. So
-it is when a sample comes twice with different content: which of them was the plant's would be chance.
+A lost sample is never interpolated: the episode has no trajectories, and is run again. The same holds
+if two samples of a step differ, because it is unknown which of them was the plant's.
 """
 
 from collections.abc import Sequence

@@ -6,8 +6,8 @@
     searching   what `gauss_newton` asks for                  confirming
     confirming  the law found, on fields of the one before    the better one, beyond chance
 
-`gauss_newton` judges its steps on a few fields that it also makes them on. So the law that it found is
-compared with the one it began with on others, on which that one was measured before.
+`gauss_newton` judges its steps on the few fields from which it computes them. So its law is compared
+with the initial one on other fields, on which that one was measured before.
 """
 
 from __future__ import annotations

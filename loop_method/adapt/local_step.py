@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A damped Gauss-Newton step on the local models that best predict differences of trajectories.
 
-It always applies; the other kinds of proposals come before it.
+It always applies; the other kinds of proposals are tried first.
 
 A model that follows one trajectory well can still be wrong about its neighbours, and a step needs
 the neighbours. So a model is judged by what it will be used for: given the measured difference of

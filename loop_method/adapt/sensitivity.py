@@ -7,8 +7,8 @@ matrix B of a fitted model, X_k = dx_k/dtheta and G_k = da_k/dtheta follow
 
     G_k = K X_k[:n_s] + I (x) [s_k; 1]^T,        X_{k+1} = gamma (A_k X_k + B G_k),        X_0 = 0.
 
-A saturated action does not move with theta: its row of G_k is zero. gamma <= 1 forgets: it keeps
-the sensitivities of a model that is unstable where the plant is not from growing.
+A saturated action does not depend on theta: its row of G_k is zero. The forgetting factor gamma <= 1
+limits the growth of sensitivities where the model is unstable but the plant is not.
 
 The cost itself needs no model. With the measured x_k and a_k its gradient and Gauss-Newton curvature
 are

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic control over a finite horizon, about a point that need not be at rest.
+"""Linear-quadratic control over a finite horizon, about a point that need not be an equilibrium.
 
     e_{k+1} = A e_k + B a_k + d,        J = sum_k q |e_k|^2 + r |a_k|^2
 

@@ -1,9 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A control law: parameters theta, and the actions that they give.
+"""A control law: its parameters theta, and the actions computed from them.
 
     a_k = law(theta, z_k, m_k, k),        m_{k+1} = update(theta, z_k, m_k, a_k, k),        m_0 = start
 
-z_k is what is measured and m_k the law's memory, which most laws do not have. theta is one vector
+z_k is the measurement and m_k the law's memory, which most laws do not have. theta is one vector
 with named parts. Optimisers, training, messages and files know theta and the law's name; only the law
 knows what the parts mean. It is made from a reduced model s_{k+1} = A s_k + B a_k, s = U^T z:
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Feedback with a feed-forward of its own at each step, a_k = K U^T z_k + b_k."""
+"""Feedback with a different feed-forward at each step, a_k = K U^T z_k + b_k."""
 
 from __future__ import annotations
 

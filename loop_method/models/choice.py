@@ -2,10 +2,10 @@
 """The choice of a model of the whole field.
 
 Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
-from their initial states, in turns. Of a single rollout these are pieces; where all points share their
-coefficients, it is the rollout that the kind was fitted to. The first kind with E of at most
-`reproduced` is taken; where there is none, the one of the fewest unknowns that is not `better` times
-worse than the best. It is then fitted to all rollouts.
+from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
+share their coefficients, used for both. The first kind with E of at most `reproduced` is
+selected; if there is none, the one with the fewest unknowns that is not `better` times worse than the
+best. It is then fitted to all rollouts.
 """
 
 from __future__ import annotations

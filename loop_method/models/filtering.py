@@ -1,15 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""States of noisy rollouts as a model and the measurements together tell them.
+"""Estimates of the states of noisy rollouts from a model and the measurements.
 
-The model predicts the next state, and at every wavenumber k a share g of the innovation, measured less
+The model predicts the next state, and at every wavenumber k a share g of the innovation, measured minus
 predicted, corrects it:
 
     F[zhat_{k+1}] = F[f(zhat_k, a_k)] + g F[z_{k+1} - f(zhat_k, a_k)].
 
 With white noise of the power R the innovations have the power P + R, where P is that of the error of
-the prediction, and g = P/(P + R) leaves the least error (the steady-state Kalman filter of independent
-wavenumbers). So g is 1 as long as the model is wrong and falls as it becomes right; nothing about the
-model's error has to be known beforehand.
+the prediction, and g = P/(P + R) minimises the error (the steady-state Kalman filter of independent
+wavenumbers). So g is 1 while the model is poor and falls as it improves; the model's error need not be
+known beforehand.
 
 References
 ----------

@@ -1,17 +1,17 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Tells whether trajectories determine a linear model, and which inputs they cannot tell apart.
+"""Whether trajectories determine a linear model, and which inputs they cannot separate.
 
 The regressors of s_{k+1} = A s_k + B a_k are s_k = U^T z_k and a_k. The data determine the column of
-an input in B if it moved by itself: not constant, no combination of other inputs, no function of the
-state. So each input is regressed on
+an input in B if it varied independently: not constant, not a combination of other inputs, and not a
+function of the state. So each input is regressed on
 
     1, the other inputs, s_k, and the leading POD modes of z_k,
 
 with every channel scaled to the norm 1. Its residual, relative to its own variation and per degree of
-freedom, is its *independence*: about 1 for white noise, 0 for feedback without excitation. The 1 is
-there because a plant drifts, and the modes because feedback may use what s leaves out of the state.
+freedom, is its *independence*: about 1 for white noise, 0 for feedback without excitation. The 1
+allows for drift of the plant, and the modes for feedback of the part of the state outside s.
 
-All of this is relative: no unit of time, of the state or of an input changes what is found.
+All of this is relative: the result does not depend on the units of time, state or inputs.
 
 References
 ----------

@@ -1,14 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The order n_s that the data support: errors of models on steps that they were not fitted to.
+"""The order n_s that the data support: errors of models on held-out steps.
 
-Every trajectory is cut into pieces; each of four times every fourth piece is held out, and the others
-give U, A and B (see `loop_method.reduce.regression`). On a held-out piece z_0 .. z_N the model is away
-from the measurement by
+Every trajectory is cut into pieces; in each of four folds every fourth piece is held out, and the
+others give U, A and B (see `loop_method.reduce.regression`). The errors of the model on a held-out
+piece z_0 .. z_N are
 
     one step    z_{k+1} - U (A U^T z_k + B a_k)
     rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0,
 
-so that what lies outside the modes counts as well. An error is the root of the sum of squares over all
+so they include the part outside the modes. An error is the root of the sum of squares over all
 held-out steps, relative to that of z_{k+1} - z_k for one step and z_{k+1} - z_0 for the rollout: 1 is
 as good as a model in which nothing changes.
 

@@ -4,18 +4,18 @@
     x_{k+1} = A x_k + B a_k + G e_k,        y_k = U (C x_k + e_k)
 
 U holds the first r POD modes of the measurements z_k, at most as many as the order n. The innovations
-e_k are what the past does not tell of a measurement, so that the model is its own steady-state filter.
-Nothing is known of the state but that it is what the past says of the future:
+e_k are the part of a measurement that the past does not predict, so the model is its own steady-state
+filter. The state is defined by the prediction of the future from the past:
 
 1. A vector ARX of p steps, by ridge regression whose weight generalised cross-validation chooses,
 
        U^T z_k = sum_{i <= p} X_i [a_{k-i}; U^T z_{k-i}] + e_k,
 
    has as coefficients the Markov parameters X_i = C (A - G C)^{i-1} [B G] of the predictor.
-2. From them follows what the last p steps say of the next p measurements. Its leading n directions over
-   the data, by a singular value decomposition, are the state, with the second moment I.
+2. They give the prediction of the next p measurements from the last p steps. Its leading n directions
+   over the data, by a singular value decomposition, are the state, with the second moment I.
 3. C, and A and B, by least squares on these states. G is the gain of the Kalman filter with the
-   covariances of what both leave, whose Riccati equation makes it stable.
+   covariances of both residuals; its Riccati equation makes it stable.
 
 p and n are those of the least error in predicting held-out measurements one step ahead.
 
