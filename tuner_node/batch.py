@@ -127,6 +127,8 @@ class TrainingSettings:
     """True if the states are fields on one periodic axis."""
     line: bool = True
     """True if they are fields on one axis, or plain vectors."""
+    shape: tuple[int, ...] = ()
+    """Points of each axis, if they are fields on several; none: they are not."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
     field_models: FieldModelSettings = DEFAULTS

@@ -176,12 +176,14 @@ def build_training(values: Mapping[str, Any]) -> Training:
     # The published readings are scaled (docs/robustness.md).
     scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
+    points = () if grid is None else tuple(axis.size for axis in grid.axes)
     given |= {
         "law": law,
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
         "periodic": grid is None or grid.is_circle,
         "line": grid is None or len(grid.axes) < 2,
+        "shape": points if len(points) > 1 and not sensors else (),
         "measurement_noise": values["measurement_noise"] * scale,
         "model": given_model(values, law),
         "field_models": field_model_settings(values),

@@ -40,6 +40,7 @@ def context_of(
         actuator_positions=settings.actuator_positions,
         periodic=settings.periodic,
         line=settings.line,
+        shape=settings.shape,
         further=further,
         # Where numbers and the target do not say it.
         cost=None if cost is None or cost.plain else cost,

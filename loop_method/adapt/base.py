@@ -150,6 +150,8 @@ class Context:
         Whether the states are fields on one periodic axis, which models of the whole field assume.
     line : bool
         Whether they are fields on one axis, or plain vectors.
+    shape : tuple of int
+        Points of each axis, where they are fields on several; none: they are not.
     further : sequence of Trajectory
         Other explorations, from other initial fields.
     cost : Cost or None
@@ -176,6 +178,7 @@ class Context:
     actuator_positions: Sequence[float] = ()
     periodic: bool = True
     line: bool = True
+    shape: tuple[int, ...] = ()
     further: Sequence[Trajectory] = ()
     cost: Cost | None = None
     law: Law | None = None

@@ -109,6 +109,7 @@ def believe(
         action_limit=context.action_limit,
         first=first,
         line=context.line,
+        shape=context.shape,
     )
     if found is None:
         return None

@@ -66,6 +66,7 @@ class InCoordinates(Optimizer):
             measured=measured,
             periodic=False,
             line=False,
+            shape=(),
             cost=context.cost and CostInCoordinates(context.cost, self.basis),
             law=self._observer(context),
         )

@@ -54,6 +54,7 @@ def fit_field_model(
     action_limit: float = 0.0,
     first: str | None = None,
     line: bool = True,
+    shape: tuple[int, ...] = (),
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -76,6 +77,8 @@ def fit_field_model(
         Kind to be tried first, that of the last choice.
     line : bool
         Whether the states are fields on one axis, or plain vectors.
+    shape : tuple of int
+        Points of each axis, where the states are fields on several; none: they are not.
     """
     rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
@@ -83,7 +86,7 @@ def fit_field_model(
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
         settings = replace(settings, reproduced=settings.reproduced_noisy)
-    kinds = kinds_of(len(target), components, settings, line=line)
+    kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load

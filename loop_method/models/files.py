@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from loop_method.models.base import Arrays, FieldModel, text_of
+from loop_method.models.coarse import CoarseModel
 from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
@@ -16,6 +17,7 @@ from loop_method.models.spectral import SpectralModel
 FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
     "spectral": SpectralModel.from_arrays,
     "finite-difference": FiniteDifferenceModel.from_arrays,
+    "coarse": CoarseModel.from_arrays,
     "linear": LinearModel.from_arrays,
     "low-rank": LowRankModel.from_arrays,
     "readings": ReadingsModel.from_arrays,

@@ -17,8 +17,10 @@ from loop_method.models.columns import least_squares, orthonormal
 from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
 from loop_method.models.settings import FieldModelSettings
 
-LARGEST_RATE = (1.0, 1.0, 4.0)
-"""Largest rates of the differences of order 0, 1, 2 on a unit grid."""
+
+def largest_rate(order: int) -> float:
+    """The largest rate of a difference on a unit grid; order: 0, 1, 2, and on as of the model."""
+    return 4.0 if order and order % 2 == 0 else 1.0
 
 
 def fit_finite_difference(
@@ -29,20 +31,22 @@ def fit_finite_difference(
     components: int = 1,
     ridge: float | None = None,
     degree: int = 3,
+    shape: tuple[int, ...] = (),
 ) -> FiniteDifferenceModel | None:
     """The equation, or None where half of the samples overflow the first ones.
 
-    ridge: of the points' own parts in normalised columns; None: they have none.
+    ridge: of the points' own parts in normalised columns; None: they have none; shape: points of each
+    axis, where there are several.
     """
     samples = samples.thinned(settings.point_samples)
     (count, n_z), n_a = samples.before.shape, samples.actions.shape[1]
-    n_x, features = n_z // components, features_of(components, degree)
+    n_x, features = n_z // components, features_of(components, degree, len(shape) or 1)
     size = np.quantile(np.abs(samples.before).max(axis=1), 0.9)
-    growth = np.array([len(m) * size ** (len(m) - 1) * LARGEST_RATE[j] for m, j in features])
+    growth = np.array([len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j in features])
     root = samples.weights()
     change = (samples.after - samples.before) * root[:, None]
     C, B, c = np.zeros((len(features), components, n_x)), np.zeros((n_z, n_a)), np.zeros(n_z)
-    model, fitted = FiniteDifferenceModel(kind, features, C, B, c, 8), None
+    model, fitted = FiniteDifferenceModel(kind, features, C, B, c, 8, shape), None
     for _ in range(settings.point_passes):
         means, miss = model.means(samples.before, samples.actions, samples.after)
         ok = np.isfinite(means).all(axis=(1, 2)) & np.isfinite(miss).all(axis=1)
@@ -60,7 +64,7 @@ def fit_finite_difference(
         rate = float((np.abs(C) * growth[:, None, None]).sum(axis=0).max())
         substeps = int(np.clip(np.ceil(rate / settings.point_reach), 2, settings.point_substeps))
         B, c = np.ascontiguousarray(inputs[:, :-1]), np.ascontiguousarray(inputs[:, -1])
-        model = fitted = FiniteDifferenceModel(kind, features, C, B, c, substeps)
+        model = fitted = FiniteDifferenceModel(kind, features, C, B, c, substeps, shape)
     return fitted
 
 

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from loop_method.models.base import FieldModel, Measured, Samples
+from loop_method.models.coarse import fit_coarse
 from loop_method.models.finite_difference import features_of
 from loop_method.models.finite_difference_fit import fit_finite_difference
 from loop_method.models.linear import fit_convolution, fit_linear
@@ -59,11 +62,17 @@ class Kind:
 
 
 def kinds_of(
-    n_z: int, components: int, settings: FieldModelSettings, *, line: bool = True
+    n_z: int,
+    components: int,
+    settings: FieldModelSettings,
+    *,
+    line: bool = True,
+    shape: tuple[int, ...] = (),
 ) -> list[Kind]:
     """The kinds for states of that size.
 
-    line: whether a point has one neighbour at each side, which is not so on several axes.
+    line: whether a point has one neighbour at each side, which is not so on several axes; shape: points
+    of each axis, where there are several and the states are fields on them.
     """
     kinds: list[Kind] = []
     if not line or n_z > settings.dense:
@@ -75,6 +84,9 @@ def kinds_of(
             )
             for name, most in LOW_RANKS.items()
         ]
+    if shape:
+        several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
+        return kinds + _linear(n_z, settings) + several
     if not line:
         return kinds + _linear(n_z, settings)
     if components == 1 and n_z >= settings.fewest_points:
@@ -123,19 +135,30 @@ def _several_fields(
             fit_convolution, kind=name, ridge=settings.convolution_ridge, components=components
         )
         kinds.append(Kind(name, convolution, (float(components), 0)))
+    return kinds + _finite_difference(components, settings, prefix)
+
+
+def _finite_difference(
+    components: int, settings: FieldModelSettings, prefix: str, shape: tuple[int, ...] = ()
+) -> list[Kind]:
+    """Equations whose coefficients depend on the place; shape: as of `kinds_of`."""
+    kinds: list[Kind] = []
     for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
         if degree > settings.largest_degree:
             continue
-        count = components * len(features_of(components, degree))
+        count = components * len(features_of(components, degree, len(shape) or 1))
         for name, ridge in ridges.items():
-            fit = partial(
-                fit_finite_difference,
-                kind=prefix + name,
-                settings=settings,
-                components=components,
-                ridge=ridge,
-                degree=degree,
+            known: dict[str, Any] = {
+                "kind": prefix + name,
+                "settings": settings,
+                "ridge": ridge,
+                "degree": degree,
+            }
+            fit: Callable[[Samples], FieldModel | None] = partial(
+                fit_finite_difference, components=components, **known
             )
+            if shape:
+                fit = partial(fit_coarse, shape=shape, **known)
             # What a ridge holds at zero counts as a part of an unknown; the order is what matters.
             own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-4 else 1.0)
             kinds.append(Kind(prefix + name, fit, (own, count)))

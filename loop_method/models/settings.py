@@ -67,6 +67,13 @@ class FieldModelSettings(Settings):
     point_reach: float = setting(
         2.5, "as `reach`, for finite-difference models, whose rule is of order 4", 0.1, 2.8
     )
+    coarse_points: int = setting(
+        256,
+        "maximum number of grid points of finite-difference models on several axes; every n-th "
+        "point is used on finer grids",
+        16,
+        65536,
+    )
     convolution_ridge: float = setting(1e-9, "ridge of convolution models", 0, 1e-3)
     low_rank_ridge: float = setting(1e-12, "ridge of low-rank models", 0, 1e-3)
     snapshots: int = setting(

@@ -8,6 +8,7 @@ import pytest
 
 from loop_method.models import FieldModel
 from loop_method.models.base import MAX_SUBSTEPS
+from loop_method.models.coarse import CoarseModel
 from loop_method.models.files import FORMS, model_of
 from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
 from loop_method.models.linear import LinearModel
@@ -49,6 +50,19 @@ MODELS: dict[str, FieldModel] = {
         numbers(N_Z),
         4,
     ),
+    "coarse": CoarseModel(
+        FiniteDifferenceModel(
+            "k",
+            features_of(1, axes=2),
+            numbers(len(features_of(1, axes=2)), 1, N_Z),
+            numbers(N_Z, N_A),
+            numbers(N_Z),
+            4,
+            (2, N_Z // 2),
+        ),
+        np.arange(0, 2 * N_Z, 2),
+        numbers(2 * N_Z, N_Z),
+    ),
     "linear": LinearModel("k", numbers(N_Z, N_Z), numbers(N_Z, N_A), numbers(N_Z)),
     "low-rank": LowRankModel(
         "k", numbers(N_Z, 3), numbers(3, 3), numbers(3, N_A), constant=numbers(3)
@@ -78,7 +92,8 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
 def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
     arrays = MODELS[form].arrays()
     # Axes that nothing else tells the length of; the sensed model has a centre for each actuator.
-    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, **({} if form == "sensed" else {"B": 1})}
+    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, "inner.B": 1, "interpolation": 0}
+    free |= {} if form == "sensed" else {"B": 1}
     for name, array in arrays.items():
         for axis in range(array.ndim):
             if free.get(name) != axis:
