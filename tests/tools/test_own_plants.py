@@ -217,7 +217,7 @@ def test_an_installed_package_offers_plants_by_name(
     ("name", "given", "method"),
     [
         (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
-        (PLATE, {"nx": 6, "ny": 4}, {}),
+        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15}),
     ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(
