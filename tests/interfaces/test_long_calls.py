@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from loop_interfaces import long_calls
+from loop_interfaces import long_calls, own_code
 from loop_interfaces.own_code import OwnCodeError, called
 from tests.support.loop_harness import until
 
@@ -56,16 +57,47 @@ def test_a_call_within_another_is_named_instead_and_afterwards_the_outer_one(
     assert told[0].startswith("Own.inner")
 
 
-def test_what_returns_or_fails_is_forgotten(told: list[str]) -> None:
+class Clock:
+    """A time that passes only where a test lets it, however busy the machine is."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.looks: Counter[int | None] = Counter()
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, _: float) -> None:
+        """The watch of a thread looks all the time."""
+        self.looks[threading.get_ident()] += 1
+        time.sleep(0.001)
+
+
+def test_what_returns_or_fails_is_forgotten(
+    told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(long_calls, "time", clock)
+
+    def takes(seconds: float) -> None:
+        """Let the time pass, and the watch look at what is running then."""
+        clock.now += seconds
+        watch = own_code.LONG_CALLS._thread
+        assert watch is not None
+        seen = clock.looks[watch.ident]
+        until(lambda: clock.looks[watch.ident] >= seen + 2, LIMIT, "look")
+
     def fails() -> Any:
         raise ValueError("no")
 
     for _ in range(20):
-        called("Own.step", time.sleep, 0.02)
+        called("Own.step", takes, 0.02)
         with pytest.raises(OwnCodeError, match=r"Own\.step fails: .*, line \d+: ValueError: no"):
             called("Own.step", fails)
-    time.sleep(0.2)
+    takes(1.0)
     assert told == []
+    called("Own.step", takes, 0.2)
+    assert [text.split()[0] for text in told] == ["Own.step"]
 
 
 def test_two_threads_are_looked_after(told: list[str]) -> None:
