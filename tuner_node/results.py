@@ -7,8 +7,8 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+import scipy  # whose special functions, a tenth of a start, load when they are used
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Affine
@@ -182,7 +182,8 @@ def difference(before: Sequence[float], after: Sequence[float]) -> dict[str, Any
     if count < 2:
         return None
     mean = float(changes.mean())
-    reach = float(changes.std(ddof=1) / np.sqrt(count) * stdtrit(count - 1, 0.5 + CONFIDENCE / 2))
+    quantile = scipy.special.stdtrit(count - 1, 0.5 + CONFIDENCE / 2)
+    reach = float(changes.std(ddof=1) / np.sqrt(count) * quantile)
     numbers = {"change": mean, "low": mean - reach, "high": mean + reach}
     return {name: float(f"{value:.4g}") for name, value in numbers.items()} | {"fields": count}
 

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, rfft
+import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured
@@ -67,8 +67,10 @@ def filtered(
             predicted = model.step(z[rows], actions)
             wrong = ~(np.abs(predicted).max(axis=1) <= most)
         predicted[wrong] = z[rows][wrong]
-        innovation = rfft(np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted) / n_z
-        z[rows] = predicted + n_z * irfft(shares * innovation, n_z)
+        innovation = (
+            scipy.fft.rfft(np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted) / n_z
+        )
+        z[rows] = predicted + n_z * scipy.fft.irfft(shares * innovation, n_z)
         for i in rows:
             found[i][k + 1] = z[i]
         total += np.sum(np.abs(innovation) ** 2, axis=0)

@@ -35,8 +35,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
 from numpy.typing import NDArray
-from scipy.fft import irfft, rfft
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Measured
@@ -207,7 +207,7 @@ def _wavenumbers(
 ) -> tuple[int, Array]:
     """How many of the lowest wavenumbers stand out of the noise, and g of the first pass."""
     n_z = rollouts[0].states.shape[1]
-    spectra = [rfft(rollout.states) for rollout in rollouts]
+    spectra = [scipy.fft.rfft(rollout.states) for rollout in rollouts]
     signal, noise_power = signal_power(np.concatenate(spectra), noise, n_z)
     weak = signal + noise_power < settings.noisy_power * noise_power
     cut = max(int(np.argmax(weak)) if weak.any() else len(weak), settings.fewest_modes)
@@ -253,7 +253,7 @@ def _regression(
         return None
     index = np.array(windows)[:, None] + np.arange(steps)
     W, inputs = W[:, index], np.concatenate([actions, np.ones((len(actions), 1))], axis=1)[index]
-    spectra = np.concatenate([rfft(r.states)[:, :cut] for r in rollouts]) / model.n_z
+    spectra = np.concatenate([scipy.fft.rfft(r.states)[:, :cut] for r in rollouts]) / model.n_z
     y = spectra[np.array(own)[:, None] + np.arange(steps + 1)]
     total = np.zeros((len(W), len(y), steps + 1, cut), complex)
     common = np.zeros((len(y), steps + 1, cut, inputs.shape[2]), complex)
@@ -321,7 +321,7 @@ def _pass(
         return None
     spectrum = np.zeros((model.n_a + 1, modes), complex)
     spectrum[:, :cut] = data.inputs(left)
-    inputs = model.n_z * irfft(spectrum, model.n_z)
+    inputs = model.n_z * scipy.fft.irfft(spectrum, model.n_z)
     return replace(
         model,
         linear=linear,

@@ -18,8 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
 from numpy.typing import NDArray
-from scipy.fft import irfft, rfft
 
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
@@ -58,10 +58,10 @@ def interpolated(readings: Array) -> Array:
     """The field (n,) of lowest wavenumbers with these readings (n_y,)."""
     sensors = len(readings)
     n = grid_points(sensors)
-    spectrum = rfft(readings)
+    spectrum = scipy.fft.rfft(readings)
     if sensors % 2 == 0:  # half of its last wavenumber is that of minus the wavenumber
         spectrum[-1] *= 0.5
-    field: Array = irfft(spectrum / (sensors / n), n=n)
+    field: Array = scipy.fft.irfft(spectrum / (sensors / n), n=n)
     return np.roll(field, n // (2 * sensors))
 
 

@@ -26,8 +26,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
 from numpy.typing import NDArray
-from scipy.fft import irfft, rfft
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
@@ -110,7 +110,7 @@ def _pass(
     symbols = polynomials.T @ multipliers
     left = data.y - (linear - data.symbols[0]) * data.W[0]
     left = left - np.einsum("pk,pnk->nk", symbols, data.W[1:])
-    inputs = model.n_z * irfft(least_squares(data.common, left) / data.phi, model.n_z)
+    inputs = model.n_z * scipy.fft.irfft(least_squares(data.common, left) / data.phi, model.n_z)
     if not (np.isfinite(linear).all() and np.isfinite(symbols).all() and np.isfinite(inputs).all()):
         return None
     return replace(
@@ -132,7 +132,7 @@ def _regression(model: SpectralModel, samples: Samples, form: Form) -> Regressio
             W, miss = even.compiled.integrals(samples.before, samples.actions, samples.after)
         except ValueError:  # it grows beyond all bounds within a substep
             return None
-        before, after = (rfft(z) / model.n_z for z in (samples.before, samples.after))
+        before, after = (scipy.fft.rfft(z) / model.n_z for z in (samples.before, samples.after))
         y, phi = after - np.exp(L) * before, phi_functions(L)[0]
     ok = (
         np.isfinite(y).all(axis=1) & np.isfinite(W).all(axis=(0, 2)) & np.isfinite(miss).all(axis=1)

@@ -98,3 +98,14 @@ def test_the_loop_runs_in_one_process_without_ros_and_large_imports():
     )
     done = python("-c", program)
     assert done.stdout.strip() == "(1, 4, 8)"
+
+
+def test_what_only_some_trainings_need_of_scipy_is_loaded_when_it_is_used():
+    parts = [
+        f"scipy.{part}" for part in ("fft", "optimize", "signal", "sparse", "special", "stats")
+    ]
+    program = (
+        "import sys, controller_node.node, pde_sim_node.node, tuner_node.node, pdeloop.training_run\n"
+        f"print([name for name in {parts} if name in sys.modules])"
+    )
+    assert python("-c", program).stdout.strip() == "[]"

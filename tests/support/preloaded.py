@@ -7,6 +7,8 @@
 import gc
 import inspect
 
+import scipy.fft
+import scipy.special  # noqa: F401  # for what a training needs at its end
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.type_support import check_for_type_support
 

@@ -25,7 +25,13 @@ from tuner_node.training import Training
 
 NOISE = {"measurement_noise": 0.05, "process_noise": 0.02}
 BUDGETS: list[dict[str, Any]] = [
-    {"optimizer": "gauss_newton", "rollouts": 15, "horizon": 10, **NOISE},
+    {
+        "optimizer": "gauss_newton",
+        "rollouts": 12,
+        "horizon": 10,
+        "field_model_settings.folds": 2,
+        **NOISE,
+    },
     {"optimizer": "two_point", "rollouts": 16},
     {"optimizer": "two_point", "iterations": 3},
 ]
