@@ -68,7 +68,10 @@ def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorde
     problem = tmp_path / "own.yaml"
     problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given}}}))
     out, here = tmp_path / "run", tmp_path / "here"
-    words = [str(problem), "--plant", name, *flags({**BUDGET, "optimizer": optimizer})]
+    budget = {**BUDGET, "optimizer": optimizer}
+    if optimizer == "gauss_newton":  # its last rollouts compare laws: with 9 no step is confirmed
+        budget["rollouts"] = 12
+    words = [str(problem), "--plant", name, *flags(budget)]
     loop.wait(loop.pdeloop("train", *words, "--record", "--out", str(out)), LIMIT)
     loop.wait(loop.pdeloop("train", *words, "--in-process", "--out", str(here)), LIMIT)
     assert same_bits(policies(out), policies(here))
