@@ -192,7 +192,7 @@ def test_a_name_in_two_words_is_refused_with_the_help_of_new(
 def test_new_overwrites_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "own").mkdir()
     assert main(["new", "own"]) == FAILED
-    assert "there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert list((folder / "own").iterdir()) == []
 
 
