@@ -49,8 +49,8 @@ def plant_of(folder: Path) -> object:
     ("name", "given", "optimizer"),
     [
         (LINEAR, {"radius": 0.9}, "two_point"),
-        (PLATE, {"nx": 6, "ny": 4}, "model_based"),
-        (PENDULUM, {"horizon": 20}, "gauss_newton"),
+        (PLATE, {"nx": 6, "ny": 4}, "gauss_newton"),
+        (PENDULUM, {"horizon": 20}, "model_based"),
         (f"{PLANTS}/plate_skfem.py:Plate", {"refinements": 1}, "two_point"),
         solver("pde", "swift_hohenberg_pypde.py:SwiftHohenberg", {"points": 6}),
         solver("exponax", "burgers_exponax.py:Burgers", {"points": 16}),
