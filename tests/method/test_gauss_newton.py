@@ -26,6 +26,7 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.design.lqt import track
+from loop_method.models.denoising import denoised
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import parameters, same_bits, train_here
 
@@ -398,6 +399,29 @@ def test_all_kinds_of_steps_are_given_the_settings(monkeypatch: pytest.MonkeyPat
     optimizer = make(plant, settings=settings)
     optimizer.tell(measure(plant, optimizer.ask()))
     assert given == [settings, settings]
+
+
+def test_models_of_the_field_are_fitted_to_states_as_measured_and_noise_is_removed_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their fit knows of the noise; only on a line are initial fields known best by their spectra."""
+    fitted: list[Record] = []
+
+    def field_model(_: Context, data: list[Record], *__: Any) -> tuple[None, bool]:
+        fitted.extend(data)
+        return None, False
+
+    monkeypatch.setattr(field_step, "field_model", field_model)
+    plant = Plant()
+    context = replace(plant.context(), noise=0.1)
+    optimizer = make(plant, context=context)
+    results = measure(plant, optimizer.ask())
+    optimizer.tell(results)
+    measured = [context.exploration.states, *(r.trajectory.states for r in results if r.trajectory)]
+    assert len(fitted) == len(measured) == 4
+    assert all(same_bits(r.states, z) for r, z in zip(fitted, measured, strict=True))
+    for clean, states in zip(optimizer._proposer._without_noise(fitted), measured, strict=True):
+        assert same_bits(clean.states, denoised(states, 0.1))
 
 
 def test_the_ridges_are_equally_spaced_in_their_logarithm() -> None:
