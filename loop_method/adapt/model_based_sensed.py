@@ -22,7 +22,7 @@ from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.observer_design import compensators, whole_field_law
 from loop_method.adapt.renewal import mean_and_error
-from loop_method.adapt.sensed_loop import REPRODUCED, sensed_from, sensed_loop
+from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -60,7 +60,8 @@ class ModelBasedSensed(ModelBasedReadings):
             return super()._fields()
         loop = sensed_loop(self._context, self._sensed)
         found = [loop.smoothed(record) for record in self._data()]
-        good = [field for field, error in found if error <= REPRODUCED]
+        most = self._context.field_models.sensed_reproduced
+        good = [field for field, error in found if error <= most]
         return np.stack(good or [field for field, _ in found])
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:

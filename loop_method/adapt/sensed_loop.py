@@ -21,17 +21,7 @@ from loop_method.laws.observer import Observer
 from loop_method.models.sensed import SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
-
-REPRODUCED = 0.05
-"""The readings are reproduced up to this share of their sum of squares."""
-MOST_SENSORS = 32
-"""More point sensors than this are taken for a field."""
-NEWEST = 8
-"""The newest rollouts, which the model is fitted to."""
-AGAIN = 2
-"""Times that the model is fitted again with noise, when it is known how large short waves are."""
-EXTRAPOLATION = 1.5
-"""Fields that are simulated may be this many times as large as the measured ones."""
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
     WeakKeyDictionary()
@@ -42,6 +32,8 @@ _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array,
 @dataclass(frozen=True, eq=False)
 class SensedLoop(ObservedLoop):
     """Laws with an observer on a `SensedModel`; U and target are those of its grid."""
+
+    settings: FieldModelSettings = DEFAULTS
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""
@@ -62,7 +54,9 @@ class SensedLoop(ObservedLoop):
         if not steps or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[every // 2 :: every], self.state_weight * every
-        smoothing = Smoothing(model.shared, model.centres, model.noise, target, model.spread)
+        smoothing = Smoothing(
+            *(model.shared, model.centres, model.noise, target, model.spread), self.settings
+        )
         known = distance(record, weight, self.action_weight, self.horizon)
         return smoothing.field(record.acted_from, record.actions, known)
 
@@ -80,15 +74,15 @@ def distance(record: Record, state_weight: float, action_weight: float, horizon:
 
 
 def whole_rollouts(
-    problem: ClosedLoopProblem, records: Sequence[Record], largest_cost: float
+    problem: ClosedLoopProblem, records: Sequence[Record], largest_cost: float, newest: int
 ) -> list[Record]:
-    """Whole rollouts, the newest, each once, and none whose readings went far away."""
+    """The newest whole rollouts, each once, and none whose readings went far away."""
     whole = {
         record.states.tobytes(): record
         for record in records
         if len(record.actions) == problem.horizon and problem.cost_of(record) <= largest_cost
     }
-    return list(whole.values())[-NEWEST:]
+    return list(whole.values())[-newest:]
 
 
 def of_rollouts(
@@ -109,6 +103,7 @@ def fit_rollouts(
     centres: Array,
     noise: float,
     start: Array | None,
+    settings: FieldModelSettings = DEFAULTS,
 ) -> tuple[Array, Array, float] | None:
     """The fit that reproduces the readings of rollouts, from an earlier equation or from nothing.
 
@@ -116,16 +111,19 @@ def fit_rollouts(
     """
     readings, actions, distances = of_rollouts(problem, rollouts)
     for first in (None,) if start is None else (start, None):
-        found = fit_sensed(readings, actions, centres, noise, first, problem.target, distances)
-        if found[2] <= REPRODUCED:
+        found = fit_sensed(
+            *(readings, actions, centres, noise, first, problem.target, distances),
+            settings=settings,
+        )
+        if found[2] <= settings.sensed_reproduced:
             return found
     return None
 
 
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring."""
-    sensors = context.sensors
-    return context.periodic and sensors == len(context.target) and 0 < sensors <= MOST_SENSORS
+    sensors, most = context.sensors, context.field_models.sensed_most
+    return context.periodic and sensors == len(context.target) and 0 < sensors <= most
 
 
 def sensed_from(
@@ -133,17 +131,18 @@ def sensed_from(
 ) -> tuple[SensedModel, float] | None:
     """The model that reproduces the newest rollouts, and its error; None if it does not.
 
-    start: the equation that was fitted before, the (12,) unknowns.
+    start: the equation that was fitted before, the (12 + n_a,) unknowns.
     """
-    sensors, n_a = context.sensors, records[0].actions.shape[1]
+    sensors, n_a, settings = context.sensors, records[0].actions.shape[1], context.field_models
     problem = ClosedLoopProblem(
         *(context.U, context.target, context.state_weight, context.action_weight, context.horizon)
     )
-    chosen = whole_rollouts(problem, records, LOCAL * problem.cost_of(records[0]))
+    largest_cost = LOCAL * problem.cost_of(records[0])
+    chosen = whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
     if not chosen:
         return None
     centres = context.actuator_centres(n_a)
-    found = fit_rollouts(problem, chosen, centres, context.noise, start)
+    found = fit_rollouts(problem, chosen, centres, context.noise, start, settings)
     if found is None:
         return None
     shared, fields, error = found
@@ -154,24 +153,23 @@ def sensed_from(
     def learned() -> Smoothing:
         # The unpredicted part of a reading is noise to a filter.
         noise = float(np.sqrt(context.noise**2 + error * size))
-        return Smoothing(shared, centres, noise, context.target).learned(known)
+        smoothing = Smoothing(shared, centres, noise, context.target, settings=settings)
+        return smoothing.learned(known)
 
     smoothing = learned()
     # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
-    for _ in range(AGAIN if context.noise else 0):
+    for _ in range(settings.sensed_again if context.noise else 0):
         again = fit_sensed(
             *(readings, actions, centres, context.noise, shared, context.target, distances),
-            smoothing.spread,
+            *(smoothing.spread, settings),
         )
-        if again[2] > REPRODUCED:
+        if again[2] > settings.sensed_reproduced:
             break
         shared, fields, error = again
         smoothing = learned()
     assert smoothing.spread is not None
-    largest = EXTRAPOLATION * float(np.abs(fields).max())
-    model = sensed_model(
-        shared, sensors, centres, largest, context.field_models, noise=smoothing.noise
-    )
+    largest = settings.sensed_extrapolation * float(np.abs(fields).max())
+    model = sensed_model(shared, sensors, centres, largest, settings, noise=smoothing.noise)
     return replace(model, spread=smoothing.spread), error
 
 
@@ -188,4 +186,5 @@ def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
         model=model,
         noise=model.noise,
         law=context.law,
+        settings=context.field_models,
     )

@@ -17,7 +17,7 @@ from loop_method.adapt.field_step import extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
 from loop_method.adapt.settings import GaussNewtonSettings
-from loop_method.models.sensed import KIND, SHARED, interpolated, sensed_model
+from loop_method.models.sensed import KIND, interpolated, sensed_model, unknowns
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 
@@ -35,13 +35,13 @@ class SensedProposals:
     largest_cost : float
         Mean stage cost of a rollout above which it is not fitted.
     settings : FieldModelSettings
-        Constants of the model's internal steps.
+        Constants of the fit and of the model's internal steps.
     own : GaussNewtonSettings, optional
         Constants of a step.
 
     Attributes
     ----------
-    equation : (12,) array
+    equation : (12 + n_a,) array
         The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
@@ -57,13 +57,15 @@ class SensedProposals:
         self._loop, self._centres, self._noise = loop, centres, noise
         self._largest_cost, self._settings = largest_cost, settings
         self._own = own or GaussNewtonSettings()
-        self.equation: Array = np.zeros(SHARED)
+        self.equation: Array = np.zeros(unknowns(len(centres)))
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""
-        rollouts = whole_rollouts(self._loop, data, self._largest_cost)
+        settings = self._settings
+        newest = settings.sensed_newest
+        rollouts = whole_rollouts(self._loop, data, self._largest_cost, newest)
         start = self.equation if self.equation.any() else None
-        fitted = fit_rollouts(self._loop, rollouts, self._centres, self._noise, start)
+        fitted = fit_rollouts(self._loop, rollouts, self._centres, self._noise, start, settings)
         if fitted is None:
             return None
         shared, fields, error = fitted
@@ -80,7 +82,7 @@ class SensedProposals:
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            model=sensed_model(shared, sensors, self._centres, reach * largest, self._settings),
+            model=sensed_model(shared, sensors, self._centres, reach * largest, settings),
             noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))

@@ -1,12 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation of a field of which a few points are measured.
 
-    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,        B_i(x) = b 1[|x - x_i| < w/2],
-                                        x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,    B_i(x) = (b + b_i) 1[|x - x_i| < w/2],
+                                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i of the
 actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
-unknowns, however fine the grid. `loop_method.models.sensed_fit` finds them.
+unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds them.
+
+A sampling time has internal steps, the more the larger the field: a front moves through several grid
+points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
 
 References
 ----------
@@ -26,7 +29,7 @@ from loop_interfaces.arrays import Array
 from loop_method.models.base import Arrays, numbers_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
-from loop_method.models.spectral_fit import substeps_of
+from loop_method.models.spectral_fit import fewer_of, substeps_of
 
 Spectrum = NDArray[np.complex128]
 
@@ -37,7 +40,7 @@ COEFFICIENTS = len(TERMS) + 1
 _ACTUATORS = 4
 KIND = "sensed"
 SHARED = COEFFICIENTS + _ACTUATORS
-"""Unknowns that all rollouts share."""
+"""Unknowns that all rollouts share, besides one for each actuator."""
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
@@ -45,8 +48,11 @@ WAVES = 16
 """Cosines and sines of an initial field, in addition to its mean."""
 # The least number of grid points.
 _POINTS = 64
-# A linear part that grows faster, in a sampling time, would overflow within an episode.
-_FASTEST_GROWTH = 0.5
+
+
+def unknowns(n_a: int) -> int:
+    """Number of unknowns that all rollouts share."""
+    return SHARED + n_a
 
 
 def grid_points(sensors: int) -> int:
@@ -71,7 +77,7 @@ class SensedModel(SpectralModel):
 
     Attributes
     ----------
-    shared : (12,) array
+    shared : (12 + n_a,) array
         Its unknowns, in their units.
     centres : (n_a,) array
         x_i, as it was declared.
@@ -116,12 +122,20 @@ class SensedModel(SpectralModel):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         return SensedModel(
             **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
-            shared=numbers_of(arrays, "shared", SHARED),
+            shared=_shared_of(arrays, whole.n_a),
             centres=numbers_of(arrays, "centres", whole.n_a),
             sensors=sensors,
             noise=float(checked_array(arrays, "noise", "f", ())),
             spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
         )
+
+
+def _shared_of(arrays: Arrays, n_a: int) -> Array:
+    """The unknowns of `arrays`; older ones have equal actuators."""
+    known = arrays.get("shared")
+    if known is not None and known.shape == (SHARED,):
+        return np.append(numbers_of(arrays, "shared", SHARED), np.zeros(n_a))
+    return numbers_of(arrays, "shared", unknowns(n_a))
 
 
 def sensed_model(
@@ -136,7 +150,7 @@ def sensed_model(
 
     Parameters
     ----------
-    shared : (12,) array
+    shared : (12 + n_a,) array
         The unknowns that all rollouts share, in their units.
     sensors : int
         n_y.
@@ -150,8 +164,9 @@ def sensed_model(
         As of `SensedModel`.
     """
     n = grid_points(sensors)
-    equation = SensedEquation(shared, n, centres)
+    equation = SensedEquation(shared, n, centres, settings)
     symbols = np.stack([equation.linear, equation.square, equation.cube])
+    substeps = substeps_of(symbols, largest, settings)
     return SensedModel(
         KIND,
         equation.linear,
@@ -159,7 +174,8 @@ def sensed_model(
         np.eye(2),
         np.fft.irfft(equation.actuators, n).T,
         np.full(n, equation.constant / n),
-        substeps=substeps_of(symbols, largest, settings),
+        substeps=substeps,
+        fewer=fewer_of(symbols, largest, substeps, settings),
         shared=shared,
         centres=centres,
         sensors=sensors,
@@ -168,10 +184,20 @@ def sensed_model(
 
 
 class SensedEquation:
-    """The equation in Fourier space, for unknowns of any shape (..., 12)."""
+    """The equation in Fourier space, for unknowns of any shape (..., 12 + n_a).
 
-    def __init__(self, shared: Array, n: int, centres: Array) -> None:
-        self.n, waves = n, np.arange(n // 2 + 1)
+    clip: z is cut to it in powers above the first, so that a wrong equation is far off but finite.
+    """
+
+    def __init__(
+        self,
+        shared: Array,
+        n: int,
+        centres: Array,
+        settings: FieldModelSettings = DEFAULTS,
+        clip: float = np.inf,
+    ) -> None:
+        self.n, waves, self._settings, self._clip = n, np.arange(n // 2 + 1), settings, clip
         derivative = 2j * np.pi * waves
         self._kept = waves < n // 2
         derivative[~self._kept] = 0.0
@@ -180,11 +206,12 @@ class SensedEquation:
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
             symbols[p - 1] += unit * shared[..., i, None] * derivative**j
         linear, self.square, self.cube = symbols
-        self.linear = np.minimum(linear.real, _FASTEST_GROWTH) + 1j * linear.imag
-        self._half = np.exp(0.5 * self.linear)
-        self._whole = self._half**2
+        # What grows faster would overflow within an episode.
+        self.linear = np.minimum(linear.real, settings.sensed_growth) + 1j * linear.imag
+        self._exponentials: dict[int, tuple[Spectrum, Spectrum]] = {}
         self.constant = n / _TIME * shared[..., COEFFICIENTS - 1]
-        b, x_0, s, w = np.moveaxis(shared[..., COEFFICIENTS:, None, None], -3, 0) / _TIME
+        b, x_0, s, w = np.moveaxis(shared[..., COEFFICIENTS:SHARED, None, None], -3, 0) / _TIME
+        b = b + shared[..., SHARED:, None] / _TIME
         n_a = len(centres)
         own = np.arange(n_a)[:, None]
         places = centres[:, None] + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
@@ -193,25 +220,43 @@ class SensedEquation:
         shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
         self.actuators: Spectrum = n * b * shape * np.exp(-2j * np.pi * waves * places)
 
+    def substeps(self, sizes: Array) -> NDArray[np.int64]:
+        """Internal steps for fields of these sizes, with the first of the unknowns."""
+        symbols = np.stack(
+            [symbol.reshape(-1, symbol.shape[-1])[0] for symbol in (self.square, self.cube)]
+        )
+        symbols = symbols[:, : 2 * symbols.shape[1] // 3]
+        z = sizes[:, None]
+        rates = np.abs(2.0 * z * symbols[0]) + np.abs(3.0 * z * z * symbols[1])
+        most = self._settings.substeps
+        steps = np.nan_to_num(np.ceil(rates.max(axis=1) / self._settings.reach), nan=most)
+        return np.asarray(np.clip(steps, 1, most), dtype=np.int64)
+
     def force(self, a: Array) -> Spectrum:
         """The constant, and the effect of the actions (..., n_a)."""
         force: Spectrum = (a[..., None, :] @ self.actuators)[..., 0, :]
         force[..., 0] += self.constant
         return force
 
-    def step(self, z: Spectrum, force: Spectrum) -> Spectrum:
-        half, whole = self._half, self._whole
-        first = self._rate(z, force)
-        second = self._rate(half * (z + 0.5 * first), force)
-        third = self._rate(half * z + 0.5 * second, force)
-        fourth = self._rate(whole * z + half * third, force)
-        after: Spectrum = whole * z + (whole * first + 2.0 * half * (second + third) + fourth) / 6.0
-        return after
+    def step(self, z: Spectrum, force: Spectrum, substeps: int = 1) -> Spectrum:
+        """The field a sampling time later."""
+        h = 1.0 / substeps
+        if substeps not in self._exponentials:
+            half = np.exp(0.5 * h * self.linear)
+            self._exponentials[substeps] = half, half**2
+        half, whole = self._exponentials[substeps]
+        for _ in range(substeps):
+            first = self._rate(z, force)
+            second = self._rate(half * (z + 0.5 * h * first), force)
+            third = self._rate(half * z + 0.5 * h * second, force)
+            fourth = self._rate(whole * z + h * half * third, force)
+            z = whole * z + h / 6.0 * (whole * first + 2.0 * half * (second + third) + fourth)
+        return z
 
     def _rate(self, z: Spectrum, force: Spectrum) -> Spectrum:
         """The nonlinear terms, on a grid fine enough for the products."""
         count = z.shape[-1]
-        field = 2.0 * np.fft.irfft(z, 2 * self.n)
+        field = np.clip(2.0 * np.fft.irfft(z, 2 * self.n), -self._clip, self._clip)
         square = field * field
         rate: Spectrum = force + 0.5 * (
             self.square * np.fft.rfft(square)[..., :count]

@@ -21,10 +21,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import WAVES, grid_points, spectrum
 from loop_method.models.sensed_fit import SensedProblem
-
-# Steps towards the likeliest spread, the least share of a rollout that counts as told, and the least
-# spread, relative to the largest.
-_LEARNING_STEPS, _LEAST_TOLD, _LEAST_SPREAD = 5, 0.05, 1e-2
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +30,7 @@ class Smoothing:
 
     Attributes
     ----------
-    shared : (12,) array
+    shared : (12 + n_a,) array
         The equation's unknowns.
     centres : (n_a,) array
         Of the actuators, as shares of the domain.
@@ -44,6 +41,8 @@ class Smoothing:
     spread : (33,) array, optional
         Standard deviations of the Fourier coefficients of a field; those that readings of any size
         suggest if there are none.
+    settings : FieldModelSettings
+        The constants of the fits, `sensed_`.
     """
 
     shared: Array
@@ -51,6 +50,7 @@ class Smoothing:
     noise: float
     target: Array
     spread: Array | None = None
+    settings: FieldModelSettings = DEFAULTS
 
     def field(self, readings: Array, actions: Array, distance: float) -> tuple[Array, float]:
         """The initial field (n,) and its error, as of `fit_sensed`; infinite where nothing is finite.
@@ -71,12 +71,14 @@ class Smoothing:
         problems = [self._problem(*rollout) for rollout in rollouts]
         found = [p.fit(self.shared, p.interpolated(), known=True)[2] for p in problems]
         spread: Array = np.mean([problem.suggested for problem in problems], axis=0)
-        for _ in range(_LEARNING_STEPS):
+        settings = self.settings
+        for _ in range(settings.sensed_learning):
             size, told = np.zeros(len(spread)), np.zeros(len(spread))
             for problem, fields in zip(problems, found, strict=True):
                 size += fields[0] ** 2
                 told += 1.0 - problem.variances(self.shared, fields) / spread**2
-            spread = _falling(size, np.maximum(told, _LEAST_TOLD * len(problems)))
+            told = np.maximum(told, settings.sensed_least_told * len(problems))
+            spread = _falling(size, told, settings.sensed_least_spread)
             for i, problem in enumerate(problems):
                 problem.spread = spread
                 found[i] = problem.refined(self.shared, found[i])
@@ -87,17 +89,18 @@ class Smoothing:
         first = float(np.sqrt(np.mean(readings[0] ** 2)))
         problem = SensedProblem(
             *(readings[None], actions[None], self.centres, self.noise, self.target),
-            np.array([distance]),
+            *(np.array([distance]), self.settings),
             least=first,
         )
         problem.spread = self.spread
         return problem
 
 
-def _falling(size: Array, told: Array) -> Array:
+def _falling(size: Array, told: Array, least: float) -> Array:
     """The square root of size / told, alike for cosine and sine, and not rising with the wavenumber.
 
-    Between sensors a short wave looks like a long one, which is the likelier one.
+    Between sensors a short wave looks like a long one, which is the likelier one. least: the least of
+    them, relative to the largest.
     """
     squares, weights = (
         np.mean([part[1 : WAVES + 1], part[WAVES + 1 :]], axis=0) for part in (size, told)
@@ -107,5 +110,5 @@ def _falling(size: Array, told: Array) -> Array:
 
     waves = isotonic_regression(squares / weights, weights=weights, increasing=False).x
     variances = np.concatenate([size[:1] / told[:1], waves, waves])
-    found: Array = np.sqrt(np.maximum(variances, _LEAST_SPREAD**2 * variances.max()))
+    found: Array = np.sqrt(np.maximum(variances, least**2 * variances.max()))
     return found

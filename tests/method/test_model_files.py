@@ -14,7 +14,7 @@ from loop_method.models.finite_difference import FiniteDifferenceModel, features
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
-from loop_method.models.sensed import SHARED, SensedModel, grid_points
+from loop_method.models.sensed import SHARED, SensedModel, grid_points, unknowns
 from loop_method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2
@@ -73,7 +73,7 @@ MODELS: dict[str, FieldModel] = {
     ),
     "sensed": SensedModel(
         **spectral(grid_points(SENSORS)),  # type: ignore[arg-type]
-        shared=numbers(SHARED),
+        shared=numbers(unknowns(N_A)),
         centres=numbers(N_A),
         sensors=SENSORS,
     ),
@@ -86,6 +86,13 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     again = model_of(arrays).arrays()
     assert again.keys() == arrays.keys()
     assert all(np.array_equal(again[name], arrays[name]) for name in arrays)
+
+
+def test_an_older_model_between_sensors_has_equal_actuators() -> None:
+    arrays = MODELS["sensed"].arrays()
+    older = model_of({**arrays, "shared": arrays["shared"][:SHARED]}).arrays()["shared"]
+    np.testing.assert_array_equal(older[:SHARED], arrays["shared"][:SHARED])
+    assert older.shape == arrays["shared"].shape and not older[SHARED:].any()
 
 
 @pytest.mark.parametrize("form", FORMS)

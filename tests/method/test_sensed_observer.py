@@ -29,11 +29,11 @@ from loop_method.laws import Observer
 from loop_method.models.files import model_of
 from loop_method.models.sensed import (
     COEFFICIENTS,
-    SHARED,
     TERMS,
     SensedModel,
     interpolated,
     sensed_model,
+    unknowns,
 )
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
@@ -48,7 +48,7 @@ RNG = np.random.default_rng(17)
 
 def equation(**terms: float) -> Array:
     """Unknowns of an equation with these terms, like z1 for z and z0_x2 for its second derivative."""
-    shared = np.zeros(SHARED)
+    shared = np.zeros(unknowns(N_A))
     for name, value in terms.items():
         p, j = (int(part) for part in name[1:].split("_x"))
         shared[TERMS.index((p, j))] = value
