@@ -35,6 +35,8 @@ Spectrum = NDArray[np.complex128]
 
 # p and j of the terms; 1 is added for the constant.
 TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
+HIGHEST = (3, 0)
+"""The term that bounds large fields: it never drives them on."""
 COEFFICIENTS = len(TERMS) + 1
 # b, x_0, s and w.
 _ACTUATORS = 4
@@ -204,7 +206,10 @@ class SensedEquation:
         symbols = np.zeros((3, *shared.shape[:-1], waves.size), dtype=np.complex128)
         for i, (p, j) in enumerate(TERMS):
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
-            symbols[p - 1] += unit * shared[..., i, None] * derivative**j
+            value = shared[..., i, None]
+            # Fields beyond some size would run away, which rollouts do not.
+            value = np.minimum(value, 0.0) if (p, j) == HIGHEST else value
+            symbols[p - 1] += unit * value * derivative**j
         linear, self.square, self.cube = symbols
         # What grows faster would overflow within an episode.
         self.linear = np.minimum(linear.real, settings.sensed_growth) + 1j * linear.imag

@@ -20,7 +20,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import WAVES, grid_points, spectrum
-from loop_method.models.sensed_fit import SensedProblem
+from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 

@@ -126,27 +126,43 @@ class FieldModelSettings(Settings):
     )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
     sensed_again: int = setting(
-        2, "further fits with measurement noise, each with the spread of waves that the last one implies", 0, 100
+        2,
+        "further fits with measurement noise, each with the spread of waves that the last one implies",
+        0,
+        100,
     )
     sensed_beginning: float = setting(
         0.05, "share of each rollout over which a fit begins", 1e-3, 1
     )
+    sensed_shortest: int = setting(10, "minimum number of its time steps", 2, 1_000_000)
     sensed_continuation: float = setting(
         1.6, "factor by which this share then grows, until the rollouts are whole", 1.1, 1000
     )
-    sensed_iterations: int = setting(20, "maximum number of iterations of a fit over a part of the rollouts", 1, 1000)
+    sensed_iterations: int = setting(
+        20, "maximum number of iterations of a fit over a part of the rollouts", 1, 1000
+    )
     sensed_last_iterations: int = setting(60, "the same over whole rollouts", 1, 1000)
     sensed_least_gain: float = setting(
         1e-3, "share of the error that an iteration must gain for the fit to continue", 0, 1
     )
-    sensed_damping: float = setting(1e-2, "initial damping of the Levenberg-Marquardt method", 1e-9, 1e4)
+    sensed_damping: float = setting(
+        1e-2, "initial damping of the Levenberg-Marquardt method", 1e-9, 1e4
+    )
     sensed_difference: float = setting(1e-5, "step of the finite differences", 1e-9, 1e-2)
-    sensed_compared: int = setting(100, "maximum number of time steps whose readings are compared", 2, 1_000_000)
+    sensed_compared: int = setting(
+        100, "maximum number of time steps whose readings are compared", 2, 1_000_000
+    )
     sensed_distance: float = setting(
-        0.1, "weight of the relative error of the distance from the target, which follows from a cost", 0, 10
+        0.1,
+        "weight of the relative error of the distance from the target, which follows from a cost",
+        0,
+        10,
     )
     sensed_dispersion: float = setting(
-        20.0, "dispersion at which fits start, of both signs; also half of it and 1.5 times it", 0, 1e6
+        20.0,
+        "dispersion at which fits start, of both signs; also half of it and 1.5 times it",
+        0,
+        1e6,
     )
     sensed_growth: float = setting(
         0.5, "maximum growth of a wave per sampling time, as an exponent of e", 0, 10
@@ -165,20 +181,29 @@ class FieldModelSettings(Settings):
     )
     sensed_ridge: float = setting(1e-5, "ridge of the unknowns of the equation", 0, 1)
     sensed_place_ridge: float = setting(
-        1e-3, "ridge of the shifts, widths and differences of actuators while no equation is known", 0, 1
+        1e-3,
+        "ridge of the shifts, widths and differences of actuators while no equation is known",
+        0,
+        1,
     )
-    sensed_unequal_ridge: float = setting(
-        1e-4, "ridge of the differences between actuators", 0, 1
-    )
+    sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
     sensed_deviation: float = setting(
-        10.0, "prior standard deviation of the unknowns of the equation, with measurement noise", 1e-6, 1e12
+        10.0,
+        "prior standard deviation of the unknowns of the equation, with measurement noise",
+        1e-6,
+        1e12,
     )
     sensed_unequal: float = setting(
         1.0, "the same for the differences between actuators", 1e-6, 1e12
     )
-    sensed_field_ridge: float = setting(1e-3, "ridge of the Fourier coefficients of an initial field", 0, 1)
+    sensed_field_ridge: float = setting(
+        1e-3, "ridge of the Fourier coefficients of an initial field", 0, 1
+    )
     sensed_field_deviation: float = setting(
-        0.5, "prior standard deviation of these coefficients relative to the readings, with noise", 1e-6, 1e6
+        0.5,
+        "prior standard deviation of these coefficients relative to the readings, with noise",
+        1e-6,
+        1e6,
     )
     sensed_field_wave: float = setting(
         4.0, "wavenumber beyond which both become stricter, with its square", 0.1, 1e3

@@ -24,7 +24,8 @@ from loop_method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from loop_method.models.sensed_fit import SensedProblem, fit_sensed
+from loop_method.models.sensed_fit import fit_sensed
+from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout

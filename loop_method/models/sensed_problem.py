@@ -1,0 +1,281 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The least squares problem of `loop_method.models.sensed_fit`, its derivatives and its descent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.models.sensed import (
+    COEFFICIENTS,
+    SHARED,
+    WAVES,
+    SensedEquation,
+    grid_points,
+    interpolated,
+    spectrum,
+    unknowns,
+)
+from loop_method.models.settings import DEFAULTS, FieldModelSettings
+
+# The part of rollouts that the fields of a known equation are fitted to before the whole.
+_FIRST = 3
+# Steps before and after one that also tell how large its field is.
+_NEAR = 2
+# Least and largest damping.
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e4
+
+
+class SensedProblem:
+    """The least squares problem: readings y (R, T, n_y), actions a (R, T, n_a), distances (R,).
+
+    target, distances: as in `fit_sensed`; least: the least size of the readings that errors are
+    relative to. noise becomes what the noise has in the mean square of the readings, as a share of it.
+    """
+
+    def __init__(
+        self,
+        y: Array,
+        a: Array,
+        centres: Array,
+        noise: float,
+        target: Array,
+        distances: Array,
+        settings: FieldModelSettings = DEFAULTS,
+        place_ridge: float = 0.0,
+        least: float = 0.0,
+    ) -> None:
+        self.y, self.a, self._centres, self._settings = y, a, centres, settings
+        self.shared = unknowns(len(centres))
+        self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
+        self.noise: float = (noise / self._size) ** 2
+        self._place_ridge = place_ridge
+        near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
+        self._sizes = settings.sensed_margin * windows.max(axis=1)
+        self._clip = settings.sensed_clip * float(near.max())
+        self._precision = np.zeros(self.shared)
+        self.spread: Array | None = None
+        sensors = y.shape[2]
+        self._n = grid_points(sensors)
+        waves = np.arange(self._n // 2 + 1)
+        places = (np.arange(sensors) + 0.5) / sensors
+        # Of a transform: the field at the sensors.
+        twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
+        self._read = np.exp(2j * np.pi * waves[:, None] * places) * (twice / self._n)[:, None]
+        self._waves = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
+        # Times |transform|^2: the mean square of the field.
+        self._mean_square = twice / self._n**2
+        self._target = np.fft.rfft(interpolated(target))
+        self._distances = distances
+
+    def interpolated(self) -> Array:
+        """Initial fields from the first readings alone, (R, 33)."""
+        sensors = self.y.shape[2]
+        places = (np.arange(sensors) + 0.5) / sensors
+        grid = np.arange(self._n) / self._n
+        fields = np.stack([np.interp(grid, places, y[0], period=1.0) for y in self.y])
+        z = np.fft.rfft(fields)[:, : WAVES + 1] / self._n
+        return np.hstack([z.real, z.imag[:, 1:]])
+
+    @property
+    def lengths(self) -> list[int]:
+        """Steps of the rollouts that are fitted one after the other."""
+        steps, found = self.y.shape[1], []
+        share = max(self._settings.sensed_beginning, self._settings.sensed_shortest / steps)
+        while share < 1.0:
+            found.append(min(max(2, round(share * steps)), steps))
+            share *= self._settings.sensed_continuation
+        return [*found, steps]
+
+    def fit(
+        self,
+        shared: Array,
+        fields: Array,
+        *,
+        known: bool = False,
+        lengths: Sequence[int] = (),
+        most: float = np.inf,
+    ) -> tuple[float, Array, Array]:
+        """The error per reading, relative to their size, and the unknowns.
+
+        known: the shared ones stay as they are; lengths: of the fits, `lengths` if there are none;
+        most: the error after any of them, besides noise, with which the fit is given up.
+        """
+        every = self.lengths
+        # The fields of a known equation need less of a continuation.
+        lengths = lengths or ([*every[: _FIRST + 1][-1:], every[-1]] if known else every)
+        for steps, following in zip(lengths, [*lengths[1:], lengths[-1]], strict=True):
+            moved = self._descend(shared, fields, steps, known)
+            # What fits the beginning may overflow later.
+            if np.isfinite(self._error(*moved, following)):
+                shared, fields = moved
+            if not known:
+                self._precision = self._relevant(shared, fields, steps)
+            if self._error(shared, fields, steps) > most + self.noise:
+                return np.inf, shared, fields
+        return self._error(shared, fields, lengths[-1]), shared, fields
+
+    def forget(self) -> None:
+        """Take all unknowns for relevant again."""
+        self._precision = np.zeros(self.shared)
+
+    def _relevant(self, shared: Array, fields: Array, steps: int) -> Array:
+        """Ridges of the shared unknowns, s^2/(x^2 + s^2 H^-1): large where one is not significant."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual, J = self._linearised(shared, fields, steps, known=False)
+        if not np.isfinite(J).all():
+            return self._precision
+        variance = max(float(residual @ residual), self.noise) / residual.size
+        inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)))
+        own = variance * np.diag(inverse)[: self.shared]
+        found: Array = variance / np.maximum(shared**2 + own, np.finfo(float).tiny)
+        return found
+
+    def refined(self, shared: Array, fields: Array) -> Array:
+        """The fields that fit best next to these, with the shared unknowns as they are."""
+        return self._descend(shared, fields, self.y.shape[1], known=True)[1]
+
+    def variances(self, shared: Array, fields: Array) -> Array:
+        """Those of the coefficients of the field of the only rollout, (33,), given its readings."""
+        steps = self.y.shape[1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            J = self._linearised(shared, fields, steps, known=True)[1]
+        if not np.isfinite(J).all():
+            return np.zeros(len(J))
+        inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)[self.shared :]))
+        found: Array = self._weight(steps) * np.diag(inverse)
+        return found
+
+    @property
+    def suggested(self) -> Array:
+        """Standard deviations of the coefficients of a field, (33,), from its size alone."""
+        falling = 1.0 + (self._waves / self._settings.sensed_field_wave) ** 2
+        found: Array = self._settings.sensed_field_deviation * self._size / falling
+        return found
+
+    def error(self, shared: Array, fields: Array) -> float:
+        """That over whole rollouts, without what noise has in it."""
+        return self._error(shared, fields, self.y.shape[1]) - self.noise
+
+    def _error(self, shared: Array, fields: Array, steps: int) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            residuals = self._residuals(shared[None], fields[None], steps)
+            error = float(np.sum(residuals**2))
+        return error if np.isfinite(error) else np.inf
+
+    def _descend(
+        self, shared: Array, fields: Array, steps: int, known: bool
+    ) -> tuple[Array, Array]:
+        settings = self._settings
+        damping = settings.sensed_damping
+        begin = self.shared if known else 0
+        ridge = self._ridge(steps)[begin:]
+        x = np.concatenate([shared, fields.ravel()])[begin:]
+
+        def parts(x: Array) -> tuple[Array, Array]:
+            own = shared if known else x[: self.shared]
+            return own, x[self.shared - begin :].reshape(fields.shape)
+
+        def objective(x: Array) -> float:
+            shared, fields = parts(x)
+            residual = self._residuals(shared[None], fields[None], steps)
+            total = float(np.sum(residual**2) + np.sum(ridge * x * x))
+            return total if np.isfinite(total) else np.inf
+
+        # Unknowns on the way to a good model may overflow: their error is then infinite.
+        whole = steps == self.y.shape[1]
+        most = settings.sensed_last_iterations if whole else settings.sensed_iterations
+        with np.errstate(over="ignore", invalid="ignore"):
+            now = objective(x)
+            for _ in range(most):
+                residual, J = self._linearised(*parts(x), steps, known)
+                if not np.isfinite(J).all():
+                    break
+                H, g = J @ J.T, J @ residual + ridge * x
+                H[np.diag_indices(x.size)] += ridge
+                before = now
+                while damping < _MOST_DAMPING:
+                    damped = H + np.diag(damping * np.diag(H) + 1e-12)
+                    moved = x - np.linalg.solve(damped, g)
+                    value = objective(moved)
+                    if value < now:
+                        x, now = moved, value
+                        damping = max(damping / 5.0, _LEAST_DAMPING)
+                        break
+                    damping *= 5.0
+                if not now < (1.0 - settings.sensed_least_gain) * before:
+                    break
+        return parts(x)
+
+    def _ridge(self, steps: int) -> Array:
+        rollouts, weight, settings = len(self.y), self._weight(steps), self._settings
+        shared = np.full(self.shared, weight / settings.sensed_deviation**2)
+        shared[SHARED:] = weight / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
+        shared += settings.sensed_ridge**2 + self._precision
+        shared[COEFFICIENTS + 1 :] += self._place_ridge**2
+        rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
+        field = settings.sensed_field_ridge**2 / rollouts * rising
+        if self.spread is None:
+            field += weight / settings.sensed_field_deviation**2 * rising
+        else:
+            field += weight / self.spread**2
+        return np.concatenate([shared, np.tile(field, rollouts)])
+
+    def _weight(self, steps: int) -> float:
+        """The variance of the noise on a residual."""
+        rollouts, _, sensors = self.y.shape
+        compared = len(range(0, steps, self._stride(steps)))
+        return float(self.noise / (compared * sensors * rollouts))
+
+    def _stride(self, steps: int) -> int:
+        """Interval between compared steps, for a given number of steps."""
+        return -(-steps // self._settings.sensed_compared)
+
+    def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
+        """Errors for unknowns (P, 12 + n_a) and (P, R, 33), as shares of the whole: (P, R, errors).
+
+        Those of the readings and, over whole rollouts, that of the distance.
+        """
+        stride = self._stride(steps)
+        equation = SensedEquation(
+            *(shared[:, None], self._n, self._centres, self._settings, self._clip)
+        )
+        substeps = equation.substeps(self._sizes).tolist()
+        z = spectrum(fields, self._n)
+        residuals = []
+        distance = np.zeros(z.shape[:2])
+        for k in range(steps):
+            if k % stride == 0:
+                residuals.append((z @ self._read).real - self.y[:, k])
+            distance += np.abs(z - self._target) ** 2 @ self._mean_square
+            z = equation.step(z, equation.force(self.a[:, k]), substeps[k])
+        whole: Array = np.concatenate(residuals, axis=2)
+        whole /= self._size * np.sqrt(whole[0].size)
+        if steps < self.y.shape[1]:
+            return whole
+        off = distance / (steps * self._distances) - 1.0
+        off = np.where(np.isnan(self._distances), 0.0, off)
+        off *= self._settings.sensed_distance / np.sqrt(len(self.y))
+        return np.concatenate([whole, off[..., None]], axis=2)
+
+    def _linearised(
+        self, shared: Array, fields: Array, steps: int, known: bool
+    ) -> tuple[Array, Array]:
+        """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
+        rollouts, own = fields.shape
+        # Backwards: the highest term has no effect above zero, where it starts.
+        common, difference = 0 if known else self.shared, self._settings.sensed_difference
+        count = 1 + common + own
+        all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
+        all_shared[1 : 1 + common] -= difference * np.eye(self.shared)[:common]
+        all_fields[1 + common :] -= difference * np.eye(own)[:, None]
+        residuals = self._residuals(all_shared, all_fields, steps)
+        changes = (residuals[0] - residuals[1:]) / difference
+        J = np.zeros((common + rollouts * own, *residuals[0].shape))
+        J[:common] = changes[:common]
+        for m in range(rollouts):
+            J[common + m * own : common + (m + 1) * own, m] = changes[common:, m]
+        return residuals[0].ravel(), J.reshape(len(J), -1)
