@@ -105,9 +105,9 @@ def fit_sensed(
         shared = start
     _, _, known = problem.fit(shared, fields, known=True)
     whole = [y.shape[1]] * _WHOLE
-    if problem.error(shared, known) <= settings.sensed_hopeless:
+    if problem.error(shared, known) <= settings.sensed_reproduced:
         error, shared, fields = problem.fit(shared, known, lengths=whole)
-    else:  # what is right for the calmest rollouts is not for others
+    else:  # the equation does not hold for the other rollouts: nothing is near enough for a whole fit
         error, shared, fields = problem.fit(shared, fields)
     return shared, np.fft.irfft(spectrum(fields, n), n), max(error - problem.noise, 0.0)
 
