@@ -124,10 +124,14 @@ class SensedProblem:
 
     def _relevant(self, shared: Array, fields: Array, steps: int) -> Array:
         """Ridges of the shared unknowns, s^2/(x^2 + s^2 H^-1): large where one is not significant."""
+        before = self._precision
+        if steps < self.y.shape[1]:
+            # What a part does not determine, a longer one may.
+            self.forget()
         with np.errstate(over="ignore", invalid="ignore"):
             residual, J = self._linearised(shared, fields, steps, known=False)
         if not np.isfinite(J).all():
-            return self._precision
+            return before
         variance = max(float(residual @ residual), self.noise) / residual.size
         inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)))
         own = variance * np.diag(inverse)[: self.shared]

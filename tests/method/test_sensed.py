@@ -233,6 +233,23 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
     assert square[1].imag == pytest.approx(-0.05 * np.pi / scale, rel=0.15)
 
 
+def test_what_a_part_of_a_rollout_does_not_determine_may_come_back_over_a_longer_one() -> None:
+    """Ridges of a part follow from its readings alone; over whole rollouts they add up."""
+    rng = np.random.default_rng(3)
+    readings, actions = rng.standard_normal((1, 12, 4)), rng.standard_normal((1, 12, 2))
+    known = np.zeros(4), np.full(1, np.nan)
+    problem = SensedProblem(readings, actions, _equally_spaced(2), 0.5, *known)
+    shared = 0.1 * rng.standard_normal(unknowns(2))
+    dispersion = TERMS.index((1, 3))
+
+    def ridges(steps: int, before: float) -> Array:
+        problem._precision = np.full(len(shared), before)
+        return problem._relevant(shared, problem.interpolated(), steps)
+
+    assert same_bits(ridges(6, 0.0), ridges(6, 1e6))
+    assert ridges(12, 1e6)[dispersion] > 2.0 * ridges(12, 0.0)[dispersion]
+
+
 def test_readings_that_no_equation_explains_are_given_up_early() -> None:
     rng = np.random.default_rng(0)
     readings, actions = rng.standard_normal((2, 40, 4)), rng.standard_normal((2, 40, 2))
