@@ -29,8 +29,6 @@ from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensitivity import ReducedTrajectory, damped_step
 from loop_method.adapt.settings import GaussNewtonSettings
 
-LOCAL = 3.0
-"""A comparison with a rollout that costs more than this many times another one is not local."""
 DEFAULTS = GaussNewtonSettings()
 
 

@@ -85,7 +85,8 @@ class Proposer:
         # One component, of which each sensor's last reading is the state.
         if can_be_sensed(context):
             centres = context.actuator_centres(n_a)
-            largest_cost = settings.local_cost * self.loop.cost_of(self._before[0])
+            largest_cost = context.field_models.sensed_largest_cost
+            largest_cost *= self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(
                 *(self.loop, centres, context.noise, largest_cost, context.field_models), settings
             )

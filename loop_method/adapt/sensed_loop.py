@@ -15,7 +15,6 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
-from loop_method.adapt.local_step import LOCAL
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.laws.observer import Observer
 from loop_method.models.sensed import SensedModel, interpolated, sensed_model
@@ -137,7 +136,7 @@ def sensed_from(
     problem = ClosedLoopProblem(
         *(context.U, context.target, context.state_weight, context.action_weight, context.horizon)
     )
-    largest_cost = LOCAL * problem.cost_of(records[0])
+    largest_cost = settings.sensed_largest_cost * problem.cost_of(records[0])
     chosen = whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
     if not chosen:
         return None

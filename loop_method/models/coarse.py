@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,13 +131,20 @@ def fit_coarse(
     """
     n_z = samples.before.shape[1]
     components = n_z // math.prod(shape)
-    known = {"kind": kind, "settings": settings, "ridge": ridge, "degree": degree}
+    fit = partial(
+        fit_finite_difference,
+        kind=kind,
+        settings=settings,
+        components=components,
+        ridge=ridge,
+        degree=degree,
+    )
     points, few = coarse_points(shape, settings.coarse_points)
     if few == shape:
-        return fit_finite_difference(samples, components=components, shape=shape, **known)  # type: ignore[arg-type]
+        return fit(samples, shape=shape)
     every = (np.arange(components)[:, None] * math.prod(shape) + points).ravel()
     seen = Samples(samples.before[:, every], samples.actions, samples.after[:, every])
-    inner = fit_finite_difference(seen, components=components, shape=few, **known)  # type: ignore[arg-type]
+    inner = fit(seen, shape=few)
     if inner is None:
         return None
     some = samples.thinned(settings.point_samples)

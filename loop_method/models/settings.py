@@ -125,6 +125,9 @@ class FieldModelSettings(Settings):
         1e-5, "error at which no other dispersion is tried as a start", 0, 1
     )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
+    sensed_largest_cost: float = setting(
+        3.0, "maximum cost of a rollout in a fit, per cost of the exploration", 1, 1e6
+    )
     sensed_again: int = setting(
         2,
         "further fits with measurement noise, each with the spread of waves that the last one implies",
