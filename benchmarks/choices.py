@@ -31,7 +31,8 @@ from benchmarks.optimum import evaluation_seeds
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
 from loop_method.adapt.belief import Belief
-from loop_method.adapt.renewal import choose_fraction, left_out_costs, mean_and_error
+from loop_method.adapt.estimate import mean_of
+from loop_method.adapt.renewal import choose_fraction, left_out_costs
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
 from loop_method.models import affine_law
@@ -226,7 +227,7 @@ def drawn_choice(
     """What is chosen where the rollouts have these fields in turn, and the row of its law."""
     known, judging = fields[: table.known], fields[table.known :][: table.judged]
     part = np.arange(len(known)) % len(table.left_out)
-    fraction, *held_out = choose_fraction(table.left_out[part, :, known].T, settings.confidence)
+    fraction, held_out = choose_fraction(table.left_out[part, :, known].T, settings.confidence)
     adapted, stays = OF_FRACTIONS + fraction, table.stays
     means = table.model[:, known].mean(axis=1)
     close = len(judging) > 1 and means[0] <= (1.0 + settings.close) * means[adapted]
@@ -235,11 +236,11 @@ def drawn_choice(
     def evidence(row: int, rollouts: NDArray[np.int64]) -> Evidence:
         true, model = table.true[row, rollouts], table.model[row, rollouts]
         excess = (true - model)[np.isfinite(model) | ~np.isfinite(true)]
-        change, deviation = held_out
+        change = held_out
         if row < OF_FRACTIONS:
             differences = table.model[row, fields] - table.model[stays, fields]
-            change, deviation = mean_and_error(differences)
-        return Evidence(float(change), float(deviation), np.where(np.isnan(excess), np.inf, excess))
+            change = mean_of(differences)
+        return Evidence(change, np.where(np.isnan(excess), np.inf, excess))
 
     rows = {FIRST: 1, NONE: 0, ADAPTED: adapted}
     measured = {FIRST: known[-table.of_first :], NONE: on_none, ADAPTED: own}

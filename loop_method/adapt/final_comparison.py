@@ -22,7 +22,9 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, State
 from loop_method.adapt.belief import Belief
+from loop_method.adapt.estimate import ZERO, Estimate
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.progress import fraction_and_change, held_out
 from loop_method.adapt.renewal import confirmed_fraction
 from loop_method.adapt.settings import ImprovementSettings
 from loop_method.adapt.verdict import (
@@ -59,7 +61,7 @@ class Comparison:
         The laws to roll out, and the numbers of the initial fields.
     fraction : float
         How far the law moved from `base`.
-    change, deviation : float
+    change : Estimate
         What it costs more than `base` on a model, on fields that did not make it.
     belief : Belief or None
         The model; None: rollouts alone decide.
@@ -70,8 +72,7 @@ class Comparison:
     names: Sequence[str]
     numbers: Sequence[int]
     fraction: float = 1.0
-    change: float = 0.0
-    deviation: float = 0.0
+    change: Estimate = ZERO
     belief: Belief | None = None
 
     def rollouts(self, laws: Laws, seed: int) -> list[Rollout]:
@@ -116,7 +117,7 @@ class Comparison:
             self.base,
             [*others, *fresh],
             initial_fields([*known, *fresh]),
-            (self.change, self.deviation),
+            self.change,
         )
         return choose(evidence, self.base, confidence)
 
@@ -126,8 +127,8 @@ class Comparison:
             return Verdict(self.base, 0.0, 0.0, NO_OTHER)
         if self.belief is None:
             return Verdict(ADAPTED, 0.0, 0.0, "too few rollouts are left to compare it on others")
-        size = size_of(ADAPTED, self.base, self.change, self.deviation)
-        return Verdict(ADAPTED, self.change, self.deviation, size)
+        change = self.change.value, self.change.error
+        return Verdict(ADAPTED, *change, size_of(ADAPTED, self.base, *change))
 
     def _rolled_out(
         self, laws: Laws, known: Sequence[Record], fresh: Sequence[Record]
@@ -143,7 +144,7 @@ class Comparison:
             return evidence_of_pairs(costs, self.base)
         before = [r.cost for r in known if np.array_equal(r.policy, laws[self.base])]
         costs[self.base] = np.array(before)
-        return {name: Evidence(0.0, 0.0, own) for name, own in costs.items()}
+        return {name: Evidence(ZERO, own) for name, own in costs.items()}
 
     def state(self) -> State:
         """The arrays of a checkpoint."""
@@ -152,7 +153,7 @@ class Comparison:
             "base": np.array(self.base),
             "names": np.array(list(self.names), dtype=str),
             "numbers": np.array(list(self.numbers), dtype=np.int64),
-            "held_out": np.array([self.fraction, self.change, self.deviation]),
+            "held_out": held_out(self.fraction, self.change),
         }
         return arrays if self.belief is None else arrays | self.belief.state()
 
@@ -172,11 +173,11 @@ class Comparison:
         if unknown := {base, *names} - {FIRST, ADAPTED, NONE}:
             raise ValueError(f"it compares laws that there are not: {', '.join(sorted(unknown))}")
         law = checked_array(arrays, "law", "f", shape).copy()
-        fraction, change, deviation = checked_array(arrays, "held_out", "f", (3,)).tolist()
+        fraction, change = fraction_and_change(arrays)
         belief = Belief.of(arrays)
         if belief is not None:
             belief.check(context)
-        return cls(law, base, names, numbers, fraction, change, deviation, belief)
+        return cls(law, base, names, numbers, fraction, change, belief)
 
 
 def on_model(
@@ -212,13 +213,13 @@ def on_model(
     means = {name: float(loop.costs(own, fields).mean()) for name, own in theta.items()}
     # A first law that is worse than no control is nothing to stay near to.
     base = FIRST if means[FIRST] < means[NONE] else NONE
-    law, fraction, change, deviation = laws[ADAPTED], 0.0, 0.0, 0.0
+    law, fraction, change = laws[ADAPTED], 0.0, ZERO
     if not np.array_equal(law, laws[base]):
         left_out = fields
         if is_chaotic(loop, fields):
             left_out = measured_states(known, settings.chaotic_fields)
             settings = replace(settings, mixtures=0)
-        fraction, change, deviation = confirmed_fraction(
+        fraction, change = confirmed_fraction(
             loop,
             theta[base],
             left_out,
@@ -236,7 +237,7 @@ def on_model(
     names = [ADAPTED if fraction else base] * (count - close) + [NONE] * close
     if (not fraction and not close) or count <= close:
         names = []  # nothing is left to be decided
-    return Comparison(law, base, names, numbers[: len(names)], fraction, change, deviation, belief)
+    return Comparison(law, base, names, numbers[: len(names)], fraction, change, belief)
 
 
 def on_same_fields(
@@ -265,9 +266,9 @@ def on_same_fields(
     names = [base] * (moved or close) + [ADAPTED] * moved + [NONE] * close
     if close and moved and len(numbers) < LEAST * len(names):
         names.remove(NONE)
-    count = min(settings.judging, len(numbers) // max(len(names), 1))
+    count = min(settings.pairs, len(numbers) // max(len(names), 1))
     if count < LEAST and moved:  # rollouts of `base` from other fields have to do
-        names, count = [ADAPTED], min(settings.judging, len(numbers))
+        names, count = [ADAPTED], min(settings.pairs, len(numbers))
     if count < LEAST:
         names, count = [], 0
     every = [name for name in names for _ in range(count)]

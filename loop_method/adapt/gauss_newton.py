@@ -147,6 +147,16 @@ class GaussNewton(Optimizer):
         return self._now.tells
 
     @property
+    def used(self) -> int:
+        """Rollouts so far."""
+        return self._records.count
+
+    @property
+    def next_field(self) -> int:
+        """Number of the first initial field after those of its rollouts."""
+        return int(self._now.fields.max()) + 1
+
+    @property
     def done(self) -> bool:
         """True if the rollouts that are left make no step."""
         return not self.ask()
@@ -312,7 +322,7 @@ class GaussNewton(Optimizer):
         """After the last step: the rollouts that decide which law is returned."""
         now, known, comparison = self._now, self._records.all(), None
         left = max(self._budget - self._records.count, 0)
-        fresh = (int(now.fields.max()) + 1 + np.arange(left)).tolist()
+        fresh = (self.next_field + np.arange(left)).tolist()
         if now.believed:
             rng = np.random.default_rng([self._seed, _CONFIRMING])
             # One thread: a threaded LAPACK rounds differently for another number of threads.

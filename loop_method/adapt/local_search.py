@@ -7,7 +7,8 @@
     confirming  the law found, on fields of the one before    the better one, beyond chance
 
 `gauss_newton` judges its steps on the few fields from which it computes them. So its law is compared
-with the initial one on other fields, on which that one was measured before.
+with the initial one on other fields, on which that one was measured before; what rollouts are left then
+compare both on fresh ones.
 """
 
 from __future__ import annotations
@@ -22,9 +23,8 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State, part_of
 from loop_method.adapt.gauss_newton import GaussNewton
-from loop_method.adapt.renewal import mean_and_error
 from loop_method.adapt.settings import GaussNewtonSettings, ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, NO_OTHER, NONE, size_of
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of_pairs
 from loop_method.seeds import field_seed
 
 COMPARING, SEARCHING, CONFIRMING, ENDED = "comparing", "searching", "confirming", "ended"
@@ -88,15 +88,20 @@ class LocalSearch:
             assert self._search is not None
             return self._search.ask()
         if self.stage == CONFIRMING:
-            return [self._rollout(self.policy, i) for i in range(len(self._costs_before))]
+            assert self._search is not None
+            known, fresh = self._pairs
+            numbers = range(self._search.next_field, self._search.next_field + fresh)
+            own = [self._rollout(self.policy, i) for i in (*range(known), *numbers)]
+            return own + [self._rollout(self._start, i) for i in numbers]
         return []
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the results of `ask` in."""
         row: Row = {"role": self.stage}
         costs = np.array([r.cost if r.usable else np.inf for r in results])
-        if self.stage != SEARCHING and np.isfinite(costs).all():
-            row["cost"] = float(np.mean(costs))
+        own = costs[: sum(self._pairs)] if self.stage == CONFIRMING else costs
+        if self.stage != SEARCHING and np.isfinite(own).all():
+            row["cost"] = float(np.mean(own))
         if self.stage == COMPARING:
             self._none_costs = costs
             first = np.array([record.cost for record in self._records[: len(costs)]])
@@ -154,14 +159,26 @@ class LocalSearch:
     def _costs_before(self) -> Array:
         """Costs of the law that the steps began with, on the fields from 0 on."""
         first = np.array([record.cost for record in self._records])
-        return (self._none_costs if self._from_none else first)[: self._settings.judging]
+        return self._none_costs if self._from_none else first
+
+    @property
+    def _pairs(self) -> tuple[int, int]:
+        """On how many fields of the law before, and on how many fresh ones, the laws are compared."""
+        assert self._search is not None
+        left, most = self._budget - self._compared - self._search.used, self._settings.pairs
+        known = min(len(self._costs_before), left, most)
+        return known, min((left - known) // 2, most - known)
 
     def _begin_search(self) -> None:
         known = [*self._context.measured, *self._records]
+        judging = self._settings.judging
+        missing = max(judging - len(self._costs_before), 0)
+        left = self._budget - self._compared - GaussNewton.first_step(GaussNewtonSettings())
+        kept = min(judging + missing, left)  # on a fresh field both laws are rolled out
         self._search = GaussNewton(
             self._start,
             seed=self._seed,
-            rollouts=self._budget - self._compared - self._settings.judging,
+            rollouts=self._budget - self._compared - kept,
             context=replace(self._context, measured=known),
             first_field=len(self._records),
             verdict=False,
@@ -171,21 +188,16 @@ class LocalSearch:
     def _rollout(self, policy: Array, number: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, number))
 
-    def _confirm(self, after: Array, row: Row) -> None:
+    def _confirm(self, costs: Array, row: Row) -> None:
         """Keep the law of the steps if it is better by more than chance."""
-        before = self._costs_before
-        if not np.isfinite(after).all():
-            better, row["reason"] = False, "a rollout of the adapted law diverged"
-        elif not np.isfinite(before).all():
-            better, row["reason"] = True, "a rollout of the law before diverged"
-        else:
-            change, deviation = mean_and_error(after - before)
-            row["predicted_change"], row["deviation"] = change, deviation
-            better = change + self._settings.confidence * deviation < 0.0
-            base = NONE if self._from_none else FIRST
-            size = size_of(ADAPTED, base, change, deviation)
-            row["reason"] = size if better else f"{NO_OTHER}: {size}"
-        row["chosen"] = ADAPTED if better else NONE if self._from_none else FIRST
-        if not better:
+        known, fresh = self._pairs
+        before = np.concatenate([self._costs_before[:known], costs[known + fresh :]])
+        base = NONE if self._from_none else FIRST
+        evidence = evidence_of_pairs({base: before, ADAPTED: costs[: known + fresh]}, base)
+        verdict = choose(evidence, base, self._settings.confidence)
+        row["reason"], row["chosen"] = verdict.reason, verdict.chosen
+        if verdict.change:
+            row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        if verdict.chosen != ADAPTED:
             self.policy = self._start.copy()
         self.stage = ENDED

@@ -321,11 +321,11 @@ class ModelBased(Optimizer):
             row["reason"] = "no law is finite on the model; the law stays"
             return
         self._progress.improved, self._progress.parts = found.improved, found.parts
-        self._progress.held_out = np.array([found.fraction, found.change, found.deviation])
+        self._progress.fraction, self._progress.change = found.fraction, found.change
         self._progress.policy = loop.policy(found.theta, near) if found.fraction else near.copy()
         row["fraction"], row["steps"] = found.fraction, found.steps
-        if np.isfinite(found.change):
-            row["predicted_change"], row["deviation"] = found.change, found.deviation
+        if np.isfinite(found.change.value):
+            row["predicted_change"], row["deviation"] = found.change.value, found.change.error
 
     def _judge(self, row: Row) -> None:
         """Choose between the first law, the final one and no control."""
@@ -334,14 +334,13 @@ class ModelBased(Optimizer):
             return
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
         base = FIRST if self._progress.safe else NONE
-        _, change, deviation = self._progress.held_out.tolist()
         evidence = evidence_of(
             self._progress.belief.loop(self._context),
             laws,
             base,
             self._data()[len(self._context.every_exploration) :],
             self._fields(),
-            (change, deviation),
+            self._progress.change,
         )
         verdict = choose(evidence, base, self._settings.confidence)
         self._progress.policy = laws[verdict.chosen].copy()

@@ -16,12 +16,12 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Row
 from loop_method.adapt.belief import Belief, believe
+from loop_method.adapt.estimate import Estimate, mean_of
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.observer_design import compensators, whole_field_law
-from loop_method.adapt.renewal import mean_and_error
 from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
 from loop_method.models.sensed import SensedModel
 
@@ -98,11 +98,11 @@ class ModelBasedSensed(ModelBasedReadings):
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)
         progress.safe = bool(first.mean() < none.mean())
-        change, deviation = gained(loop.costs(theta, held_out), first if progress.safe else none)
-        progress.held_out = np.array([1.0, change, deviation])
+        change = gained(loop.costs(theta, held_out), first if progress.safe else none)
+        progress.fraction, progress.change = 1.0, change
         row["steps"] = found.steps
-        if np.isfinite(change):
-            row["predicted_change"], row["deviation"] = change, deviation
+        if np.isfinite(change.value):
+            row["predicted_change"], row["deviation"] = change.value, change.error
 
     def _judge(self, row: Row) -> None:
         """As on a model of the whole field, where there is one."""
@@ -112,10 +112,10 @@ class ModelBasedSensed(ModelBasedReadings):
             ModelBased._judge(self, row)
 
 
-def gained(costs: Array, base: Array) -> tuple[float, float]:
-    """The mean change against the costs of another law and its standard error, where both are finite.
+def gained(costs: Array, base: Array) -> Estimate:
+    """The mean change against the costs of another law, where both are finite.
 
     NaN where neither ever is.
     """
     known = np.isfinite(costs) & np.isfinite(base)
-    return mean_and_error(costs[known] - base[known]) if known.any() else (np.nan, np.nan)
+    return mean_of(costs[known] - base[known]) if known.any() else Estimate(np.nan, np.nan)

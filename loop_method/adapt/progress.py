@@ -13,10 +13,11 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import State
 from loop_method.adapt.belief import Belief
+from loop_method.adapt.estimate import ZERO, Estimate
 
 RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
 LARGEST = 1e150
-"""Largest number of what fields that were left out say."""
+"""Largest change on fields that were left out."""
 _STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
 
 
@@ -38,8 +39,10 @@ class Progress:
         The law after the last descent, with which the next one begins.
     parts : list of arrays
         The same for each part of the fields, from the other parts.
-    held_out : (3,) array
-        Fraction, change and deviation of the last renewal.
+    fraction : float
+        How far the law moved from the first one at the last renewal.
+    change : Estimate
+        What it then cost more than that one on fields that did not make it.
     begun : int
         Rollouts before local steps began.
     none_is_close : bool
@@ -54,7 +57,8 @@ class Progress:
     belief: Belief | None = None
     improved: Array | None = None
     parts: list[Array] = field(default_factory=list)
-    held_out: Array = field(default_factory=lambda: np.zeros(3))
+    fraction: float = 0.0
+    change: Estimate = ZERO
     begun: int = 0
     none_is_close: bool = False
     safe: bool = True
@@ -65,7 +69,7 @@ class Progress:
             "stage": np.array(self.stage),
             "tells": np.array(self.tells),
             "policy": self.policy.copy(),
-            "held_out": self.held_out.copy(),
+            "held_out": held_out(self.fraction, self.change),
             "begun": np.array(self.begun),
             "none_is_close": np.array(self.none_is_close),
             "safe": np.array(self.safe),
@@ -85,6 +89,7 @@ class Progress:
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
+        fraction, change = fraction_and_change(state, finite=False)
         return cls(
             checked_array(state, "policy", "f", shape).copy(),
             stage=stage,
@@ -92,15 +97,31 @@ class Progress:
             belief=Belief.of(state),
             improved=laws[0] if laws else None,
             parts=laws[1:],
-            held_out=_held_out(checked_array(state, "held_out", "f", (3,), finite=False)),
+            fraction=fraction,
+            change=change,
             begun=int(checked_array(state, "begun", "i", ())),
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
         )
 
 
-def _held_out(numbers: Array) -> Array:
-    """A copy; ValueError for numbers whose squares are infinite, unless they are themselves."""
+def held_out(fraction: float, change: Estimate) -> Array:
+    """How far a law moved and what fields that did not make it say, as an array of a checkpoint."""
+    return np.array([fraction, change.value, change.error, change.degrees])
+
+
+def fraction_and_change(
+    state: Mapping[str, NDArray[np.generic]], *, finite: bool = True
+) -> tuple[float, Estimate]:
+    """What `held_out` made an array of.
+
+    ValueError for numbers whose squares are infinite, unless they are themselves, and for no degrees of
+    freedom.
+    """
+    numbers = checked_array(state, "held_out", "f", (4,), finite=finite)
     if (np.abs(numbers[np.isfinite(numbers)]) > LARGEST).any():
         raise ValueError(f"'held_out' has a number beyond {LARGEST:g}")
-    return numbers.copy()
+    fraction, value, error, degrees = numbers.tolist()
+    if not degrees > 0.0:
+        raise ValueError(f"'held_out' has {degrees:g} degrees of freedom; expected more than 0")
+    return fraction, Estimate(value, error, degrees)

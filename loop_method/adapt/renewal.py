@@ -25,6 +25,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.estimate import ZERO, Estimate, mean_change
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.settings import ImprovementSettings
@@ -46,9 +47,9 @@ class Renewal:
         The laws that each part of the fields did not make.
     fraction : float
         How far the law moved; 0: it is the first one.
-    change, deviation : float
-        The mean change of the cost against the first law on fields that were left out, and its standard
-        error. 0 where the law is the first one.
+    change : Estimate
+        The mean change of the cost against the first law on fields that were left out. 0 where the law
+        is the first one.
     steps : int
         Of L-BFGS, all together.
     """
@@ -57,8 +58,7 @@ class Renewal:
     improved: Array
     parts: list[Array]
     fraction: float
-    change: float
-    deviation: float
+    change: Estimate
     steps: int
 
 
@@ -112,14 +112,14 @@ def renew(
         if found is None:
             return None
         before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, found[0]))
-        return Renewal(found[0], found[0], [], 1.0, after - before, 0.0, found[1])
+        return Renewal(found[0], found[0], [], 1.0, Estimate(after - before), found[1])
     made, steps = _of_parts(descend, first, parts or [first] * settings.folds, fields, few)
     found = descend([first, improved], fields, settings.mixtures if final else few)
     if found is None:
         return None
-    fraction, change, deviation = held_out_fraction(loop, first, made, fields, settings)
+    fraction, change = held_out_fraction(loop, first, made, fields, settings)
     theta = first + fraction * (found[0] - first)
-    return Renewal(theta, found[0], made, fraction, change, deviation, steps + found[1])
+    return Renewal(theta, found[0], made, fraction, change, steps + found[1])
 
 
 def confirmed_fraction(
@@ -131,13 +131,13 @@ def confirmed_fraction(
     *,
     components: int = 1,
     periodic: bool = True,
-) -> tuple[float, float, float]:
-    """Fraction, change and deviation of a `Renewal`, for a law that was made in another way.
+) -> tuple[float, Estimate]:
+    """Fraction and change of a `Renewal`, for a law that was made in another way.
 
     What a descent on some of the fields is worth on the others, for which alone it is made here.
     """
     if len(fields) < 2:
-        return 1.0, 0.0, 0.0
+        return 1.0, ZERO
     descend = _descent(loop, rng, settings, components, periodic, settings.first_gain)
     starts = [first] * settings.folds
     made, _ = _of_parts(descend, first, starts, fields, settings.mixtures // 2)
@@ -167,14 +167,14 @@ def held_out_fraction(
     parts: Sequence[Array],
     fields: Array,
     settings: ImprovementSettings,
-) -> tuple[float, float, float]:
-    """The fraction of the way from the first law, and `change` and `deviation` of a `Renewal`.
+) -> tuple[float, Estimate]:
+    """The fraction of the way from the first law, and `change` of a `Renewal`.
 
     parts: for each part of the fields the law that the others made.
     """
     costs = left_out_costs(loop, first, parts, fields, settings.fractions)
-    i, change, deviation = choose_fraction(costs, settings.confidence)
-    return i / settings.fractions, change, deviation
+    i, change = choose_fraction(costs, settings.confidence)
+    return i / settings.fractions, change
 
 
 def left_out_costs(
@@ -193,42 +193,19 @@ def left_out_costs(
     return costs
 
 
-def choose_fraction(costs: Array, confidence: float) -> tuple[int, float, float]:
-    """The row of `left_out_costs` to take, its change against the first row and the error of that."""
+def choose_fraction(costs: Array, confidence: float) -> tuple[int, Estimate]:
+    """The row of `left_out_costs` to take, and its change against the first row."""
     # From where the first law is not finite, a law that is tells nothing of the size of a gain.
     costs = costs[:, np.isfinite(costs[0])]
     if not costs.shape[1]:
-        return len(costs) - 1, 0.0, 0.0
-    found, least = (0, 0.0, 0.0), np.inf
+        return len(costs) - 1, ZERO
+    found, least = (0, ZERO), np.inf
     for i, own in enumerate(costs[1:], 1):
         if np.isfinite(own).all() and own.mean() < least:
-            change, error = change_and_error(own, costs[0])
-            if change + confidence * error < 0.0:
-                found, least = (i, change, error), float(own.mean())
+            change = mean_change(own, costs[0])
+            if change.is_negative(confidence):
+                found, least = (i, change), float(own.mean())
     return found
-
-
-def change_and_error(costs: Array, before: Array) -> tuple[float, float]:
-    """The mean change of the costs, and its standard error next to the costs before.
-
-    It is that of the ratio of their means, times the mean before: 0 where each falls by the same share.
-
-    >>> change_and_error(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
-    (-1.5, 0.0)
-    """
-    change, error = mean_and_error(costs - before)
-    if len(costs) > 1 and before.any():
-        ratio = float(costs.mean() / before.mean())
-        error = mean_and_error(costs - ratio * before)[1]
-    return change, error
-
-
-def mean_and_error(values: Array) -> tuple[float, float]:
-    """The mean of some numbers and its standard error; of one number as large as itself."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, abs(mean)
-    return mean, float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def _descent(

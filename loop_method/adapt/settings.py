@@ -81,9 +81,16 @@ class ImprovementSettings(Settings):
         0.0,
         10.0,
     )
+    pairs: int = setting(
+        12,
+        "maximum number of fields on which laws are compared by rollouts alone",
+        2,
+        1000,
+    )
     confidence: float = setting(
         1.0,
-        "standard errors by which a law must beat the first one on held-out fields",
+        "exact standard errors by which a law must beat the first one; estimated from few rollouts, "
+        "they have to be more",
         0.0,
         10.0,
     )

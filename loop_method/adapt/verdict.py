@@ -10,6 +10,8 @@ with m the mean of its model costs over all measured fields: the model is a cont
 rollout is as informative as many without it. The fields of that mean are the same for all laws, so the
 difference of two laws has little variance; for the final law, which was computed from these fields,
 the mean is over held-out fields.
+
+The rule accounts for how well the error of few rollouts is known (`estimate`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.renewal import mean_and_error
+from loop_method.adapt.estimate import ZERO, Estimate, mean_of
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
 NAMES = {FIRST: "the first law", ADAPTED: "the adapted law", NONE: "no control"}
@@ -35,15 +37,14 @@ class Evidence:
 
     Attributes
     ----------
-    change, deviation : float
+    change : Estimate
         Its model cost against that of the law to stay with, in the mean over measured fields that did
-        not make it, and the standard error of that.
+        not make it.
     excess : (k,) array
         Measured less model cost of its own rollouts; infinite where one diverged.
     """
 
-    change: float
-    deviation: float
+    change: Estimate
     excess: Array
 
 
@@ -60,31 +61,29 @@ class Verdict:
 def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
     """The law with the least cost, and `base` where the difference may be chance.
 
-    confidence: standard errors by which another law has to be better.
+    confidence: standard errors by which another law has to be better, were they known exactly.
     """
     stays = Verdict(base, 0.0, 0.0, NO_OTHER)
     missed: list[str] = []
     lost = bool(np.isinf(evidence[base].excess).any())
-    own_value, own_error = _corrected(evidence[base])
+    of_base = _correction(evidence[base])
     found: list[Verdict] = []
     for name, own in evidence.items():
-        if name == base or not np.isfinite(own.change):
+        if name == base or not np.isfinite(own.change.value):
             continue
         if np.isinf(own.excess).any():
             if name == ADAPTED:
                 stays = Verdict(base, 0.0, 0.0, "a rollout of the adapted law diverged")
             continue
-        value, error = _corrected(own)
-        change = own.change + value - own_value
-        deviation = float(np.sqrt(own.deviation**2 + error**2 + own_error**2))
+        change = own.change + _correction(own) - of_base
+        size = change.value, change.error
         if lost:
-            found.append(
-                Verdict(name, own.change, own.deviation, f"a rollout of '{base}' diverged")
-            )
-        elif change + confidence * deviation < 0.0:
-            found.append(Verdict(name, change, deviation, size_of(name, base, change, deviation)))
+            known = own.change.value, own.change.error
+            found.append(Verdict(name, *known, f"a rollout of {NAMES[base]} diverged"))
+        elif change.is_negative(confidence):
+            found.append(Verdict(name, *size, size_of(name, base, *size)))
         else:
-            missed.append(size_of(name, base, change, deviation))
+            missed.append(size_of(name, base, *size))
     if missed and stays.reason == NO_OTHER:
         stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
     return min(found, key=lambda verdict: verdict.change, default=stays)
@@ -107,12 +106,12 @@ def evidence_of(
     base: str,
     records: Sequence[Record],
     fields: Array,
-    held_out: tuple[float, float],
+    held_out: Estimate,
 ) -> dict[str, Evidence]:
     """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
 
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
-    held_out: change and deviation of the adapted law on fields that did not make it.
+    held_out: change of the adapted law on fields that did not make it.
     """
     if loop.replays:  # a rollout replayed is itself, so that measurements alone decide
         measured = {
@@ -121,7 +120,7 @@ def evidence_of(
             if name == base or not np.array_equal(law, laws[base])
         }
         return {
-            name: Evidence(0.0, 0.0, costs)
+            name: Evidence(ZERO, costs)
             for name, costs in measured.items()
             if len(costs) or name == base
         }
@@ -132,13 +131,13 @@ def evidence_of(
         same = name != base and np.array_equal(law, laws[base])
         if same or not (len(excess) or name == base):
             continue
-        change, deviation = held_out
+        change = held_out
         if name != ADAPTED:
             with np.errstate(invalid="ignore"):
                 differences = loop.costs(loop.theta(law), fields) - stay
             known = bool(np.isfinite(differences).all())
-            change, deviation = mean_and_error(differences) if known else (np.inf, 0.0)
-        evidence[name] = Evidence(change, deviation, excess)
+            change = mean_of(differences) if known else Estimate(np.inf)
+        evidence[name] = Evidence(change, excess)
     return evidence
 
 
@@ -150,8 +149,8 @@ def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Eviden
     evidence = {}
     for name, own in costs.items():
         known = np.isfinite(own) & np.isfinite(costs[base])
-        difference = mean_and_error((own - costs[base])[known]) if known.any() else (0.0, 0.0)
-        evidence[name] = Evidence(*difference, own[np.isinf(own)])
+        difference = mean_of((own - costs[base])[known]) if known.any() else ZERO
+        evidence[name] = Evidence(difference, own[np.isinf(own)])
     return evidence
 
 
@@ -167,7 +166,7 @@ def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
     return np.array(excess)
 
 
-def _corrected(own: Evidence) -> tuple[float, float]:
-    """The mean of measured less model cost, and its standard error; 0 where nothing was measured."""
+def _correction(own: Evidence) -> Estimate:
+    """The mean of measured less model cost; 0 where nothing was measured."""
     finite = own.excess[np.isfinite(own.excess)]
-    return mean_and_error(finite) if len(finite) else (0.0, 0.0)
+    return mean_of(finite) if len(finite) else ZERO

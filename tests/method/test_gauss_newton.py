@@ -23,6 +23,7 @@ from loop_method.adapt import (
     local_step,
 )
 from loop_method.adapt.base import Record
+from loop_method.adapt.estimate import Estimate
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.design.lqt import track
@@ -128,9 +129,8 @@ def test_the_law_moves_only_as_far_as_fields_left_out_confirm(
     plant = Plant()
     whole = make(plant, rollouts=6, verdict=False)
     optimizer = make(plant, rollouts=9)
-    monkeypatch.setattr(
-        final_comparison, "confirmed_fraction", lambda *_, **__: (fraction, -0.5 * fraction, 0.1)
-    )
+    change = Estimate(-0.5 * fraction, 0.1, 8.0)
+    monkeypatch.setattr(final_comparison, "confirmed_fraction", lambda *_, **__: (fraction, change))
     seeds: list[int] = []
     for each in (whole, optimizer):
         while not each.done:
@@ -285,7 +285,9 @@ def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     row = optimizer.tell(measure(plant, optimizer.ask()))
     assert row["reason"] == why and row["rollouts"] == 3
     row = optimizer.tell(measure(plant, optimizer.ask()))
-    assert optimizer.done and row["rollouts"] == 9 and same_bits(optimizer.policy, 0.6 * plant.best)
+    assert (
+        optimizer.done and row["rollouts"] == 23 and same_bits(optimizer.policy, 0.6 * plant.best)
+    )
     assert row["chosen"] == "first" and str(row["reason"]).startswith(
         f"{why}; no other law is better"
     )

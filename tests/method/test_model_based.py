@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
-from loop_method.adapt.renewal import choose_fraction, held_out_fraction, mean_and_error
+from loop_method.adapt.estimate import ZERO, Estimate, mean_of
+from loop_method.adapt.renewal import choose_fraction, held_out_fraction
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
 from loop_method.design.lqt import track
@@ -227,12 +228,12 @@ def test_the_way_from_the_first_law_is_what_fields_that_were_left_out_agree_on(
 ) -> None:
     fields = np.arange(8.0)[:, None]
     loop: Any = Costs(cost)
-    found, change, deviation = held_out_fraction(
+    found, change = held_out_fraction(
         loop, np.zeros((1, 1)), [np.ones((1, 1))] * 2, fields, ModelBasedSettings()
     )
     assert found == fraction
     differences = np.array([cost(fraction, i) - cost(0.0, i) for i in range(8)])
-    assert change == pytest.approx(differences.mean()) and deviation >= 0.0
+    assert change.value == pytest.approx(differences.mean()) and change.error >= 0.0
 
 
 def test_fields_that_cost_more_do_not_hide_a_gain_that_is_the_same_share_of_all() -> None:
@@ -241,10 +242,10 @@ def test_fields_that_cost_more_do_not_hide_a_gain_that_is_the_same_share_of_all(
     before = rng.gamma(0.5, 1.0, 16)
     noise = 1e-3 * rng.standard_normal(16)
     costs = np.stack([before, 0.99 * before, 0.98 * before + noise, 0.9 * before + before**2])
-    assert mean_and_error(costs[2] - before)[1] > 3.0 * mean_and_error(noise)[1]
-    chosen, change, deviation = choose_fraction(costs, 1.0)
-    assert chosen == 2 and change == pytest.approx((costs[2] - before).mean())
-    assert deviation < 2.0 * mean_and_error(noise)[1]
+    assert mean_of(costs[2] - before).error > 3.0 * mean_of(noise).error
+    chosen, change = choose_fraction(costs, 1.0)
+    assert chosen == 2 and change.value == pytest.approx((costs[2] - before).mean())
+    assert change.error < 2.0 * mean_of(noise).error
 
 
 def test_laws_that_are_no_better_are_taken_no_more_often_than_the_confidence_says() -> None:
@@ -258,7 +259,7 @@ def test_laws_that_are_no_better_are_taken_no_more_often_than_the_confidence_say
 
 
 def evidence(change: float, deviation: float, *excess: float) -> Evidence:
-    return Evidence(change, deviation, np.array(excess))
+    return Evidence(Estimate(change, deviation, 20.0), np.array(excess))
 
 
 @pytest.mark.parametrize(
@@ -298,8 +299,8 @@ def test_equal_laws_are_told_apart_by_chance_no_more_often_than_the_confidence_s
     """Two laws of one cost, measured with noise: the other one is taken in one case of six."""
     rng, wrong = np.random.default_rng(11), 0
     for _ in range(2000):
-        first = Evidence(0.0, 0.0, rng.standard_normal(12))
-        other = Evidence(0.0, 0.0, rng.standard_normal(12))
+        first = Evidence(ZERO, rng.standard_normal(12))
+        other = Evidence(ZERO, rng.standard_normal(12))
         wrong += choose({FIRST: first, ADAPTED: other}, FIRST, 1.0).chosen == ADAPTED
     assert wrong / 2000 < 0.2
 

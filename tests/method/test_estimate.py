@@ -1,0 +1,80 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""How often chance passes for a difference: rates that are known from the theory of small samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from scipy.stats import t, ttest_ind
+
+from loop_method.adapt.estimate import ZERO, Estimate, mean_change, mean_of
+from loop_method.adapt.verdict import ADAPTED, FIRST, Evidence, choose, evidence_of_pairs
+
+DRAWS = 4000
+
+
+def upper(rate: float) -> float:
+    """What a share of `DRAWS` draws of this rate exceeds in one case of 30,000."""
+    return rate + 4.0 * float(np.sqrt(rate * (1.0 - rate) / DRAWS))
+
+
+@pytest.mark.parametrize("pairs", range(2, 9))
+@pytest.mark.parametrize("confidence", [1.0, 2.0])
+def test_pairs_without_a_difference_are_taken_for_one_at_the_level_however_few(
+    pairs: int, confidence: float
+) -> None:
+    """Student's t is exact for normal differences; a normal quantile would be wrong up to 0.25."""
+    rng, wrong = np.random.default_rng(pairs), 0
+    level = 1.0 - float(ndtr(confidence))
+    for difference in rng.standard_normal((DRAWS, pairs)):
+        costs = {FIRST: np.full(pairs, 9.0), ADAPTED: 9.0 + difference}
+        verdict = choose(evidence_of_pairs(costs, FIRST), FIRST, confidence)
+        wrong += verdict.chosen == ADAPTED
+    assert 2.0 * level - upper(level) < wrong / DRAWS < upper(level)
+
+
+@pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 3), (3, 12), (2, 40), (8, 8)])
+@pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
+def test_laws_of_one_cost_on_different_fields_are_told_apart_no_more_often_than_the_level(
+    own: int, others: int, ratio: float
+) -> None:
+    """By the approximation of Welch and Satterthwaite: not more than 1 % above it."""
+    rng, wrong = np.random.default_rng([own, others]), 0
+    level = 1.0 - float(ndtr(1.0))
+    for _ in range(DRAWS):
+        first = Evidence(ZERO, ratio * rng.standard_normal(others))
+        other = Evidence(ZERO, rng.standard_normal(own))
+        wrong += choose({FIRST: first, ADAPTED: other}, FIRST, 1.0).chosen == ADAPTED
+    assert wrong / DRAWS < upper(level) + 0.01
+
+
+def test_the_degrees_of_two_means_are_those_of_welch() -> None:
+    rng = np.random.default_rng(4)
+    a, b = rng.standard_normal(3), 4.0 * rng.standard_normal(7)
+    found, expected = mean_of(a) - mean_of(b), ttest_ind(a, b, equal_var=False)
+    assert found.degrees == pytest.approx(expected.df)
+    assert found.value / found.error == pytest.approx(expected.statistic)
+    assert (mean_of(a) + ZERO) == mean_of(a) == (ZERO + mean_of(a))
+
+
+def test_an_error_that_is_known_from_many_fields_is_hardly_enlarged() -> None:
+    """A small error of three rollouts, next to a larger one of a control variate on forty fields."""
+    both = Estimate(-1.0, 0.9, 39.0) + Estimate(0.0, 0.1, 2.0)
+    assert both.degrees > 39.0 and both.is_negative(1.0)
+    few = Estimate(-1.0, both.error, 2.0)
+    assert not few.is_negative(1.0)
+    assert few.is_negative(float(ndtr(0.0))) and t.cdf(-1.0 / few.error, 2.0) > 1.0 - ndtr(1.0)
+
+
+def test_errors_without_bound_stay_so() -> None:
+    huge = Estimate(-1.0, 1e200, 2.0) + Estimate(0.0, 1e200, 2.0)
+    assert huge.degrees == pytest.approx(4.0) and np.isfinite(huge.error)
+    assert not (Estimate(-1.0, np.inf) + huge).is_negative(1.0)
+
+
+def test_a_change_by_the_same_share_has_no_error() -> None:
+    before = np.random.default_rng(3).gamma(1.0, 1.0, 6)
+    change = mean_change(0.9 * before, before)
+    assert change.error < 1e-15 < -change.value and change.is_negative(3.0)
+    assert mean_change(before[:1], before[:1] + 1.0).error == 1.0, "of one, as large as itself"
