@@ -48,8 +48,9 @@ class Estimate:
     def __add__(self, other: Estimate) -> Estimate:
         """The sum of two independent estimates.
 
-        >>> Estimate(1.0, 3.0, 4.0) + Estimate(1.0, 3.0, 4.0)
-        Estimate(value=2.0, error=4.242640687119286, degrees=8.0)
+        >>> both = Estimate(1.0, 3.0, 4.0) + Estimate(1.0, 4.0, 4.0)
+        >>> both.value, round(both.error, 6), round(both.degrees, 2)
+        (2.0, 5.0, 7.42)
         """
         value, error = self.value + other.value, float(np.hypot(self.error, other.error))
         known = [own for own in (self, other) if own.error > 0.0]
