@@ -24,7 +24,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
 
 from loop_interfaces.arrays import Array
 
@@ -80,6 +79,9 @@ def errors_for(confidence: float, degrees: float) -> float:
     >>> [round(errors_for(1.0, degrees), 2) for degrees in (1.0, 2.0, 5.0, 40.0)]
     [1.84, 1.32, 1.11, 1.01]
     """
+    # Not at the top: few processes need it.
+    from scipy.special import ndtr, stdtrit
+
     return float(stdtrit(degrees, ndtr(confidence)))
 
 
