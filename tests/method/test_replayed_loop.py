@@ -10,6 +10,7 @@ import pytest
 
 from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from loop_method.adapt.belief import believe
+from loop_method.adapt.estimate import ZERO, Estimate
 from loop_method.adapt.model_based_readings import ModelBasedReadings, best_measured, step
 from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.adapt.settings import ModelBasedSettings
@@ -134,8 +135,9 @@ def test_of_replays_measured_costs_alone_decide() -> None:
     first = first_law().theta_start
     records = [rolled(20 + i, first_law(), law) for i in range(3) for law in (first, theta)]
     fields = loop.beginnings(records)
-    found = evidence_of(loop, {FIRST: first, ADAPTED: theta}, FIRST, records, fields, (-1e3, 0.0))
-    assert found[ADAPTED].change == 0.0
+    laws, on_model = {FIRST: first, ADAPTED: theta}, Estimate(-1e3)
+    found = evidence_of(loop, laws, FIRST, records, fields, on_model)
+    assert found[ADAPTED].change == ZERO
     assert found[ADAPTED].excess.tolist() == [r.cost for r in records[1::2]]
     assert found[FIRST].excess.tolist() == [r.cost for r in records[::2]]
 
