@@ -166,16 +166,20 @@ def differences(summary: Row) -> list[str]:
 
 
 def _reasons(summary: Row) -> list[str]:
-    """Why seeds kept their first law, or have no control, as their optimisers say."""
-    seeds_of: dict[str, list[int]] = {}
+    """Why seeds kept their first law, have no control or left rollouts over."""
+    kept: dict[str, list[int]] = {}
+    early: dict[str, list[int]] = {}
     for m, (own, changed) in enumerate(
         zip(summary.get("outcome", []), summary["changed"], strict=False)
     ):
         if own["reason"] and not (changed and own["verdict"] == "better"):
-            seeds_of.setdefault(own["reason"], []).append(summary["seed"] + m)
+            kept.setdefault(own["reason"], []).append(summary["seed"] + m)
+        if why := own.get("early"):
+            early.setdefault(why, []).append(summary["seed"] + m)
     several = summary["seeds"] > 1
     return [
-        f"  {f'seed {_listed(seeds)}: ' if several else 'the optimiser says: '}{reason}"
+        f"  {f'seed {_listed(seeds)}: ' if several else alone}{reason}"
+        for alone, seeds_of in (("the optimiser says: ", kept), ("", early))
         for reason, seeds in seeds_of.items()
     ]
 

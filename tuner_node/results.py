@@ -16,13 +16,14 @@ from tuner_node.budget import PURPOSES
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
-WORDS = ("event", "role", "model", "chosen", "reason")
+WORDS = ("event", "role", "model", "chosen", "reason", "early")
 """Entries of a row of the history that are not numbers."""
 LQT, ADAPTED = EVALUATED.index("lqt"), EVALUATED.index("adapted")
 DIFFERENCE = ("change", "low", "high", "fields")
 """Entries of a `difference`."""
 CONFIDENCE = 0.95
 """Of the interval of a difference of costs."""
+NO_MORE = "the optimiser asked for no more"
 WORSE_THAN_NONE = "worse than no control"
 
 
@@ -78,7 +79,8 @@ def check_history(history: object, seed: int, seeds: int) -> None:
 
 def _outcome(own: Mapping[str, Any]) -> bool:
     """True if this is the verdict on a seed, its reason, and the difference if it has one."""
-    if not (isinstance(own.get("verdict"), str) and isinstance(own.get("reason"), str)):
+    texts = own.get("verdict"), own.get("reason"), own.get("early", "")
+    if not all(isinstance(text, str) for text in texts):
         return False
     known = own.get("against_lqt")
     return known is None or (
@@ -111,7 +113,8 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
-    one it began with; outcome: what came of each seed, and why, as its optimiser says.
+    one it began with; outcome: what came of each seed, and why, as its optimiser says, also why it
+    left rollouts over.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
@@ -141,6 +144,7 @@ def summarise(training: Training) -> dict[str, Any]:
             {
                 "verdict": verdict(*mean[m].tolist(), changed=moved),
                 "reason": last_reason(training.history, training.settings.seed + m),
+                "early": early_end(training, m),
                 "against_lqt": difference(costs[m, LQT], costs[m, ADAPTED]) if moved else None,
             }
             for m, moved in enumerate(changed)
@@ -192,6 +196,16 @@ def last_reason(history: Sequence[Mapping[str, Any]], seed: int) -> str:
     """The last reason that the optimiser of a seed gave; empty: none."""
     given = [str(row["reason"]) for row in history if row["seed"] == seed and row.get("reason")]
     return given[-1] if given else ""
+
+
+def early_end(training: Training, m: int) -> str:
+    """Why the optimiser of the m-th seed left rollouts of the budget over; empty: it did not."""
+    total, paid = int(training.budget.total[m]), int(training.budget.paid[m])
+    if paid >= total:
+        return ""
+    own = [row for row in training.history if row["seed"] == training.settings.seed + m]
+    why = str(own[-1].get("early") or NO_MORE) if own else NO_MORE
+    return f"{total - paid} of {total} rollouts were not used: {why}"
 
 
 def versions() -> dict[str, str]:

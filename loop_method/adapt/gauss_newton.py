@@ -152,6 +152,11 @@ class GaussNewton(Optimizer):
         return self._records.count
 
     @property
+    def early(self) -> str:
+        """Why rollouts are left over at the end."""
+        return self._now.reason or "what is left is too little for a step or the verdict"
+
+    @property
     def next_field(self) -> int:
         """Number of the first initial field after those of its rollouts."""
         return int(self._now.fields.max()) + 1
@@ -185,6 +190,8 @@ class GaussNewton(Optimizer):
         row: Row = {"diverged": sum(not r.usable for r in results)}
         if self._comparison is not None:
             self._decide(results, row)
+            if self._records.count < self._budget:
+                row["early"] = self.early
             return row
         missing = now.missing
         if missing.size:
@@ -209,6 +216,8 @@ class GaussNewton(Optimizer):
             self._propose(row)
         if self._verdict and self.done:
             self._finish(row)
+        if self.done and self._records.count < self._budget:
+            row["early"] = self.early
         return row
 
     def state(self) -> State:

@@ -117,6 +117,7 @@ class LocalSearch:
             if self._search.done:
                 unchanged = np.array_equal(self.policy, self._start)
                 self.stage = ENDED if unchanged else CONFIRMING
+                row["early"] = self._search.early
                 if unchanged:
                     row["reason"] = "no local step was better than the law that they began with"
                     row["chosen"] = NONE if self._from_none else FIRST
@@ -195,7 +196,9 @@ class LocalSearch:
         base = NONE if self._from_none else FIRST
         evidence = evidence_of_pairs({base: before, ADAPTED: costs[: known + fresh]}, base)
         verdict = choose(evidence, base, self._settings.confidence)
+        assert self._search is not None
         row["reason"], row["chosen"] = verdict.reason, verdict.chosen
+        row["early"] = self._search.early
         if verdict.change:
             row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
         if verdict.chosen != ADAPTED:

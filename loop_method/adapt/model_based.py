@@ -180,6 +180,10 @@ class ModelBased(Optimizer):
             elif self._progress.stage == JUDGING:
                 row = self._measured(added)
                 self._judge(row)
+        if self.done and self._records.count < self._budget:
+            row.setdefault("early", row["reason"])
+        else:
+            row.pop("early", None)
         row["rollouts"] = self._records.count
         row["diverged"] = sum(not result.usable for result in results)
         return row
@@ -346,12 +350,12 @@ class ModelBased(Optimizer):
         self._progress.policy = laws[verdict.chosen].copy()
         row["chosen"] = verdict.chosen
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
-        early = self._records.count < self._budget
         known = len(self._fields())
-        self._end(row, verdict.reason + f"; more than {known} fields would not change it" * early)
+        self._end(row, verdict.reason, f"more than {known} fields would not change the law")
 
-    def _end(self, row: Row, reason: str) -> None:
+    def _end(self, row: Row, reason: str, early: str = "") -> None:
         row["reason"], self._progress.stage = reason, ENDED
+        row["early"] = early or reason
 
     def _begin_search(self, row: Row) -> None:
         self._progress.begun = self._records.count

@@ -252,6 +252,7 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
         count = sum(other["verdict"] == own["verdict"] for other in outcome)
         which = f"{count} of {len(outcome)} seeds" if len(outcome) > 1 else "outcome"
         said.append(f"{which}: {own['verdict']}" + f" ({own['reason']})" * bool(own["reason"]))
+    said += dict.fromkeys(own["early"] for own in outcome if own.get("early"))
     return problem.name, cost_text(cost), "; ".join(said)
 
 

@@ -285,6 +285,7 @@ def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     row = optimizer.tell(measure(plant, optimizer.ask()))
     assert row["reason"] == why and row["rollouts"] == 3
     row = optimizer.tell(measure(plant, optimizer.ask()))
+    assert row["early"] == why
     assert (
         optimizer.done and row["rollouts"] == 23 and same_bits(optimizer.policy, 0.6 * plant.best)
     )

@@ -116,3 +116,4 @@ def test_a_step_that_is_never_found_leaves_the_law_that_was_better(
     monkeypatch.setattr(Proposer, "propose", lambda *_, **__: None)
     judged, row = carried_out(found, costs(5.0, 0.0))
     assert not judged and row["chosen"] == NONE and not found.policy.any()
+    assert row["early"] == "no model gives a finite step that gains anything"

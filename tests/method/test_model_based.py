@@ -168,7 +168,7 @@ def test_too_few_rollouts_for_local_steps_end_with_a_reason() -> None:
     plant = Plant(chaotic)
     optimizer = make(plant, rollouts=8)
     rows = finished(plant, optimizer)
-    assert "too few rollouts" in rows[-1]["reason"]
+    assert "too few rollouts" in rows[-1]["reason"] == rows[-1]["early"]
     assert same_bits(optimizer.policy, 0.6 * plant.best)
 
 
@@ -200,7 +200,8 @@ def test_a_large_budget_ends_once_the_fields_are_known() -> None:
     optimizer = make(plant, rollouts=100, settings=settings)
     rows = finished(plant, optimizer)
     assert [row["rollouts"] for row in rows] == [4, 10, 13]
-    assert "would not change it" in rows[-1]["reason"]
+    assert "fields would not change" in rows[-1]["early"]
+    assert not any("early" in row for row in rows[:-1])
 
 
 class Costs:

@@ -12,11 +12,11 @@ import pytest
 
 from pdeloop.cli import main
 from pdeloop.display import Display
-from pdeloop.in_process import LocalPair
+from pdeloop.in_process import LocalPair, train
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training
 from tuner_node.narration import Narration, closing_lines, exit_code, failed, warnings
-from tuner_node.results import difference
+from tuner_node.results import difference, summarise
 from tuner_node.rollouts import CHECK
 
 
@@ -271,6 +271,27 @@ def test_how_much_an_adaptation_gained_is_said_with_its_interval() -> None:
     outcome = [own | {"against_lqt": gained}, own | {"against_lqt": chance}]
     lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
     assert any("costs less than the LQT law for 1 of 2 seeds, more for 0" in line for line in lines)
+
+
+def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_law() -> None:
+    why = "9 of 20 rollouts were not used: more fields would not change the law"
+    own = {"verdict": "better", "reason": "it is better", "early": why}
+    lines = closing_lines("kdv", summary(seeds=1, changed=[True], outcome=[own]), "")
+    assert f"  {why}" in lines and not any("it is better" in line for line in lines)
+    outcome = [own | {"early": ""}, own]
+    lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
+    assert f"  seed 1: {why}" in lines
+
+
+def test_every_optimiser_that_leaves_rollouts_over_says_so_in_the_results() -> None:
+    """One explores and two check: the paper's method steps with pairs of the five that are left."""
+    values = parameters(rollouts=8, optimizer="two_point")
+    training = build_training(values)
+    train(training, LocalPair(values), lambda row: None)
+    (own,) = summarise(training)["outcome"]
+    total, spent = training.budget.total[0], training.budget.paid[0]
+    assert spent == total - 1
+    assert own["early"] == f"1 of {total} rollouts were not used: the optimiser asked for no more"
 
 
 def test_the_interval_of_a_difference_has_the_mean_as_often_as_it_says() -> None:
