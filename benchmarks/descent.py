@@ -46,6 +46,7 @@ def descend(
     *,
     tolerance: float,
     iterations: int = 1000,
+    limit: float = 0.0,
 ) -> Descent:
     """Minimise function(x) = (J, dJ/dx) from x on.
 
@@ -59,6 +60,8 @@ def descend(
         Converged when J falls by less than this share of it in WINDOW iterations.
     iterations
         At most.
+    limit
+        Largest magnitude of the numbers of x; 0 for none.
 
     Raises
     ------
@@ -91,10 +94,14 @@ def descend(
         x.ravel(),
         jac=True,
         method="L-BFGS-B",
+        bounds=[(-limit, limit)] * x.size if limit else None,
         callback=after,
         options={**options, "ftol": 0.0, "gtol": 0.0},
     )
     _, gradient = bounded(end.x)
+    if limit:  # what points out of the bounds is nothing that is left to fall
+        outward = (np.abs(end.x) >= limit) & (gradient * end.x < 0.0)
+        gradient = np.where(outward, 0.0, gradient)
     norm = float(np.linalg.norm(end.x) * np.linalg.norm(gradient) / end.fun)
     # A descent that comes to the bottom fast ends before its window is full of small falls. What is
     # left to fall is of second order in the gradient.

@@ -34,12 +34,12 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from benchmarks.optimum import TRAINING_SEED, evaluation_seeds, optimise_law
+from benchmarks.true_model import TrueModel
 from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.models.base import linearised
 from pde_sim_node.build import build_plant
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
@@ -149,28 +149,6 @@ def run(
                     cost = _cost(sensed, laws[int(np.argmin(tuned))], seeds)
                     rows.append({**known, "sensors": count, "noise": sigma, "estimator": cost})
     return rows
-
-
-class TrueModel:
-    """The plant itself as a model of the field (`loop_method.models.FieldModel`)."""
-
-    kind = "true"
-
-    def __init__(self, plant: Plant) -> None:
-        self._plant, self._adjoint = plant, plant.adjoint()
-        self.n_z, self.n_a = plant.n_z, plant.n_a
-
-    def step(self, states: Array, actions: Array) -> Array:
-        return self._plant.evaluate(states, actions)[0]
-
-    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        return self._adjoint.pull_back(states, actions, covectors)
-
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return linearised(self, state, action)
-
-    def arrays(self) -> dict[str, Any]:
-        return {}
 
 
 def _whole(

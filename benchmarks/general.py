@@ -3,7 +3,7 @@
 
 Every case of `benchmarks.families` is trained at each budget and seed, and compared on held-out fields
 with no control, with its own first law, with the best affine law and with the limit of any controller
-(`--bounds`, by exact gradients; kept in benchmarks/families/bounds.json). Finished trainings are kept
+(`--bounds`: `benchmarks.bounds`; kept in benchmarks/families/bounds.json). Finished trainings are kept
 in a folder, so that an interrupted run continues where it stood. Constants of the method are chosen on
 `--tuning` seeds; tables are about the others.
 """
@@ -30,15 +30,13 @@ from pdeloop.study.executors import processes
 __all__ = ["run", "text"]
 
 TABLE_SEEDS = 200
-"""First seed of the trainings in a table."""
+"""First seed of the trainings in a table, in whose basis the bounds are worked out."""
 TUNING_SEEDS = 100
 """First seed of the trainings with which constants of the method may be chosen."""
 EVALUATION = 2000
 """Evaluation seed of the held-out fields in a table; `TUNING` has others."""
 TUNING_EVALUATION = 1000
 BOUNDS = Path(__file__).parent / "families" / "bounds.json"
-BOUND_FIELDS = 48
-"""Initial fields that the best affine law is optimised on."""
 
 
 def run(
@@ -98,6 +96,8 @@ def run(
         if bounds:
             for name, found in zip(chosen, pool.map(bound, chosen), strict=True):
                 keep_bound(name, found)
+                said = ", ".join(f"{key} {number(cost)}" for key, cost in found.items())
+                print(f"{name}: {said}", file=sys.stderr, flush=True)
         work = partial(train, fields=fields, evaluation=evaluation, folder=folder.resolve())
         for task, row in zip(tasks, pool.map(work, tasks), strict=True):
             rows.append(row)
@@ -152,30 +152,11 @@ def trained(case: Case, **settings: Any) -> Any:
 
 def bound(name: str) -> dict[str, float]:
     """Costs of the best affine law and of the best inputs on the held-out fields of the table."""
-    from benchmarks.optimum import evaluation_seeds, optimise_inputs, optimise_law
+    from benchmarks.bounds import bounds_of
+    from benchmarks.optimum import evaluation_seeds
 
-    case, drawn = CASES[name], evaluation_seeds(EVALUATION, 10)
-    # As a training identifies: the best law in the basis of another model says nothing of this one.
-    given = {"identification": "field", **case.parameters()}
-    found: dict[str, float] = {}
-    if case.plant:
-        print(f"{name}: no bounds (its plant has no derivatives)", file=sys.stderr)
-        return found
-    try:
-        _, law, costs = optimise_law(
-            case.base,
-            TUNING_SEEDS,
-            fields=BOUND_FIELDS,
-            evaluations={EVALUATION: drawn},
-            tolerance=2e-3,
-            given=given,
-        )
-        found["affine"] = float(np.mean(costs["optimum"][EVALUATION]))
-        ends = [optimise_inputs(case.base, s, law=law, tolerance=2e-3, given=given) for s in drawn]
-        found["limit"] = float(np.mean([end.cost for (end,) in ends]))
-    except ValueError as error:
-        print(f"{name}: no bounds ({error})", file=sys.stderr)
-    return found
+    costs = bounds_of(CASES[name], TABLE_SEEDS, evaluation_seeds(EVALUATION, 10))
+    return {key: float(f"{own.mean():.5g}") for key, own in costs.items()}
 
 
 def keep_bound(name: str, found: Mapping[str, float]) -> None:

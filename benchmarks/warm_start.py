@@ -11,7 +11,9 @@ from tuner_node.build import build_training
 from tuner_node.training import Training
 
 
-def warm_start(values: Mapping[str, Any], pair: LocalPair) -> Training:
+def warm_start(
+    values: Mapping[str, Any], pair: LocalPair, optimizer: str = "gauss_newton"
+) -> Training:
     """A training of one seed that is about to adapt, with the trajectories that it has measured.
 
     Parameters
@@ -20,6 +22,8 @@ def warm_start(values: Mapping[str, Any], pair: LocalPair) -> Training:
         Resolved parameters.
     pair
         Runs the rollouts, and has the training's model afterwards.
+    optimizer
+        Says how many explorations there are, and whether the first law is checked.
 
     Returns
     -------
@@ -27,7 +31,7 @@ def warm_start(values: Mapping[str, Any], pair: LocalPair) -> Training:
         `starts()[0]` is the law it begins with, `models[0]` the reduced model, `explorations[0]` and
         `measured[0]` are trajectories, and `budget.paid[0]` is what they cost.
     """
-    training = build_training({**values, "optimizer": "gauss_newton", "seeds": 1})
+    training = build_training({**values, "optimizer": optimizer, "seeds": 1})
     while training.phase in ("identify", "check"):
         batch = training.next_batch()
         assert batch is not None

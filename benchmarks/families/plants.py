@@ -1,30 +1,17 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Plants that no equation of the compiled solver describes, each as z_{k+1} = f(z_k, a_k) in NumPy.
 
-The method is told nothing of them, so that a state is a plain vector. Every step takes one state and
-action, or a batch of them.
+The method is told nothing of them, so that a state is a plain vector. Steps and derivatives take one
+state and action, or a batch of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from benchmarks.families.rates import RatePlant
 from loop_interfaces.arrays import Array
 from pde_sim_node.dynamics import Dynamics
-
-
-def runge_kutta(rate: Callable[[Array], Array], z: Array, duration: float, steps: int) -> Array:
-    """Classical Runge-Kutta of fourth order in this many steps."""
-    h = duration / steps
-    for _ in range(steps):
-        k1 = rate(z)
-        k2 = rate(z + h / 2 * k1)
-        k3 = rate(z + h / 2 * k2)
-        k4 = rate(z + h * k3)
-        z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return z
 
 
 def modes(rng: np.random.Generator, n: int, count: int, rms: float) -> Array:
@@ -51,13 +38,18 @@ def difference(z: Array, order: int, spacing: float) -> Array:
     return (after - 2 * z + before) / spacing**2
 
 
-class AllenCahnInhomogeneous(Dynamics):
+def with_walls(z: Array) -> Array:
+    """A field between zeros at both ends."""
+    return np.pad(z, [(0, 0)] * (z.ndim - 1) + [(1, 1)])
+
+
+class AllenCahnInhomogeneous(RatePlant):
     """Allen-Cahn with a potential that depends on x, V(x) = 5 (1 + sin(2 pi x/L)/2), L = 2."""
 
     n_z, n_a = 128, 12
     sample_time, horizon = 0.01, 80
     state_weight, action_weight, exploration_variance = 1.0, 0.05, 0.1
-    reduced_order = 24
+    reduced_order, substeps = 24, 2
 
     def __init__(self) -> None:
         x = np.arange(self.n_z) / self.n_z
@@ -68,19 +60,18 @@ class AllenCahnInhomogeneous(Dynamics):
     def initial_state(self, rng: np.random.Generator) -> Array:
         return modes(rng, self.n_z, 4, 0.8)
 
-    def step(self, z: Array, a: Array) -> Array:
-        force, dx = a @ self.shapes, 2 / self.n_z
+    def rate(self, z: Array, force: Array) -> Array:
+        return 2.5e-3 * difference(z, 2, 2 / self.n_z) - self.potential * (z * z * z - z) + force
 
-        def rate(u: Array) -> Array:
-            return 2.5e-3 * difference(u, 2, dx) - self.potential * (u**3 - u) + force
-
-        return runge_kutta(rate, z, self.sample_time, 2)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        diffused = 2.5e-3 * difference(y, 2, 2 / self.n_z)
+        return diffused - self.potential * (3 * z**2 - 1) * y, y
 
 
 class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
     """u_t = (D(x) u_x)_x + r(x) u - u^3 + a: diffusion and growth that depend on x."""
 
-    action_weight = 0.5
+    action_weight, substeps = 0.5, 4
 
     def __init__(self) -> None:
         super().__init__()
@@ -89,24 +80,27 @@ class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
         self.diffusion = 0.02 * (1 + 0.8 * np.cos(2 * np.pi * (x + 0.5 / self.n_z)))
         self.growth = 3 * np.sin(4 * np.pi * x)
 
-    def step(self, z: Array, a: Array) -> Array:
-        force, dx = a @ self.shapes, 2 / self.n_z
+    def diffused(self, u: Array) -> Array:
+        """(D(x) u_x)_x, as a symmetric matrix."""
+        dx = 2 / self.n_z
+        flux = self.diffusion * (np.roll(u, -1, axis=-1) - u) / dx
+        divergence: Array = (flux - np.roll(flux, 1, axis=-1)) / dx
+        return divergence
 
-        def rate(u: Array) -> Array:
-            flux = self.diffusion * (np.roll(u, -1, axis=-1) - u) / dx
-            diffused = (flux - np.roll(flux, 1, axis=-1)) / dx
-            return diffused + self.growth * u - u**3 + force
+    def rate(self, z: Array, force: Array) -> Array:
+        return self.diffused(z) + self.growth * z - z * z * z + force
 
-        return runge_kutta(rate, z, self.sample_time, 4)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        return self.diffused(y) + (self.growth - 3 * z**2) * y, y
 
 
-class FitzHughNagumo(Dynamics):
+class FitzHughNagumo(RatePlant):
     """FitzHugh-Nagumo on a ring, actuated in the voltage: two components, one after the other."""
 
     n_z, n_a = 128, 8
     sample_time, horizon = 0.2, 100
     state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
-    reduced_order = 16
+    reduced_order, substeps = 16, 8
     components = 2
 
     def __init__(self) -> None:
@@ -117,22 +111,23 @@ class FitzHughNagumo(Dynamics):
         n = self.n_z // 2
         return np.concatenate([modes(rng, n, 4, 0.6), modes(rng, n, 4, 0.2)])
 
-    def step(self, z: Array, a: Array) -> Array:
-        n, force = self.n_z // 2, a @ self.shapes
+    def rate(self, z: Array, force: Array) -> Array:
+        v, w = np.split(z, 2, axis=-1)
+        dv = difference(v, 2, 20 / v.shape[-1]) + v - v * v * v - w + force
+        return np.concatenate([dv, 0.08 * (v - 0.8 * w)], axis=-1)
 
-        def rate(state: Array) -> Array:
-            v, w = state[..., :n], state[..., n:]
-            dv = difference(v, 2, 20 / n) + v - v**3 - w + force
-            return np.concatenate([dv, 0.08 * (v - 0.8 * w)], axis=-1)
-
-        return runge_kutta(rate, z, self.sample_time, 8)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        v = z[..., : self.n_z // 2]
+        on_dv, on_dw = np.split(y, 2, axis=-1)
+        on_v = difference(on_dv, 2, 20 / v.shape[-1]) + (1 - 3 * v**2) * on_dv + 0.08 * on_dw
+        return np.concatenate([on_v, -on_dv - 0.08 * 0.8 * on_dw], axis=-1), on_dv
 
 
 class GrayScott(FitzHughNagumo):
     """Gray-Scott on a ring, actuated in the fed component; the target is a half-way mixture."""
 
     sample_time, horizon = 1.0, 100
-    action_weight, exploration_variance = 100.0, 1e-5
+    action_weight, exploration_variance, substeps = 100.0, 1e-5, 4
 
     def __init__(self) -> None:
         super().__init__()
@@ -144,47 +139,51 @@ class GrayScott(FitzHughNagumo):
         u, v = 0.6 + modes(rng, n, 4, 0.1), 0.2 + modes(rng, n, 4, 0.05)
         return np.concatenate([np.clip(u, 0.05, 1.0), np.clip(v, 0.01, 1.0)])
 
-    def step(self, z: Array, a: Array) -> Array:
-        n, force = self.n_z // 2, a @ self.shapes
+    def rate(self, z: Array, force: Array) -> Array:
+        u, v = np.split(z, 2, axis=-1)
+        reaction = u * v * v
+        du = 2e-1 * difference(u, 2, 1.0) - reaction + 0.04 * (1 - u) + force
+        dv = 1e-1 * difference(v, 2, 1.0) + reaction - 0.1 * v
+        return np.concatenate([du, dv], axis=-1)
 
-        def rate(state: Array) -> Array:
-            u, v = state[..., :n], state[..., n:]
-            reaction = u * v * v
-            du = 2e-1 * difference(u, 2, 1.0) - reaction + 0.04 * (1 - u) + force
-            dv = 1e-1 * difference(v, 2, 1.0) + reaction - 0.1 * v
-            return np.concatenate([du, dv], axis=-1)
-
-        return runge_kutta(rate, z, self.sample_time, 4)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        u, v = np.split(z, 2, axis=-1)
+        on_du, on_dv = np.split(y, 2, axis=-1)
+        on_reaction = on_dv - on_du
+        on_u = 2e-1 * difference(on_du, 2, 1.0) - 0.04 * on_du + v * v * on_reaction
+        on_v = 1e-1 * difference(on_dv, 2, 1.0) - 0.1 * on_dv + 2 * u * v * on_reaction
+        return np.concatenate([on_u, on_v], axis=-1), on_du
 
 
 class SineGordon(FitzHughNagumo):
     """Sine-Gordon, u_tt = u_xx - sin u + a, on a ring: a wave equation with kinks."""
 
     sample_time, horizon = 0.1, 100
-    exploration_variance = 0.3
+    exploration_variance, substeps = 0.3, 4
 
     def initial_state(self, rng: np.random.Generator) -> Array:
         n = self.n_z // 2
         return np.concatenate([modes(rng, n, 4, 1.0), np.zeros(n)])
 
-    def step(self, z: Array, a: Array) -> Array:
-        n, force = self.n_z // 2, a @ self.shapes
+    def rate(self, z: Array, force: Array) -> Array:
+        u, w = np.split(z, 2, axis=-1)
+        dw = difference(u, 2, 10 / u.shape[-1]) - np.sin(u) - 0.05 * w + force
+        return np.concatenate([w, dw], axis=-1)
 
-        def rate(state: Array) -> Array:
-            u, w = state[..., :n], state[..., n:]
-            dw = difference(u, 2, 10 / n) - np.sin(u) - 0.05 * w + force
-            return np.concatenate([w, dw], axis=-1)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        u = z[..., : self.n_z // 2]
+        on_du, on_dw = np.split(y, 2, axis=-1)
+        on_u = difference(on_dw, 2, 10 / u.shape[-1]) - np.cos(u) * on_dw
+        return np.concatenate([on_u, on_du - 0.05 * on_dw], axis=-1), on_dw
 
-        return runge_kutta(rate, z, self.sample_time, 4)
 
-
-class BurgersBetweenWalls(Dynamics):
+class BurgersBetweenWalls(RatePlant):
     """Burgers on [0, 1] with u = 0 at both walls, cell by cell, actuated inside."""
 
     n_z, n_a = 96, 6
     sample_time, horizon = 0.05, 100
     state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
-    reduced_order = 16
+    reduced_order, substeps = 16, 24
 
     def __init__(self) -> None:
         self.x = np.arange(1, self.n_z + 1) / (self.n_z + 1)
@@ -196,26 +195,26 @@ class BurgersBetweenWalls(Dynamics):
         state: Array = 0.5 / np.sqrt(2.5) * rng.standard_normal(5) @ waves
         return state
 
-    def step(self, z: Array, a: Array) -> Array:
-        force, dx = a @ self.shapes, 1 / (self.n_z + 1)
+    def rate(self, z: Array, force: Array) -> Array:
+        whole, dx = with_walls(z), 1 / (self.n_z + 1)
+        flux = 0.5 * whole**2
+        advection = (flux[..., 2:] - flux[..., :-2]) / (2 * dx)
+        diffusion = (whole[..., 2:] - 2 * z + whole[..., :-2]) / dx**2
+        return 0.01 * diffusion - advection + force
 
-        def rate(u: Array) -> Array:
-            whole = np.pad(u, [(0, 0)] * (u.ndim - 1) + [(1, 1)])
-            flux = 0.5 * whole**2
-            advection = (flux[..., 2:] - flux[..., :-2]) / (2 * dx)
-            diffusion = (whole[..., 2:] - 2 * u + whole[..., :-2]) / dx**2
-            return 0.01 * diffusion - advection + force
-
-        return runge_kutta(rate, z, self.sample_time, 24)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        whole, dx = with_walls(y), 1 / (self.n_z + 1)
+        diffusion = (whole[..., 2:] - 2 * y + whole[..., :-2]) / dx**2
+        return 0.01 * diffusion + z * (whole[..., 2:] - whole[..., :-2]) / (2 * dx), y
 
 
-class Lorenz96(Dynamics):
+class Lorenz96(RatePlant):
     """Lorenz-96 with 40 variables and forcing 8, eight of them actuated: chaotic, no PDE."""
 
     n_z, n_a = 40, 8
     sample_time, horizon = 0.05, 100
     state_weight, action_weight, exploration_variance = 1.0, 0.1, 4.0
-    reduced_order = 24
+    reduced_order, substeps = 24, 2
 
     def __init__(self) -> None:
         self.target = np.zeros(self.n_z)
@@ -228,23 +227,28 @@ class Lorenz96(Dynamics):
         state: Array = z[0]
         return state
 
-    def step(self, z: Array, a: Array) -> Array:
-        force = 8 + a @ self.shapes
+    def forced(self, a: Array) -> Array:
+        return 8 + a @ self.shapes
 
-        def rate(x: Array) -> Array:
-            ahead, behind = np.roll(x, -1, axis=-1), np.roll(x, 1, axis=-1)
-            return (ahead - np.roll(x, 2, axis=-1)) * behind - x + force
+    def rate(self, z: Array, force: Array) -> Array:
+        ahead, behind = np.roll(z, -1, axis=-1), np.roll(z, 1, axis=-1)
+        return (ahead - np.roll(z, 2, axis=-1)) * behind - z + force
 
-        return runge_kutta(rate, z, self.sample_time, 2)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        ahead, behind = np.roll(z, -1, axis=-1), np.roll(z, 1, axis=-1)
+        product = behind * y  # of the difference of its factors
+        on_behind = (ahead - np.roll(z, 2, axis=-1)) * y
+        on_z = np.roll(product, 1, axis=-1) - np.roll(product, -2, axis=-1)
+        return on_z + np.roll(on_behind, -1, axis=-1) - y, y
 
 
-class CoupledPendulums(Dynamics):
+class CoupledPendulums(RatePlant):
     """Sixteen pendulums on a ring with springs between them, every second one driven, to rest."""
 
     n_z, n_a = 32, 8
     sample_time, horizon = 0.1, 100
     state_weight, action_weight, exploration_variance = 1.0, 0.1, 1.0
-    reduced_order = 24
+    reduced_order, substeps = 24, 4
 
     def __init__(self) -> None:
         self.target = np.zeros(self.n_z)
@@ -253,16 +257,19 @@ class CoupledPendulums(Dynamics):
     def initial_state(self, rng: np.random.Generator) -> Array:
         return np.concatenate([rng.normal(0.0, 1.0, 16), rng.normal(0.0, 0.5, 16)])
 
-    def step(self, z: Array, a: Array) -> Array:
-        torque = a @ self.shapes
+    def rate(self, z: Array, force: Array) -> Array:
+        angle, speed = np.split(z, 2, axis=-1)
+        springs = 0.5 * (np.roll(angle, 1, axis=-1) - 2 * angle + np.roll(angle, -1, axis=-1))
+        dv = springs - np.sin(angle) - 0.05 * speed + force
+        return np.concatenate([speed, dv], axis=-1)
 
-        def rate(state: Array) -> Array:
-            angle, speed = state[..., :16], state[..., 16:]
-            springs = 0.5 * (np.roll(angle, 1, axis=-1) - 2 * angle + np.roll(angle, -1, axis=-1))
-            dv = springs - np.sin(angle) - 0.05 * speed + torque
-            return np.concatenate([speed, dv], axis=-1)
-
-        return runge_kutta(rate, z, self.sample_time, 4)
+    def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
+        angle = z[..., :16]
+        on_speed, on_dv = np.split(y, 2, axis=-1)
+        springs = 0.5 * difference(on_dv, 2, 1.0)
+        return np.concatenate(
+            [springs - np.cos(angle) * on_dv, on_speed - 0.05 * on_dv], axis=-1
+        ), on_dv
 
 
 class RandomLinear(Dynamics):
@@ -286,3 +293,6 @@ class RandomLinear(Dynamics):
     def step(self, z: Array, a: Array) -> Array:
         after: Array = z @ self.A.T + a @ self.B.T
         return after
+
+    def pull_back(self, z: Array, a: Array, y: Array) -> tuple[Array, Array]:
+        return y @ self.A, y @ self.B

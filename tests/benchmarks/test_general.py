@@ -69,6 +69,23 @@ def test_a_plant_steps_a_batch_as_it_steps_each(name: str) -> None:
     assert plant.target.shape == (plant.n_z,)
 
 
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_plant_has_exact_derivatives(name: str) -> None:
+    """<y, f' d> = <f'^T y, d> for any direction d, with f' d by central differences."""
+    plant = getattr(plants, name)()
+    rng = np.random.default_rng(5)
+    z = np.stack([plant.initial_state(rng) for _ in range(2)])
+    a = rng.standard_normal((2, plant.n_a))
+    y, dz, da = (rng.standard_normal(part.shape) for part in (z, z, a))
+    e = 1e-5
+    along = (plant.step(z + e * dz, a + e * da) - plant.step(z - e * dz, a - e * da)) / (2 * e)
+    on_z, on_a = plant.pull_back(z, a, y)
+    expected = np.sum(y * along, axis=1)
+    np.testing.assert_allclose(
+        np.sum(on_z * dz, axis=1) + np.sum(on_a * da, axis=1), expected, rtol=1e-6
+    )
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_case_is_a_problem_that_can_be_trained_on(name: str) -> None:
     case = CASES[name]

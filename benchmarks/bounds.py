@@ -1,0 +1,173 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The best affine law and the limit of any controller, for the table of `python -m benchmarks general`.
+
+Both are those of a training's closed loop with the plant itself in place of its model, so that action
+limits and measurement noise count, and with exact derivatives:
+
+- the law a = K_a U^T z + b of least mean cost over many initial fields, with U as a training begins
+  with it, by the descent of the trainings (`loop_method.adapt.improve`), repeated with new coordinates
+  until it gains nothing more, from the first law or from zero, whichever leads further,
+- the inputs of least cost for known initial fields, without noise, as a_k = K_a U^T z_k + b + v_k
+  around that law, by L-BFGS on all v_k: where the plant is unstable, the cost is a gentler function of
+  v than of a. No controller can do better, up to local optima.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import pdeloop
+from benchmarks.descent import descend
+from benchmarks.families.cases import Case
+from benchmarks.optimum import TRAINING_SEED, evaluation_seeds
+from benchmarks.true_model import TrueModel
+from benchmarks.warm_start import warm_start
+from loop_interfaces.arrays import Array
+from loop_interfaces.parameters import INSTRUMENTS
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import cheapest, curvature_of, improve
+from loop_method.adapt.settings import ImprovementSettings
+from pde_sim_node.build import build_plant
+from pde_sim_node.plant import Plant
+from pdeloop.episode import rollout
+from pdeloop.in_process import LocalPair
+
+__all__ = ["best_inputs", "best_law", "bounds_of", "inputs_cost", "loop_of"]
+
+FIELDS = 48
+"""Initial fields that the best affine law is optimised on."""
+COARSE = ImprovementSettings(iterations=300, least_gain=1e-2)
+"""Descents on some of the fields."""
+FINE = ImprovementSettings(iterations=300, window=10, least_gain=1e-3)
+"""Descents on all of them, which end later than those of a training."""
+HORIZONS = (8, 4, 2)
+"""Divisors of the horizon."""
+ROUNDS = 6
+"""Descents from one law at most, each in the coordinates of the one before."""
+INPUTS_TOLERANCE = 1e-3
+"""Of `descend`, for the inputs."""
+
+
+def bounds_of(case: Case, seed: int, held_out: Sequence[int]) -> dict[str, Array]:
+    """The costs from each held-out field of the best affine law and of the best inputs.
+
+    seed: of the training whose basis and first law are taken; held_out: seeds of the fields.
+    """
+    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+        plant, loop, first = loop_of(case, seed)
+        own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, FIELDS))
+        theta = best_law(loop, first, own)
+        K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
+        noise = np.arange(len(held_out))
+        episode = rollout(plant, lambda _, z: z @ K.T + b, held_out, noise, keep=False)
+        inputs = best_inputs(loop, theta, initial_fields(plant, held_out))
+    return {"affine": episode.costs.mean, "limit": inputs}
+
+
+def loop_of(case: Case, seed: int) -> tuple[Plant, ClosedLoop, Array]:
+    """The plant of a case, the closed loop of the training with this seed, and its first law."""
+    given = case.parameters()
+    values: dict[str, Any] = dict(pdeloop.problem(case.base or None, seed=seed, **given).values)
+    plant = build_plant(values)
+    ideal = build_plant({**values, **{spec.name: spec.default for spec in INSTRUMENTS}})
+    training = warm_start(values, LocalPair(values, plant), values["optimizer"])
+    loop = ClosedLoop(
+        training.laws()[0].model.U,
+        ideal.target,
+        ideal.state_weight,
+        ideal.action_weight,
+        ideal.horizon,
+        values["action_limit"],
+        model=TrueModel(ideal),
+        noise=values["measurement_noise"],
+    )
+    return plant, loop, loop.theta(training.warm_starts()[0])
+
+
+def initial_fields(plant: Plant, seeds: Sequence[int]) -> Array:
+    """The initial fields with these seeds, (F, n_z)."""
+    plant.reset(np.array(seeds), np.zeros(len(seeds), dtype=np.int64))
+    return plant.states.copy()
+
+
+def best_law(loop: ClosedLoop, first: Array, fields: Array) -> Array:
+    """The law of least mean cost, from the best of some laws to begin with.
+
+    Descents on a quarter of the fields say which leads furthest: that from the first law, or that from
+    zero over growing horizons. Of a chaotic plant the cost of a long rollout has many local optima, and
+    that of a short one few.
+    """
+    few = fields[: -(-len(fields) // 4)]
+    zero = grown = np.zeros_like(first)
+    for part in HORIZONS:
+        short = replace(loop, horizon=max(loop.horizon // part, 1))
+        grown = descended(short, grown, few, COARSE)
+    near = [descended(loop, theta, few, COARSE) for theta in (first, grown)]
+    even = np.full(len(fields), 1.0 / len(fields))
+    start = cheapest(loop, [first, zero, *near], fields, even)
+    return descended(loop, start, fields, FINE)
+
+
+def descended(
+    loop: ClosedLoop, theta: Array, fields: Array, settings: ImprovementSettings
+) -> Array:
+    """The law after repeated descents, each in the coordinates of where the last one ended."""
+    even, curvature = np.full(len(fields), 1.0 / len(fields)), curvature_of(loop)
+    for _ in range(ROUNDS):
+        better = improve(loop, theta, fields, even, curvature, settings)
+        if better is None:
+            break
+        theta = better.theta
+        if better.before - better.after <= settings.least_gain * better.after:
+            break
+    return theta
+
+
+def best_inputs(loop: ClosedLoop, theta: Array, fields: Array) -> Array:
+    """The cost of the best inputs from each of the fields, known and without noise, (F,)."""
+    loop = replace(loop, noise=0.0)
+    start = np.zeros((loop.horizon, len(fields), loop.model.n_a))
+    if loop.action_limit:
+        # Without the law, as what is added to an action that saturates has no effect.
+        start, theta = loop.simulate(theta, fields).actions, np.zeros_like(theta)
+    found = descend(
+        lambda v: _mean(*inputs_cost(loop, theta, v, fields)),
+        start,
+        tolerance=INPUTS_TOLERANCE,
+        limit=loop.action_limit,
+    )
+    return inputs_cost(loop, theta, found.x, fields)[0]
+
+
+def _mean(costs: Array, gradient: Array) -> tuple[float, Array]:
+    return float(costs.mean()), gradient / len(costs)
+
+
+def inputs_cost(loop: ClosedLoop, theta: Array, v: Array, fields: Array) -> tuple[Array, Array]:
+    """J of a_k = theta [U^T z_k; 1] + v_k from each of the fields, (F,), and dJ/dv, as v (T, F, n_a).
+
+    Infinite, with a gradient of zero, where a simulation is not finite.
+    """
+    T, model = loop.horizon, loop.model
+    q, r = 2.0 * loop.state_weight / T, 2.0 * loop.action_weight / T
+    K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
+    z, states, actions, costs = fields, [], [], np.zeros(len(fields))
+    for k in range(T):
+        states.append(z)
+        actions.append(z @ K.T + b + v[k])
+        costs += 0.5 * q * np.sum((z - loop.target) ** 2, axis=1)
+        costs += 0.5 * r * np.sum(actions[k] ** 2, axis=1)
+        if not (np.isfinite(costs).all() and np.isfinite(z).all()):
+            return np.full(len(fields), np.inf), np.zeros_like(v)
+        z = model.step(z, actions[k])
+    gradient, eta = np.empty_like(v), np.zeros_like(fields)
+    for k in reversed(range(T)):
+        eta, g = model.pull_back(states[k], actions[k], eta)
+        gradient[k] = g + r * actions[k]
+        eta = eta + q * (states[k] - loop.target) + gradient[k] @ K
+    return costs, gradient

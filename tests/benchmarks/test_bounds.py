@@ -1,0 +1,89 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The bounds in the table of `python -m benchmarks general`: against known optima, and each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import bounds
+from benchmarks.bounds import best_inputs, best_law, initial_fields, inputs_cost, loop_of
+from benchmarks.families.cases import Case
+from benchmarks.families.plants import CoupledPendulums, RandomLinear
+from benchmarks.optimum import TRAINING_SEED, evaluation_seeds, optimise_law
+from benchmarks.true_model import TrueModel
+from loop_method.adapt.closed_loop import ClosedLoop
+from pde_sim_node.plants.loading import as_plant
+from tests.support.small import SMALL
+
+
+def loop_on(dynamics: Any, n_s: int, horizon: int, **settings: Any) -> ClosedLoop:
+    """The closed loop of laws of the first numbers of the state."""
+    plant = as_plant(dynamics)
+    numbers = plant.target, plant.state_weight, plant.action_weight, horizon
+    return ClosedLoop(np.eye(plant.n_z, n_s), *numbers, model=TrueModel(plant), **settings)
+
+
+def test_the_best_inputs_of_a_linear_plant_are_those_of_the_riccati_recursion() -> None:
+    plant, T = RandomLinear(), 6
+    fields = np.random.default_rng(1).standard_normal((3, plant.n_z))
+    P = np.zeros((plant.n_z, plant.n_z))
+    for _ in range(T):
+        S = plant.action_weight * np.eye(plant.n_a) + plant.B.T @ P @ plant.B
+        K = np.linalg.solve(S, plant.B.T @ P @ plant.A)
+        P = plant.state_weight * np.eye(plant.n_z) + plant.A.T @ P @ (plant.A - plant.B @ K)
+    least = np.einsum("fi,ij,fj->f", fields, P, fields) / T
+    loop = loop_on(plant, 4, T)
+    law = 0.02 * np.random.default_rng(2).standard_normal((plant.n_a, 5))
+    for theta in (np.zeros_like(law), law):  # whatever law they are found around
+        np.testing.assert_allclose(best_inputs(loop, theta, fields), least, rtol=1e-3)
+
+
+def test_inputs_have_an_exact_gradient() -> None:
+    loop = loop_on(CoupledPendulums(), 6, 7)
+    rng = np.random.default_rng(3)
+    fields, theta = rng.standard_normal((2, 32)), rng.standard_normal((8, 7))
+    v, d = rng.standard_normal((2, 7, 2, 8))
+    (up, _), (down, _) = (inputs_cost(loop, theta, v + e * d, fields) for e in (1e-5, -1e-5))
+    _, gradient = inputs_cost(loop, theta, v, fields)
+    np.testing.assert_allclose(np.sum(gradient * d, axis=(0, 2)), (up - down) / 2e-5, rtol=1e-7)
+
+
+def test_saturating_inputs_cost_more_and_no_more_than_the_law() -> None:
+    free = loop_on(RandomLinear(), 4, 6)
+    fields = np.random.default_rng(1).standard_normal((2, 64))
+    theta = -0.05 * np.eye(4, 5)
+    limited = replace(free, action_limit=0.1)
+    cost = best_inputs(limited, theta, fields)
+    assert (cost > best_inputs(free, theta, fields)).all()
+    assert (cost < limited.costs(theta, fields)).all()
+
+
+def test_the_best_law_is_that_of_the_descent_with_the_plant_s_own_gradients() -> None:
+    given = {"fields": 4, "evaluations": {}, "tolerance": 1e-4}
+    found, (U, theta), _ = optimise_law(str(SMALL), 0, **given)
+    plant, loop, _ = loop_of(Case("", str(SMALL)), 0)
+    loop = replace(loop, U=U)
+    fields = initial_fields(plant, evaluation_seeds(TRAINING_SEED, 4))
+    assert loop.costs(theta, fields).mean() == pytest.approx(found.cost, rel=1e-9)
+    own = best_law(loop, np.zeros_like(theta), fields)
+    assert loop.costs(own, fields).mean() == pytest.approx(found.cost, rel=5e-3)
+
+
+def test_limits_and_noise_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With them the best law costs more, and noise does not change the limit for known fields."""
+    monkeypatch.setattr(bounds, "FIELDS", 4)
+
+    def means(**settings: Any) -> tuple[float, float]:
+        costs = bounds.bounds_of(Case("", str(SMALL), settings), 0, [1, 2])
+        assert (costs["limit"] <= costs["affine"]).all()
+        return costs["affine"].mean(), costs["limit"].mean()
+
+    affine, limit = means()
+    noisy, same = means(measurement_noise=0.3)
+    saturated, higher = means(action_limit=0.05)
+    assert noisy > affine and same == pytest.approx(limit, rel=1e-3)
+    assert saturated > affine and higher > limit
