@@ -3,7 +3,7 @@
 
 An environment's action does not depend on how many environments are in the batch, nor on its place
 in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
-reassociation). What stands side by side is sums that do not depend on each other: those of eight
+reassociation). Sums that do not depend on each other are computed side by side: those of eight
 modes or actuators in the lanes of a vector, and those of four environments, which hide each other's
 latency.
 """

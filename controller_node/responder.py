@@ -4,8 +4,8 @@
 It answers every state of an episode whose start it has, including repeated ones, and the answer depends
 only on (state, policy, model, step) or, in an exploratory episode, on (seed, step). After a restart the
 latched topics restore everything it keeps, except the samples of an exploratory episode and the memory
-of a law that has one, which is a function of the episode's states: if it missed some, it says so and
-the episode is run again.
+of a law that has one, which is a function of the episode's states: if it missed some, it reports
+that, and the episode is run again.
 """
 
 from collections import Counter, OrderedDict

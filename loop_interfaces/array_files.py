@@ -37,8 +37,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
     """The arrays of an npz archive that begins where `file` stands, of at most `most` bytes together.
 
-    What they take is known from the archive's directory before anything is unpacked: no member can
-    unpack to more than is written there.
+    The archive's directory gives their sizes before anything is unpacked: no member can unpack to more
+    than is written there.
     """
     try:
         start = file.tell()

@@ -129,7 +129,7 @@ class Plant(Protocol):
     target : (state_size,)
         Target of what `reset` and `step` return.
     grid : Grid
-        What the numbers of a state are.
+        Axes and components of a state.
     forced : slice
         The numbers of a state that process noise forces.
     supports : (forced numbers, n_a) or None

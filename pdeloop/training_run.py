@@ -98,8 +98,8 @@ def begin(
 ) -> tuple[Path, dict[str, Any]]:
     """Folder and parameters of a new training, of which nothing has been done yet.
 
-    What can be refused without a compiler is refused before anything is compiled, as are options
-    that change nothing. transport: over topics, if not given.
+    Mistakes that show without a compiler are refused before anything is compiled, as are options that
+    change nothing. transport: over topics, if not given.
     """
     values = resolve(problem, options)
     transport = transport or Transport()

@@ -15,7 +15,7 @@ PURPOSES = {
     "adapt": "adaptation",
     "evaluate": "evaluation",
 }
-"""What the rollouts of each phase are for. Those of the closing evaluation are not in the budget."""
+"""The purpose of the rollouts of each phase. Those of the closing evaluation are not in the budget."""
 
 Counts = NDArray[np.int64]
 

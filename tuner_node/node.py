@@ -5,7 +5,7 @@ For each pair of plant and controller, in its namespace:
 Publishes   policy, episode/start, model
 Subscribes  episode/cost, episode/paused, target, model/identified, model/failed, samples
 Serves      ~/pause, ~/resume, ~/stop (std_srvs/Trigger)
-Messages and their order: docs/protocol.md. What it does is in tuner_node.session.
+Messages and their order: docs/protocol.md. The work itself: tuner_node.session.
 """
 
 import contextlib

@@ -19,7 +19,7 @@ from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
-"""Minimum seconds between checkpoints. What a crash loses is computed again, identically."""
+"""Minimum seconds between checkpoints. Work that a crash loses is computed again, identically."""
 CHECKPOINT_SHARE = 0.2
 """Share of the time that writing them may take: with many trajectories one has 100 MB and more."""
 

@@ -2,7 +2,7 @@
 """One training carried out by plant and controller pairs: Training and Dispatcher joined. Pure.
 
 Events of the pairs go to the dispatcher; `advance` takes what it answers, finishes a batch whose
-results are all there, and assigns the next one. What happens is given to `report` as JSON-able rows.
+results are all there, and assigns the next one. Events are given to `report` as JSON-able rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -51,8 +51,8 @@ class Session:
     def stop(self) -> list[PairPublication]:
         """End when the rollouts under way are over; at once in a pause, when none is running.
 
-        What an unfinished batch of them has is dropped, and computed again when the run is continued,
-        identically.
+        The results of an unfinished batch are dropped, and computed again, identically, when the run is
+        continued.
         """
         self.stopping = True
         return self._end() if self.dispatcher.paused else []

@@ -77,8 +77,8 @@ def jit(function: F) -> F:
 def jit_in_closure(function: F) -> F:
     """As `jit`, for functions that a cached function closes over.
 
-    What is closed over is a part of the key on disk. A function has the same one in each process, and
-    what Numba makes of it has not: so the function stays as it is.
+    The variables of a closure are part of its key on disk. A plain function has the same key in every
+    process, a Numba dispatcher does not, so the function itself is returned.
     """
     registered: F = register_jitable(**_PART)(function)
     return registered

@@ -157,7 +157,7 @@ class Context:
     cost : Cost or None
         The whole cost, where the weights and the target do not say it.
     law : Law, optional
-        What theta is the parameters of, with its derivatives where it has them.
+        The law whose parameters theta is, with its derivatives if it has any.
     field_models : FieldModelSettings
         How models of the whole field are fitted and one is chosen.
     refused : array or None

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Calls of an optimiser, possibly a user's: exceptions and results are checked.
 
-What an optimiser of this package raises is its own sentence, and goes through as it is.
+Errors that an optimiser of this package raises are passed on unchanged.
 """
 
 from __future__ import annotations

@@ -293,9 +293,9 @@ def rollouts_to_keep(
 
 
 def none_is_close(records: Sequence[Record], first: Array, close: float) -> bool:
-    """True if no control may be as good as the first law, as far as rollouts tell.
+    """True if the rollouts allow that no control is as good as the first law.
 
-    From the same fields where there are such; true where nothing is known.
+    Rollouts from the same fields are compared if there are any; true if nothing is known.
 
     close: largest share by which no control then costs more.
     """

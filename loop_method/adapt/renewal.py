@@ -132,9 +132,9 @@ def confirmed_fraction(
     components: int = 1,
     periodic: bool = True,
 ) -> tuple[float, Estimate]:
-    """Fraction and change of a `Renewal`, for a law that was made in another way.
+    """Fraction and change of a `Renewal`, for a law that was found in another way.
 
-    What a descent on some of the fields is worth on the others, for which alone it is made here.
+    The descents on some of the fields are made here only to see what they are worth on the others.
     """
     if len(fields) < 2:
         return 1.0, ZERO

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law with an observer on a model of the field between few sensors.
 
-What a rollout began with is the field that its readings tell (`loop_method.models.sensed_smoothing`).
+The initial field of a rollout is estimated from its readings (`loop_method.models.sensed_smoothing`).
 """
 
 from __future__ import annotations

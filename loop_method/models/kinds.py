@@ -159,7 +159,7 @@ def _finite_difference(
             )
             if shape:
                 fit = partial(fit_coarse, shape=shape, **known)
-            # What a ridge holds at zero counts as a part of an unknown; the order is what matters.
+            # An unknown that a ridge holds at zero counts as part of one; only the order matters.
             own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-4 else 1.0)
             kinds.append(Kind(prefix + name, fit, (own, count)))
     return kinds

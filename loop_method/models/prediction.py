@@ -48,9 +48,9 @@ def errors(
 ) -> Array:
     """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
 
-    Of a rollout that ends in values that are not finite, those before count; one without two states
-    that are finite is left out. What noise on every number of the states is expected to have in both
-    sums is subtracted from them: it is no fault of the model.
+    Of a rollout that ends in values that are not finite, those before count; one without two finite
+    states is left out. The expected contribution of measurement noise is subtracted from both sums, as
+    the model is not to blame for it.
     """
     kept = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
     found = np.full(len(kept), float(worst))

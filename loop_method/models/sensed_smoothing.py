@@ -66,7 +66,8 @@ class Smoothing:
     def learned(self, rollouts: Sequence[tuple[Array, Array, float]]) -> Smoothing:
         """With the spread that makes these rollouts likeliest: readings, actions and distance of each.
 
-        What readings do not tell of a field is then as large as it is likely, and not as noise has it.
+        Components of a field that the readings do not determine then have their likely size, not that
+        of the noise.
         """
         problems = [self._problem(*rollout) for rollout in rollouts]
         found = [p.fit(self.shared, p.interpolated(), known=True)[2] for p in problems]

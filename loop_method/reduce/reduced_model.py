@@ -163,8 +163,8 @@ def leading_modes(after: Array, n_s: int, channels: Channels = NUMBERED) -> tupl
     after : (N, n_z) array
         The transpose of Z'.
 
-    A ValueError says so where the states have fewer modes than that, and which channels are the
-    reason. Call it with one LAPACK thread.
+    ValueError if the states have fewer modes than that; it names the channels that are the reason.
+    Call it with one LAPACK thread.
     """
     left, values, _ = linalg.svd(after.T, full_matrices=False)
     rank = numerical_rank(values, *after.shape)

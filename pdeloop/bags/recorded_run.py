@@ -88,7 +88,7 @@ class RecordedRun:
             self._note(
                 f"recorded with another fingerprint of the plant ({episode.cost.plant}; here it is "
                 f"{self._fingerprint}): its parameters or the source of its equation are others. "
-                "What it computes is compared all the same"
+                "The states that it computes are compared nevertheless"
             )
         if not episode.missing:
             self._run_again(episode, where)
