@@ -215,14 +215,16 @@ def synthesised(spectra: Array, found: Array, plans: NDArray[np.void]) -> None:
 
 @cached_njit(*SOURCES)
 def advance(spectra: Array, actions: Array, plans: NDArray[np.void]) -> None:
-    """Advance spectra (M, 2, modes) by a sampling time, in place."""
-    plan = plans[0]
-    w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-    for i in range(len(spectra)):
-        begin(spectra[i], actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
-        for _ in range(plan.steps):
-            integrate(w, d, plan, c, e, plan.tape)
-        from_scratch(spectra[i], plan.x, w, d)
+    """Advance spectra (M, 2, modes) by a sampling time, in place; M/P in a row by each of P plans."""
+    each = len(spectra) // len(plans)
+    for p in range(len(plans)):
+        plan = plans[p]
+        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+        for i in range(p * each, (p + 1) * each):
+            begin(spectra[i], actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
+            for _ in range(plan.steps):
+                integrate(w, d, plan, c, e, plan.tape)
+            from_scratch(spectra[i], plan.x, w, d)
 
 
 @cached_njit(*SOURCES)

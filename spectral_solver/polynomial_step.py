@@ -1,6 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The step of an equation with polynomial nonlinear parts, made ready, with its adjoint."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,8 +112,12 @@ class PolynomialStep:
     def step(self, states: Array, actions: Array) -> Array:
         """The states (M, n_x) a sampling time later under actions (M, n_a)."""
         spectra = self.spectra(states)
-        advance(spectra, _with_constant(actions), self._plans)
+        self.advance(spectra, _with_constant(actions))
         return self.states(spectra)
+
+    def advance(self, spectra: Array, inputs: Array) -> None:
+        """Advance spectra (M, 2, modes) in place; inputs (M, n_a + 1): actions, and a factor of c."""
+        advance(spectra, inputs, self._plans)
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         """(df/dz)^T y, (M, n_x), and (df/da)^T y, (M, n_a), of covectors y (M, n_x)."""
@@ -167,6 +172,21 @@ class PolynomialStep:
             for i, spectrum in enumerate(_complex(spectra)):
                 found[i] = np.fft.irfft(spectrum * self._n_x, self._n_x)
         return found
+
+
+class PolynomialSteps:
+    """Several equations on one grid, each for as many rows of a batch.
+
+    One thread may use it at a time. steps: of each, with as many supports.
+    """
+
+    def __init__(self, steps: Sequence[PolynomialStep]) -> None:
+        self._steps = tuple(steps)  # kept alive: the plans have their addresses
+        self._plans = np.concatenate([step._plans for step in steps])
+
+    def advance(self, spectra: Array, inputs: Array) -> None:
+        """As of `PolynomialStep`: the first rows with the first equation, as many with the next."""
+        advance(spectra, inputs, self._plans)
 
 
 def _with_constant(actions: Array) -> Array:

@@ -49,7 +49,7 @@ class ModelBasedSensed(ModelBasedReadings):
         """In an equation, as long as one reproduces the readings; then in a model of the readings."""
         measured, model = self._measurements(), self._sensed
         if model is not None or self._progress.belief is None:
-            found = sensed_from(self._context, measured, None if model is None else model.shared)
+            found = sensed_from(self._context, measured, model)
             if found is not None:
                 return Belief(*found, 1)
         return believe(self._context, measured)

@@ -19,7 +19,7 @@ from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.laws.observer import Observer
 from loop_method.models.sensed import SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
-from loop_method.models.sensed_smoothing import Smoothing
+from loop_method.models.sensed_smoothing import Smoothing, settled
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
@@ -103,16 +103,18 @@ def fit_rollouts(
     noise: float,
     start: Array | None,
     settings: FieldModelSettings = DEFAULTS,
+    spread: Array | None = None,
 ) -> tuple[Array, Array, float] | None:
     """The fit that reproduces the readings of rollouts, from an earlier equation or from nothing.
 
     The shared unknowns, the initial fields and the error, as of `fit_sensed`; None if neither does.
+    spread: as of `fit_sensed` as well.
     """
     readings, actions, distances = of_rollouts(problem, rollouts)
     for first in (None,) if start is None else (start, None):
         found = fit_sensed(
             *(readings, actions, centres, noise, first, problem.target, distances),
-            settings=settings,
+            *(spread, settings),
         )
         if found[2] <= settings.sensed_reproduced:
             return found
@@ -126,11 +128,11 @@ def can_be_sensed(context: Context) -> bool:
 
 
 def sensed_from(
-    context: Context, records: Sequence[Record], start: Array | None
+    context: Context, records: Sequence[Record], before: SensedModel | None
 ) -> tuple[SensedModel, float] | None:
     """The model that reproduces the newest rollouts, and its error; None if it does not.
 
-    start: the equation that was fitted before, the (12 + n_a,) unknowns.
+    before: the model of earlier rollouts, whose equation and spread the fit starts from.
     """
     sensors, n_a, settings = context.sensors, records[0].actions.shape[1], context.field_models
     problem = ClosedLoopProblem(
@@ -141,7 +143,9 @@ def sensed_from(
     if not chosen:
         return None
     centres = context.actuator_centres(n_a)
-    found = fit_rollouts(problem, chosen, centres, context.noise, start, settings)
+    start, spread = (None, None) if before is None else (before.shared, before.spread)
+    spread = spread if context.noise else None
+    found = fit_rollouts(problem, chosen, centres, context.noise, start, settings, spread)
     if found is None:
         return None
     shared, fields, error = found
@@ -149,27 +153,30 @@ def sensed_from(
     known = list(zip(readings, actions, distances.tolist(), strict=True))
     size = float(np.mean([np.mean(own**2) for own in readings]))
 
-    def learned() -> Smoothing:
+    def learned() -> tuple[Smoothing, Array]:
         # The unpredicted part of a reading is noise to a filter.
         noise = float(np.sqrt(context.noise**2 + error * size))
-        smoothing = Smoothing(shared, centres, noise, context.target, settings=settings)
-        return smoothing.learned(known)
+        smoothing = Smoothing(shared, centres, noise, context.target, spread, settings)
+        smoothing = smoothing.learned(known, fields)
+        assert smoothing.spread is not None
+        return smoothing, smoothing.spread
 
-    smoothing = learned()
+    smoothing, likely = learned()
     # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
     for _ in range(settings.sensed_again if context.noise else 0):
+        if spread is not None and settled(likely, spread, settings):
+            break
         again = fit_sensed(
             *(readings, actions, centres, context.noise, shared, context.target, distances),
-            *(smoothing.spread, settings),
+            *(likely, settings, fields),
         )
         if again[2] > settings.sensed_reproduced:
             break
-        shared, fields, error = again
-        smoothing = learned()
-    assert smoothing.spread is not None
+        (shared, fields, error), spread = again, likely
+        smoothing, likely = learned()
     largest = settings.sensed_extrapolation * float(np.abs(fields).max())
     model = sensed_model(shared, sensors, centres, largest, settings, noise=smoothing.noise)
-    return replace(model, spread=smoothing.spread), error
+    return replace(model, spread=likely), error
 
 
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:

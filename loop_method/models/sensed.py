@@ -10,10 +10,6 @@ unknowns and one for each actuator, however fine the grid. `loop_method.models.s
 
 A sampling time has internal steps, the more the larger the field: a front moves through several grid
 points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
-
-References
-----------
-Lawson, SIAM J. Numer. Anal. 4(3), 1967 (the integrator: Runge-Kutta with the linear part exact).
 """
 
 from __future__ import annotations
@@ -30,6 +26,7 @@ from loop_method.models.base import Arrays, numbers_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import fewer_of, substeps_of
+from spectral_solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
 
@@ -174,8 +171,8 @@ def sensed_model(
         equation.linear,
         symbols[1:],
         np.eye(2),
-        np.fft.irfft(equation.actuators, n).T,
-        np.full(n, equation.constant / n),
+        equation.supports * equation.strengths,
+        np.full(n, equation.constant),
         substeps=substeps,
         fewer=fewer_of(symbols, largest, substeps, settings),
         shared=shared,
@@ -186,10 +183,7 @@ def sensed_model(
 
 
 class SensedEquation:
-    """The equation in Fourier space, for unknowns of any shape (..., 12 + n_a).
-
-    clip: z is cut to it in powers above the first, so that a wrong equation is far off but finite.
-    """
+    """The equation in Fourier space, for unknowns (12 + n_a,)."""
 
     def __init__(
         self,
@@ -197,39 +191,35 @@ class SensedEquation:
         n: int,
         centres: Array,
         settings: FieldModelSettings = DEFAULTS,
-        clip: float = np.inf,
     ) -> None:
-        self.n, waves, self._settings, self._clip = n, np.arange(n // 2 + 1), settings, clip
+        waves, self._settings = np.arange(n // 2 + 1), settings
         derivative = 2j * np.pi * waves
-        self._kept = waves < n // 2
-        derivative[~self._kept] = 0.0
-        symbols = np.zeros((3, *shared.shape[:-1], waves.size), dtype=np.complex128)
+        derivative[waves == n // 2] = 0.0
+        symbols = np.zeros((3, waves.size), dtype=np.complex128)
         for i, (p, j) in enumerate(TERMS):
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
-            value = shared[..., i, None]
             # Fields beyond some size would run away, which rollouts do not.
-            value = np.minimum(value, 0.0) if (p, j) == HIGHEST else value
+            value = min(shared[i], 0.0) if (p, j) == HIGHEST else shared[i]
             symbols[p - 1] += unit * value * derivative**j
         linear, self.square, self.cube = symbols
         # What grows faster would overflow within an episode.
         self.linear = np.minimum(linear.real, settings.sensed_growth) + 1j * linear.imag
-        self._exponentials: dict[int, tuple[Spectrum, Spectrum]] = {}
-        self.constant = n / _TIME * shared[..., COEFFICIENTS - 1]
-        b, x_0, s, w = np.moveaxis(shared[..., COEFFICIENTS:SHARED, None, None], -3, 0) / _TIME
-        b = b + shared[..., SHARED:, None] / _TIME
+        self.constant = float(shared[COEFFICIENTS - 1]) / _TIME
+        b, x_0, s, w = shared[COEFFICIENTS:SHARED] / _TIME
+        self.strengths: Array = b + shared[SHARED:] / _TIME
         n_a = len(centres)
-        own = np.arange(n_a)[:, None]
-        places = centres[:, None] + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
+        own = np.arange(n_a)
+        places = centres + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
         width = (0.5 + w) / n_a
         # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
         shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
-        self.actuators: Spectrum = n * b * shape * np.exp(-2j * np.pi * waves * places)
+        shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])
+        self.supports: Array = np.fft.irfft(shifted, n).T
+        """Of actuators of strength 1, (n, n_a)."""
 
     def substeps(self, sizes: Array) -> NDArray[np.int64]:
-        """Internal steps for fields of these sizes, with the first of the unknowns."""
-        symbols = np.stack(
-            [symbol.reshape(-1, symbol.shape[-1])[0] for symbol in (self.square, self.cube)]
-        )
+        """Internal steps for fields of these sizes."""
+        symbols = np.stack([self.square, self.cube])
         symbols = symbols[:, : 2 * symbols.shape[1] // 3]
         z = sizes[:, None]
         rates = np.abs(2.0 * z * symbols[0]) + np.abs(3.0 * z * z * symbols[1])
@@ -237,43 +227,33 @@ class SensedEquation:
         steps = np.nan_to_num(np.ceil(rates.max(axis=1) / self._settings.reach), nan=most)
         return np.asarray(np.clip(steps, 1, most), dtype=np.int64)
 
-    def force(self, a: Array) -> Spectrum:
-        """The constant, and the effect of the actions (..., n_a)."""
-        force: Spectrum = (a[..., None, :] @ self.actuators)[..., 0, :]
-        force[..., 0] += self.constant
-        return force
+    def compiled(self, substeps: int, supports: Array, clip: float = np.inf) -> PolynomialStep:
+        """The step, with these internal steps and supports, and a constant forcing of 1.
 
-    def step(self, z: Spectrum, force: Spectrum, substeps: int = 1) -> Spectrum:
-        """The field a sampling time later."""
-        h = 1.0 / substeps
-        if substeps not in self._exponentials:
-            half = np.exp(0.5 * h * self.linear)
-            self._exponentials[substeps] = half, half**2
-        half, whole = self._exponentials[substeps]
-        for _ in range(substeps):
-            first = self._rate(z, force)
-            second = self._rate(half * (z + 0.5 * h * first), force)
-            third = self._rate(half * z + 0.5 * h * second, force)
-            fourth = self._rate(whole * z + h * half * third, force)
-            z = whole * z + h / 6.0 * (whole * first + 2.0 * half * (second + third) + fourth)
-        return z
-
-    def _rate(self, z: Spectrum, force: Spectrum) -> Spectrum:
-        """The nonlinear terms, on a grid fine enough for the products."""
-        count = z.shape[-1]
-        field = np.clip(2.0 * np.fft.irfft(z, 2 * self.n), -self._clip, self._clip)
-        square = field * field
-        rate: Spectrum = force + 0.5 * (
-            self.square * np.fft.rfft(square)[..., :count]
-            + self.cube * np.fft.rfft(square * field)[..., :count]
+        clip: z is cut to it in powers above the first, so that a wrong equation is far off but finite.
+        ValueError if the unknowns are not finite.
+        """
+        equation = Polynomials(
+            self.linear,
+            np.stack([self.square, self.cube]),
+            np.eye(2),
+            supports,
+            np.ones(len(supports)),
+            substeps,
+            clip,
         )
-        rate *= self._kept
-        return rate
+        return PolynomialStep(equation)
 
 
-def spectrum(fields: Array, n: int) -> Spectrum:
-    """The transform on n points of Fourier coefficients (..., 33)."""
-    z = np.zeros((*fields.shape[:-1], n // 2 + 1), dtype=np.complex128)
-    z[..., : WAVES + 1] = n * fields[..., : WAVES + 1]
-    z[..., 1 : WAVES + 1] += 1j * n * fields[..., WAVES + 1 :]
-    return z
+def field_of(coefficients: Array, n: int) -> Array:
+    """The fields on n points of Fourier coefficients (..., 33)."""
+    z = np.zeros((*coefficients.shape[:-1], n // 2 + 1), dtype=np.complex128)
+    z[..., : WAVES + 1] = coefficients[..., : WAVES + 1]
+    z[..., 1 : WAVES + 1] += 1j * coefficients[..., WAVES + 1 :]
+    return n * np.fft.irfft(z, n)
+
+
+def coefficients_of(fields: Array) -> Array:
+    """The Fourier coefficients (..., 33) of fields (..., n) on a grid."""
+    z = np.fft.rfft(fields)[..., : WAVES + 1] / fields.shape[-1]
+    return np.concatenate([z.real, z.imag[..., 1:]], axis=-1)

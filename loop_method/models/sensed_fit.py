@@ -33,7 +33,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import TERMS, grid_points, spectrum
+from loop_method.models.sensed import TERMS, coefficients_of, field_of, grid_points
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -54,6 +54,7 @@ def fit_sensed(
     distances: Array | None = None,
     spread: Array | None = None,
     settings: FieldModelSettings = DEFAULTS,
+    near: Array | None = None,
 ) -> tuple[Array, Array, float]:
     """Fit the equation and the initial fields of rollouts.
 
@@ -76,6 +77,8 @@ def fit_sensed(
         size suggest if there are none.
     settings : FieldModelSettings
         The constants of the fit, `sensed_`.
+    near : (rollouts, n) array, optional
+        Initial fields that an earlier fit of the same rollouts found with `start`.
 
     Returns
     -------
@@ -100,16 +103,19 @@ def fit_sensed(
         )
         error, shared, fields[pair] = _first_guess(few, settings)
         if not np.isfinite(error):
-            return shared, np.fft.irfft(spectrum(fields, n), n), np.inf
+            return shared, field_of(fields, n), np.inf
     else:
         shared = start
-    _, _, known = problem.fit(shared, fields, known=True)
+    if near is None:
+        _, _, known = problem.fit(shared, fields, known=True)
+    else:
+        known = coefficients_of(near)
     whole = [y.shape[1]] * _WHOLE
     if problem.error(shared, known) <= settings.sensed_reproduced:
         error, shared, fields = problem.fit(shared, known, lengths=whole)
     else:  # the equation does not hold for the other rollouts: nothing is near enough for a whole fit
         error, shared, fields = problem.fit(shared, fields)
-    return shared, np.fft.irfft(spectrum(fields, n), n), max(error - problem.noise, 0.0)
+    return shared, field_of(fields, n), max(error - problem.noise, 0.0)
 
 
 def _first_guess(

@@ -12,12 +12,12 @@ from loop_method.models.sensed import (
     COEFFICIENTS,
     SHARED,
     WAVES,
-    SensedEquation,
+    coefficients_of,
     grid_points,
     interpolated,
-    spectrum,
     unknowns,
 )
+from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # The part of rollouts that the fields of a known equation are fitted to before the whole.
@@ -62,13 +62,14 @@ class SensedProblem:
         self._n = grid_points(sensors)
         waves = np.arange(self._n // 2 + 1)
         places = (np.arange(sensors) + 0.5) / sensors
-        # Of a transform: the field at the sensors.
+        # Of the two planes of a spectrum: the field at the sensors, and its mean square.
         twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
-        self._read = np.exp(2j * np.pi * waves[:, None] * places) * (twice / self._n)[:, None]
+        phase = 2 * np.pi * waves[:, None] * places
+        self._read = np.vstack([np.cos(phase), -np.sin(phase)]) * np.tile(twice, 2)[:, None]
         self._waves = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
-        # Times |transform|^2: the mean square of the field.
-        self._mean_square = twice / self._n**2
-        self._target = np.fft.rfft(interpolated(target))
+        self._mean_square = np.tile(twice, 2)
+        aim = np.fft.rfft(interpolated(target)) / self._n
+        self._target = np.concatenate([aim.real, aim.imag])
         self._distances = distances
 
     def interpolated(self) -> Array:
@@ -77,8 +78,7 @@ class SensedProblem:
         places = (np.arange(sensors) + 0.5) / sensors
         grid = np.arange(self._n) / self._n
         fields = np.stack([np.interp(grid, places, y[0], period=1.0) for y in self.y])
-        z = np.fft.rfft(fields)[:, : WAVES + 1] / self._n
-        return np.hstack([z.real, z.imag[:, 1:]])
+        return coefficients_of(fields)
 
     @property
     def lengths(self) -> list[int]:
@@ -132,8 +132,8 @@ class SensedProblem:
             residual, J = self._linearised(shared, fields, steps, known=False)
         if not np.isfinite(J).all():
             return before
-        variance = max(float(residual @ residual), self.noise) / residual.size
-        inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)))
+        variance = max(float(np.sum(residual**2)), self.noise) / residual.size
+        inverse = np.linalg.inv(self._normal(residual, J, steps)[0])
         own = variance * np.diag(inverse)[: self.shared]
         found: Array = variance / np.maximum(shared**2 + own, np.finfo(float).tiny)
         return found
@@ -146,10 +146,10 @@ class SensedProblem:
         """Those of the coefficients of the field of the only rollout, (33,), given its readings."""
         steps = self.y.shape[1]
         with np.errstate(over="ignore", invalid="ignore"):
-            J = self._linearised(shared, fields, steps, known=True)[1]
+            residual, J = self._linearised(shared, fields, steps, known=True)
         if not np.isfinite(J).all():
-            return np.zeros(len(J))
-        inverse = np.linalg.inv(J @ J.T + np.diag(self._ridge(steps)[self.shared :]))
+            return np.zeros(len(self._waves))
+        inverse = np.linalg.inv(self._normal(residual, J, steps)[0])
         found: Array = self._weight(steps) * np.diag(inverse)
         return found
 
@@ -166,7 +166,7 @@ class SensedProblem:
 
     def _error(self, shared: Array, fields: Array, steps: int) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            residuals = self._residuals(shared[None], fields[None], steps)
+            residuals = self._residuals(shared, fields[None], steps)
             error = float(np.sum(residuals**2))
         return error if np.isfinite(error) else np.inf
 
@@ -185,7 +185,7 @@ class SensedProblem:
 
         def objective(x: Array) -> float:
             shared, fields = parts(x)
-            residual = self._residuals(shared[None], fields[None], steps)
+            residual = self._residuals(shared, fields[None], steps)
             total = float(np.sum(residual**2) + np.sum(ridge * x * x))
             return total if np.isfinite(total) else np.inf
 
@@ -198,8 +198,8 @@ class SensedProblem:
                 residual, J = self._linearised(*parts(x), steps, known)
                 if not np.isfinite(J).all():
                     break
-                H, g = J @ J.T, J @ residual + ridge * x
-                H[np.diag_indices(x.size)] += ridge
+                H, g = self._normal(residual, J, steps)
+                g += ridge * x
                 before = now
                 while damping < _MOST_DAMPING:
                     damped = H + np.diag(damping * np.diag(H) + 1e-12)
@@ -238,27 +238,33 @@ class SensedProblem:
         """Interval between compared steps, for a given number of steps."""
         return -(-steps // self._settings.sensed_compared)
 
-    def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
-        """Errors for unknowns (P, 12 + n_a) and (P, R, 33), as shares of the whole: (P, R, errors).
+    def _residuals(
+        self, shared: Array, fields: Array, steps: int, difference: float = 0.0
+    ) -> Array:
+        """Errors for unknowns (12 + n_a,) and fields (P, R, 33), as shares of the whole.
 
-        Those of the readings and, over whole rollouts, that of the distance.
+        (P, R, errors): those of the readings and, over whole rollouts, that of the distance. With a
+        difference, P is followed by the first fields with each of the unknowns less by it.
         """
-        stride = self._stride(steps)
-        equation = SensedEquation(
-            *(shared[:, None], self._n, self._centres, self._settings, self._clip)
-        )
-        substeps = equation.substeps(self._sizes).tolist()
-        z = spectrum(fields, self._n)
-        residuals = []
-        distance = np.zeros(z.shape[:2])
-        for k in range(steps):
+        stride, own = self._stride(steps), (self._settings, self._clip, difference)
+        flow = SensedFlow(shared, self._n, self._centres, self._sizes, *own)
+        compared = len(range(0, steps, stride))
+        rows, (rollouts, _, sensors) = len(fields), self.y.shape
+        rows += self.shared if difference else 0
+        if not flow.finite:
+            return np.full((rows, rollouts, compared * sensors), np.inf)
+        found = np.empty((rows, rollouts, compared, sensors))
+        told = steps == self.y.shape[1] and not np.isnan(self._distances).all()
+        distance = np.zeros((rows, rollouts))
+        for k, z in enumerate(flow.path(fields, self.a, steps)):
+            z = z.reshape(rows, rollouts, -1)
             if k % stride == 0:
-                residuals.append((z @ self._read).real - self.y[:, k])
-            distance += np.abs(z - self._target) ** 2 @ self._mean_square
-            z = equation.step(z, equation.force(self.a[:, k]), substeps[k])
-        whole: Array = np.concatenate(residuals, axis=2)
+                found[:, :, k // stride] = z @ self._read - self.y[:, k]
+            if told:
+                distance += (z - self._target) ** 2 @ self._mean_square
+        whole = found.reshape(rows, rollouts, -1)
         whole /= self._size * np.sqrt(whole[0].size)
-        if steps < self.y.shape[1]:
+        if not told:
             return whole
         off = distance / (steps * self._distances) - 1.0
         off = np.where(np.isnan(self._distances), 0.0, off)
@@ -268,18 +274,29 @@ class SensedProblem:
     def _linearised(
         self, shared: Array, fields: Array, steps: int, known: bool
     ) -> tuple[Array, Array]:
-        """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
-        rollouts, own = fields.shape
-        # Backwards: the highest term has no effect above zero, where it starts.
-        common, difference = 0 if known else self.shared, self._settings.sensed_difference
-        count = 1 + common + own
-        all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
-        all_shared[1 : 1 + common] -= difference * np.eye(self.shared)[:common]
-        all_fields[1 + common :] -= difference * np.eye(own)[:, None]
-        residuals = self._residuals(all_shared, all_fields, steps)
+        """Residuals (R, errors) of the rollouts and the derivatives of each, (R, unknowns, errors).
+
+        The unknowns are the shared ones, if they are not known, and the rollout's own field.
+        """
+        own, difference = fields.shape[1], self._settings.sensed_difference
+        nearby = np.tile(fields, (1 + own, 1, 1))
+        nearby[1:] -= difference * np.eye(own)[:, None]
+        residuals = self._residuals(shared, nearby, steps, 0.0 if known else difference)
         changes = (residuals[0] - residuals[1:]) / difference
-        J = np.zeros((common + rollouts * own, *residuals[0].shape))
-        J[:common] = changes[:common]
-        for m in range(rollouts):
-            J[common + m * own : common + (m + 1) * own, m] = changes[common:, m]
-        return residuals[0].ravel(), J.reshape(len(J), -1)
+        # The shared ones first.
+        return residuals[0], np.concatenate([changes[own:], changes[:own]]).swapaxes(0, 1)
+
+    def _normal(self, residual: Array, J: Array, steps: int) -> tuple[Array, Array]:
+        """Matrix and right-hand side J r of the normal equations, the matrix with its ridge.
+
+        A field moves its own rollout alone.
+        """
+        own = len(self._waves)
+        common = J.shape[1] - own
+        ridge = self._ridge(steps)[self.shared - common :]
+        H, g = np.diag(ridge), np.zeros(len(ridge))
+        for m, (r, part) in enumerate(zip(residual, J, strict=True)):
+            rows = np.r_[:common, common + m * own : common + (m + 1) * own]
+            H[np.ix_(rows, rows)] += part @ part.T
+            g[rows] += part @ r
+        return H, g

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import WAVES, grid_points, spectrum
+from loop_method.models.sensed import WAVES, coefficients_of, field_of, grid_points
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -60,20 +60,31 @@ class Smoothing:
         problem = self._problem(readings, actions, distance)
         error, _, fields = problem.fit(self.shared, problem.interpolated(), known=True)
         n = grid_points(readings.shape[1])
-        field: Array = np.fft.irfft(spectrum(fields, n), n)[0]
+        field: Array = field_of(fields, n)[0]
         return field, max(error - problem.noise, 0.0)
 
-    def learned(self, rollouts: Sequence[tuple[Array, Array, float]]) -> Smoothing:
+    def learned(
+        self, rollouts: Sequence[tuple[Array, Array, float]], near: Array | None = None
+    ) -> Smoothing:
         """With the spread that makes these rollouts likeliest: readings, actions and distance of each.
 
         Components of a field that the readings do not determine then have their likely size, not that
         of the noise.
+        near (rollouts, n): initial fields that an earlier fit of the rollouts found with the equation.
+        The iterations start from the spread, if there is one.
         """
         problems = [self._problem(*rollout) for rollout in rollouts]
-        found = [p.fit(self.shared, p.interpolated(), known=True)[2] for p in problems]
-        spread: Array = np.mean([problem.suggested for problem in problems], axis=0)
+        if near is None:
+            found = [p.fit(self.shared, p.interpolated(), known=True)[2] for p in problems]
+        else:
+            fields = coefficients_of(near)[:, None]
+            found = [p.refined(self.shared, x) for p, x in zip(problems, fields, strict=True)]
+        spread = self.spread
+        if spread is None:
+            spread = np.mean([problem.suggested for problem in problems], axis=0)
         settings = self.settings
         for _ in range(settings.sensed_learning):
+            before = spread
             size, told = np.zeros(len(spread)), np.zeros(len(spread))
             for problem, fields in zip(problems, found, strict=True):
                 size += fields[0] ** 2
@@ -83,6 +94,8 @@ class Smoothing:
             for i, problem in enumerate(problems):
                 problem.spread = spread
                 found[i] = problem.refined(self.shared, found[i])
+            if settled(spread, before, settings):
+                break
         return replace(self, spread=spread)
 
     def _problem(self, readings: Array, actions: Array, distance: float) -> SensedProblem:
@@ -95,6 +108,11 @@ class Smoothing:
         )
         problem.spread = self.spread
         return problem
+
+
+def settled(spread: Array, before: Array, settings: FieldModelSettings) -> bool:
+    """Whether a spread is as good as the one before."""
+    return bool(np.linalg.norm(spread - before) <= settings.sensed_settled * np.linalg.norm(before))
 
 
 def _falling(size: Array, told: Array, least: float) -> Array:

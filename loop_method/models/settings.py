@@ -211,7 +211,12 @@ class FieldModelSettings(Settings):
     sensed_field_wave: float = setting(
         4.0, "wavenumber beyond which both become stricter, with its square", 0.1, 1e3
     )
-    sensed_learning: int = setting(5, "iterations towards the most likely spread of waves", 0, 100)
+    sensed_learning: int = setting(
+        5, "maximum number of iterations towards the most likely spread of waves", 0, 100
+    )
+    sensed_settled: float = setting(
+        0.05, "relative change of this spread below which nothing is iterated or fitted again", 0, 1
+    )
     sensed_least_told: float = setting(
         0.05, "minimum share of a coefficient that a rollout counts as determined", 1e-6, 1
     )

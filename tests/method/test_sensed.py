@@ -25,6 +25,7 @@ from loop_method.models.sensed import (
     unknowns,
 )
 from loop_method.models.sensed_fit import fit_sensed
+from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
@@ -201,16 +202,40 @@ def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() 
     shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
     n, centres = grid_points(16), np.array([0.5])
     equation, x = SensedEquation(shared, n, centres), np.arange(n) / n
-    fine = coarse = np.fft.rfft(1.0 / np.cosh((x - 0.5) / 0.08))
-    force, largest = np.zeros(n // 2 + 1, complex), np.ones(1)
+    field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
     (substeps,) = equation.substeps(largest)
     assert 1 < substeps < 64 and equation.substeps(0.01 * largest) == 1
-    for _ in range(10):
-        fine = equation.step(fine, force, 64)
-        coarse = equation.step(coarse, force, int(substeps))
-    exact, found = (np.fft.irfft(z, n) for z in (fine, coarse))
+
+    def after(substeps: int) -> Array:
+        step = equation.compiled(substeps, equation.supports)
+        z = step.spectra(field)
+        for _ in range(10):
+            step.advance(z, np.zeros((1, 2)))
+        return step.states(z)
+
+    exact, found = after(64), after(int(substeps))
     assert np.abs(np.diff(exact)).max() > 0.1  # a front
     np.testing.assert_allclose(found, exact, atol=1e-2)
+
+
+def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
+    rng = np.random.default_rng(2)
+    centres, n, T, R = _equally_spaced(3), grid_points(SENSORS), 6, 2
+    shared = rng.standard_normal(unknowns(3))
+    fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
+    sizes = np.linspace(3.0, 0.1, T)
+
+    def last(unknowns: Array, fields: Array, difference: float) -> Array:
+        flow = SensedFlow(unknowns, n, centres, sizes, DEFAULTS, 10.0, difference)
+        found = [z.copy() for z in flow.path(fields, actions, T)]
+        return found[-1]
+
+    together = last(shared, fields, 0.5)
+    assert len(together) == len(fields) + len(shared)
+    np.testing.assert_array_equal(together[:2], last(shared, fields, 0.0))
+    for own, change in zip(together[2:], 0.5 * np.eye(len(shared)), strict=True):
+        expected = last(shared - change, fields[:1], 0.0)[0]
+        np.testing.assert_allclose(own, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_the_burgers_equation_is_found_from_fronts() -> None:
@@ -256,9 +281,11 @@ def test_readings_that_no_equation_explains_are_given_up_early() -> None:
     simulated = []
 
     class Counted(SensedProblem):
-        def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
+        def _residuals(
+            self, shared: Array, fields: Array, steps: int, difference: float = 0.0
+        ) -> Array:
             simulated.append(steps)
-            return super()._residuals(shared, fields, steps)
+            return super()._residuals(shared, fields, steps, difference)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "SensedProblem", Counted)
