@@ -32,8 +32,7 @@ Spectrum = NDArray[np.complex128]
 
 # p and j of the terms; 1 is added for the constant.
 TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
-HIGHEST = (3, 0)
-"""The term that bounds large fields: it never drives them on."""
+_DIFFUSION, _HIGHEST = TERMS.index((1, 2)), TERMS.index((3, 0))
 COEFFICIENTS = len(TERMS) + 1
 # b, x_0, s and w.
 _ACTUATORS = 4
@@ -52,6 +51,13 @@ _POINTS = 64
 def unknowns(n_a: int) -> int:
     """Number of unknowns that all rollouts share."""
     return SHARED + n_a
+
+
+def well_posed(shared: Array) -> Array:
+    """The nearest unknowns whose short waves do not grow and whose large fields are not driven on."""
+    found = shared.copy()
+    found[_DIFFUSION], found[_HIGHEST] = max(shared[_DIFFUSION], 0.0), min(shared[_HIGHEST], 0.0)
+    return found
 
 
 def grid_points(sensors: int) -> int:
@@ -198,9 +204,7 @@ class SensedEquation:
         symbols = np.zeros((3, waves.size), dtype=np.complex128)
         for i, (p, j) in enumerate(TERMS):
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
-            # Fields beyond some size would run away, which rollouts do not.
-            value = min(shared[i], 0.0) if (p, j) == HIGHEST else shared[i]
-            symbols[p - 1] += unit * value * derivative**j
+            symbols[p - 1] += unit * shared[i] * derivative**j
         linear, self.square, self.cube = symbols
         # What grows faster would overflow within an episode.
         self.linear = np.minimum(linear.real, settings.sensed_growth) + 1j * linear.imag

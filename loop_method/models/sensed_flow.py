@@ -56,7 +56,6 @@ class SensedFlow:
         changes = np.zeros((1, shared.size))
         if difference:
             changes = np.vstack([changes, difference * np.eye(shared.size)])
-        # Backwards: the highest term has no effect above zero, where it starts.
         equations = [SensedEquation(shared - own, n, centres, settings) for own in changes]
         first, self._terms = equations[0], equations[1 : 1 + len(TERMS)]
         self.finite = all(

@@ -16,6 +16,7 @@ from loop_method.models.sensed import (
     grid_points,
     interpolated,
     unknowns,
+    well_posed,
 )
 from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
@@ -204,6 +205,8 @@ class SensedProblem:
                 while damping < _MOST_DAMPING:
                     damped = H + np.diag(damping * np.diag(H) + 1e-12)
                     moved = x - np.linalg.solve(damped, g)
+                    if not known:
+                        moved[: self.shared] = well_posed(moved[: self.shared])
                     value = objective(moved)
                     if value < now:
                         x, now = moved, value

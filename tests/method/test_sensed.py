@@ -275,6 +275,19 @@ def test_what_a_part_of_a_rollout_does_not_determine_may_come_back_over_a_longer
     assert ridges(12, 1e6)[dispersion] > 2.0 * ridges(12, 0.0)[dispersion]
 
 
+def test_noise_does_not_make_short_waves_grow() -> None:
+    """The readings are noise: a fit may only take it for fields of a well-posed equation."""
+    rng = np.random.default_rng(1)
+    readings, actions = rng.standard_normal((1, 20, 4)), rng.standard_normal((1, 20, 2))
+    known = np.zeros(4), np.full(1, np.nan)
+    problem = SensedProblem(readings, actions, _equally_spaced(2), 0.1, *known)
+    with threadpool_limits(1):
+        shared = problem.fit(np.zeros(problem.shared), problem.interpolated())[1]
+    assert shared[TERMS.index((1, 2))] >= 0.0 >= shared[TERMS.index((3, 0))]
+    growth = SensedEquation(shared, grid_points(4), _equally_spaced(2)).linear.real
+    assert growth[-2] <= growth[0]
+
+
 def test_readings_that_no_equation_explains_are_given_up_early() -> None:
     rng = np.random.default_rng(0)
     readings, actions = rng.standard_normal((2, 40, 4)), rng.standard_normal((2, 40, 2))
