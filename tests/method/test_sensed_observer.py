@@ -263,6 +263,6 @@ def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> Non
 
 
 def test_a_change_is_that_of_the_fields_from_which_both_laws_are_finite() -> None:
-    change, deviation = gained(np.array([1.0, np.inf, 3.0]), np.array([2.0, np.inf, 5.0]))
-    assert change == -1.5 and deviation == pytest.approx(0.5)
-    assert np.isnan(gained(np.array([np.inf]), np.array([1.0]))[0])
+    change = gained(np.array([1.0, np.inf, 3.0]), np.array([2.0, np.inf, 5.0]))
+    assert change.value == -1.5 and change.error == pytest.approx(0.5)
+    assert np.isnan(gained(np.array([np.inf]), np.array([1.0])).value)
