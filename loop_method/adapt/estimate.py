@@ -61,12 +61,13 @@ class Estimate:
     def __sub__(self, other: Estimate) -> Estimate:
         return self + Estimate(-other.value, other.error, other.degrees)
 
-    def is_negative(self, confidence: float) -> bool:
+    def is_negative(self, confidence: float, times: float = 1.0) -> bool:
         """True if the value is below zero by more than chance.
 
-        confidence: the level, as the standard errors of a normal distribution.
+        confidence: the level, as the standard errors of a normal distribution; times: by how many times
+        as much.
         """
-        return self.value + errors_for(confidence, self.degrees) * self.error < 0.0
+        return self.value + times * errors_for(confidence, self.degrees) * self.error < 0.0
 
 
 ZERO = Estimate()

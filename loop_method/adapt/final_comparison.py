@@ -22,11 +22,11 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, State
 from loop_method.adapt.belief import Belief
-from loop_method.adapt.estimate import ZERO, Estimate
+from loop_method.adapt.estimate import ZERO, Estimate, mean_of
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.progress import fraction_and_change, held_out
 from loop_method.adapt.renewal import confirmed_fraction
-from loop_method.adapt.settings import ImprovementSettings
+from loop_method.adapt.settings import GaussNewtonSettings, ImprovementSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -121,10 +121,17 @@ class Comparison:
         )
         return choose(evidence, self.base, confidence)
 
-    def without_rollouts(self, laws: Laws) -> Verdict:
-        """The law to return where there is nothing to roll out, or nothing left for it."""
+    def without_rollouts(self, laws: Laws, gain: Estimate | None) -> Verdict:
+        """The law to return where there is nothing to roll out, or nothing left for it.
+
+        gain: that of the steps.
+        """
         if np.array_equal(self.law, laws[self.base]):
             return Verdict(self.base, 0.0, 0.0, NO_OTHER)
+        if self.belief is None and gain is not None and gain.value < 0.0:
+            size = gain.value, gain.error
+            words = f"{size_of(ADAPTED, self.base, *size)}, on the fields of the steps"
+            return Verdict(ADAPTED, *size, words)
         if self.belief is None:
             return Verdict(ADAPTED, 0.0, 0.0, "too few rollouts are left to compare it on others")
         change = self.change.value, self.change.error
@@ -290,6 +297,23 @@ def rollouts_to_keep(
     if count < LEAST:
         count, laws = min(settings.judging, spare // 4), 2
     return count * laws if count >= LEAST else 0
+
+
+def gain_of_steps(records: Sequence[Record], laws: Laws, base: str) -> Estimate | None:
+    """What the found law costs more than `base` by the rollouts of a search; None of too few."""
+    own, before = (
+        np.array([r.cost for r in records if np.array_equal(r.policy, laws[name])])
+        for name in (ADAPTED, base)
+    )
+    few = min(len(own), len(before)) < LEAST or np.array_equal(laws[ADAPTED], laws[base])
+    if few or not np.isfinite([*own, *before]).all():
+        return None
+    return mean_of(own) - mean_of(before)
+
+
+def gain_is_clear(gain: Estimate | None, settings: GaussNewtonSettings) -> bool:
+    """True if a gain is beyond doubt although the steps were chosen by the same rollouts."""
+    return gain is not None and gain.is_negative(settings.confidence, settings.clearly)
 
 
 def none_is_close(records: Sequence[Record], first: Array, close: float) -> bool:

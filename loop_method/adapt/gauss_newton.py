@@ -17,8 +17,7 @@ step
 4. after an acceptance replaces the oldest field, so that the policy does not fit M fields, or adds one
    if the step was small,
 
-and the last rollouts decide what is returned (`final_comparison`). Sources and equations:
-docs/optimizers.md.
+and the last rollouts decide what is returned (`final_comparison`). Sources: docs/optimizers.md.
 """
 
 from __future__ import annotations
@@ -45,8 +44,11 @@ from loop_method.adapt.base import (
     require_positive,
     require_results,
 )
+from loop_method.adapt.estimate import Estimate
 from loop_method.adapt.final_comparison import (
     Comparison,
+    gain_is_clear,
+    gain_of_steps,
     none_is_close,
     on_same_fields,
     rollouts_to_keep,
@@ -116,8 +118,7 @@ class GaussNewton(Optimizer):
         )
         self._proposer = Proposer(context, self._now.policy, settings)
         self._sensors, self._context = context.sensors, context
-        # With sensors the first law is compared with no control by the rollouts of the search.
-        self._verdict = verdict and not context.sensors
+        self._verdict = verdict
         # One field says little, above all with few sensors or of a chaotic plant: where it spoke
         # against the first law, that law has to beat no control on all of them.
         contested = bool(context.sensors) or context.refused is not None
@@ -190,8 +191,6 @@ class GaussNewton(Optimizer):
         row: Row = {"diverged": sum(not r.usable for r in results)}
         if self._comparison is not None:
             self._decide(results, row)
-            if self._records.count < self._budget:
-                row["early"] = self.early
             return row
         missing = now.missing
         if missing.size:
@@ -216,8 +215,6 @@ class GaussNewton(Optimizer):
             self._propose(row)
         if self._verdict and self.done:
             self._finish(row)
-        if self.done and self._records.count < self._budget:
-            row["early"] = self.early
         return row
 
     def state(self) -> State:
@@ -272,14 +269,11 @@ class GaussNewton(Optimizer):
             now.accepted = False
         elif ran.all():
             fall = incumbent - trial
-            if not contest and fall > settings.good_ratio * now.fall:
-                now.damping = max(now.damping / settings.damping_fall, settings.least_damping)
-            elif not contest and fall <= settings.poor_ratio * now.fall:
-                now.damping *= settings.damping_rise
-            now.policy = now.candidate.copy()
-            now.compared, now.incumbents = now.incumbents, now.trials.copy()
-            now.accepted = True
-            self._renew_fields(fall < settings.small_gain * incumbent)
+            if not contest:
+                now.damp(fall, settings)
+            now.accept()
+            most = 2 * settings.fields if fall < settings.small_gain * incumbent else 0
+            now.renew_fields(self._left, most)
         else:
             return False
         row["accepted"] = now.accepted
@@ -288,22 +282,6 @@ class GaussNewton(Optimizer):
         now.trials[:] = NONE
         now.proposed = False
         return True
-
-    def _renew_fields(self, small: bool) -> None:
-        """A fresh field in place of the oldest, or in addition to it after a small step."""
-        now = self._now
-        grow = small and len(now.fields) < 2 * self._settings.fields
-        if self._left <= len(now.fields) + grow:
-            return
-        if grow:
-            now.fields = np.append(now.fields, now.fields.max() + 1)
-            now.incumbents, now.trials, now.compared = (
-                np.append(stamps, NONE) for stamps in (now.incumbents, now.trials, now.compared)
-            )
-        else:
-            oldest = int(np.argmin(now.fields))
-            now.fields[oldest] = now.fields.max() + 1
-            now.compared[oldest] = now.incumbents[oldest] = NONE
 
     @property
     def _laws(self) -> dict[str, Array]:
@@ -319,13 +297,18 @@ class GaussNewton(Optimizer):
     def _left(self) -> int:
         """Rollouts that are left for the search."""
         kept = 0
-        if self._verdict:
+        clear = self._sensors and gain_is_clear(self._gain, self._settings)
+        if self._verdict and not clear:
             known = self._context.measured
             opposed = self._base == FIRST and not self._contested
             close = opposed and none_is_close(known, self._first, self._settings.close)
             step, whole = 2 * self._settings.fields, self._now.whole
             kept = rollouts_to_keep(self._budget, step, whole, 2 + close, self._settings)
         return self._budget - kept - self._records.count
+
+    @property
+    def _gain(self) -> Estimate | None:
+        return gain_of_steps(self._records.all(), self._laws, self._base)
 
     def _finish(self, row: Row) -> None:
         """After the last step: the rollouts that decide which law is returned."""
@@ -334,7 +317,6 @@ class GaussNewton(Optimizer):
         fresh = (self.next_field + np.arange(left)).tolist()
         if now.believed:
             rng = np.random.default_rng([self._seed, _CONFIRMING])
-            # One thread: a threaded LAPACK rounds differently for another number of threads.
             with threadpool_limits(limits=1):
                 comparison = self._proposer.comparison(
                     *(self._laws, known, now.believed, fresh[: self._settings.judging], rng)
@@ -352,7 +334,7 @@ class GaussNewton(Optimizer):
             self._end(row, Verdict(comparison.base, 0.0, 0.0, reason))
         else:
             now.policy = comparison.law
-            self._end(row, comparison.without_rollouts(self._laws))
+            self._end(row, comparison.without_rollouts(self._laws, self._gain))
 
     def _decide(self, results: Sequence[RolloutResult], row: Row) -> None:
         """Choose between first law, found law and no control."""
@@ -380,6 +362,8 @@ class GaussNewton(Optimizer):
         now.policy, now.ended = self._laws[verdict.chosen].copy(), True
         row["chosen"] = verdict.chosen
         row["reason"] = f"{now.reason}; {verdict.reason}" if now.reason else verdict.reason
+        if self._records.count < self._budget:
+            row["early"] = self.early
         if verdict.change:
             row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import State
+from loop_method.adapt.settings import GaussNewtonSettings
 
 Stamps = NDArray[np.int64]
 NONE = -1
@@ -80,6 +81,37 @@ class SearchState:
         if len({given[name].size for name in STAMPS}) > 1:
             raise ValueError("the fields of the checkpoint do not add up.")
         return SearchState(**given)
+
+    def damp(self, fall: float, settings: GaussNewtonSettings) -> None:
+        """Another damping after a step that gained `fall`."""
+        if fall > settings.good_ratio * self.fall:
+            self.damping = max(self.damping / settings.damping_fall, settings.least_damping)
+        elif fall <= settings.poor_ratio * self.fall:
+            self.damping *= settings.damping_rise
+
+    def accept(self) -> None:
+        """The candidate becomes the incumbent."""
+        self.policy = self.candidate.copy()
+        self.compared, self.incumbents = self.incumbents, self.trials.copy()
+        self.accepted = True
+
+    def renew_fields(self, left: int, most: int) -> None:
+        """A fresh field in place of the oldest, or in addition to it where there are fewer than `most`.
+
+        left: rollouts for the next step, which has to be possible.
+        """
+        grow = len(self.fields) < most
+        if left <= len(self.fields) + grow:
+            return
+        if grow:
+            self.fields = np.append(self.fields, self.fields.max() + 1)
+            self.incumbents, self.trials, self.compared = (
+                np.append(stamps, NONE) for stamps in (self.incumbents, self.trials, self.compared)
+            )
+        else:
+            oldest = int(np.argmin(self.fields))
+            self.fields[oldest] = self.fields.max() + 1
+            self.compared[oldest] = self.incumbents[oldest] = NONE
 
     @property
     def missing(self) -> Stamps:

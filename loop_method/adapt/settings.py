@@ -141,6 +141,13 @@ class GaussNewtonSettings(ImprovementSettings):
         1.0,
         100.0,
     )
+    clearly: float = setting(
+        2.0,
+        "with few sensors, multiple of the standard errors of the verdict at which the rollouts of the "
+        "steps themselves decide",
+        1.0,
+        100.0,
+    )
     small_gain: float = setting(
         0.02, "share of the cost below which an accepted step adds a field", 0.0, 1.0
     )

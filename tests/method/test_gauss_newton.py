@@ -24,6 +24,7 @@ from loop_method.adapt import (
 )
 from loop_method.adapt.base import Record
 from loop_method.adapt.estimate import Estimate
+from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.design.lqt import track
@@ -275,6 +276,40 @@ def test_with_sensors_the_first_law_has_to_beat_no_control_on_all_fields(
         row = optimizer.tell([replace(plant.run(asked.policy, asked.field_seed), cost=cost)])
     assert row["accepted"] is better and row["rollouts"] == 3 + rollouts
     assert same_bits(optimizer.policy, 0.6 * first if better else np.zeros_like(first))
+
+
+@pytest.mark.parametrize(("gain", "elsewhere"), [(0.5, -1.0), (0.02, 0.02), (0.02, -0.1)])
+def test_with_sensors_the_law_found_is_compared_on_fresh_fields_unless_its_gain_is_clear(
+    gain: float, elsewhere: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rollouts that a clear gain saves make another step, here one back, which is rejected."""
+    plant = Plant()
+    first, found = 0.6 * plant.best, 0.7 * plant.best
+    steps = (Proposal(policy, 1.0, 1, 0.0, 0.1) for policy in (found, first))
+    monkeypatch.setattr(Proposer, "propose", lambda *_, **__: next(steps, None))
+    context = replace(plant.context(), sensors=N_S)
+    optimizer = make(plant, first, rollouts=14, context=context)
+    fields: list[list[int]] = []
+    while not optimizer.done:
+        again = make(plant, first, rollouts=14, context=context)
+        again.restore(optimizer.state())
+        asked, share = again.ask(), elsewhere if again._comparison else gain
+        fields.append([rollout.field_seed for rollout in asked])
+        results = []
+        for rollout, result in zip(asked, measure(plant, asked), strict=True):
+            own = 5.0 - 5.0 * share * same_bits(rollout.policy, found)
+            cost = own if rollout.policy.any() else 50.0
+            results.append(replace(result, cost=cost + rollout.field_seed % 3))
+        row = optimizer.tell(results)
+    chosen = "first" if elsewhere == -0.1 else "adapted"
+    assert row["chosen"] == chosen and row["rollouts"] <= 14
+    assert same_bits(optimizer.policy, found if chosen == "adapted" else first)
+    if gain == 0.5:
+        assert row["accepted"] is False and row["reason"].endswith("on the fields of the steps")
+    else:
+        seen = {seed for some in fields[:-1] for seed in some}
+        assert row["role"] == "judging" and row["rollouts"] == 14 and len(fields[-1]) == 4
+        assert fields[-1][:2] == fields[-1][2:] and not seen & set(fields[-1])
 
 
 def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
