@@ -5,8 +5,8 @@ Where one equation reproduces the readings of the rollouts (`loop_method.models.
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
 current law and those of `observer_design`; its result is used only if it is cheaper on other draws.
-Once no equation reproduces the rollouts, it continues with a model of the readings
-(`model_based_readings`).
+Where no equation reproduces the rollouts, it continues with a model of the readings
+(`model_based_readings`) and tries again with more of them.
 """
 
 from __future__ import annotations
@@ -46,9 +46,13 @@ class ModelBasedSensed(ModelBasedReadings):
         return 2 * own if 4 * own <= last else last
 
     def _believe(self) -> Belief | None:
-        """In an equation, as long as one reproduces the readings; then in a model of the readings."""
+        """In an equation where one reproduces the readings, else in a model of the readings.
+
+        More rollouts may determine one that the first ones did not.
+        """
         measured, model = self._measurements(), self._sensed
-        if model is not None or self._progress.belief is None:
+        before = self._records.count // self._settings.judging
+        if model is not None or before < self._context.field_models.sensed_attempts:
             found = sensed_from(self._context, measured, model)
             if found is not None:
                 return Belief(*found, 1)

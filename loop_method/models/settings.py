@@ -125,6 +125,9 @@ class FieldModelSettings(Settings):
         1e-5, "error at which no other dispersion is tried as a start", 0, 1
     )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
+    sensed_attempts: int = setting(
+        8, "maximum number of times that an equation is looked for in vain", 1, 1000
+    )
     sensed_largest_cost: float = setting(
         3.0, "maximum cost of a rollout in a fit, per cost of the exploration", 1, 1e6
     )

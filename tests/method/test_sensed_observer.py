@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,13 @@ from loop_method.adapt import (
     Rollout,
     RolloutResult,
     Trajectory,
+    model_based_sensed,
 )
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
 from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
-from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.laws import Observer
 from loop_method.models.files import model_of
@@ -222,14 +224,14 @@ def measured(asked: Rollout) -> RolloutResult:
     return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
 
 
-def optimiser() -> Optimizer:
+def optimiser(rollouts: int = 3) -> Optimizer:
     _, context = small()
     kind = ModelBased.for_context(context)
     assert kind is ModelBasedSensed
     settings = ModelBasedSettings(iterations=5, mixtures=2, judging=1)
     law = context.law
     assert law is not None
-    return kind(law.theta_start, seed=0, rollouts=3, settings=settings, context=context)
+    return kind(law.theta_start, seed=0, rollouts=rollouts, settings=settings, context=context)
 
 
 def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -> None:
@@ -245,6 +247,22 @@ def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -
     half = len(rows) // 2
     assert rows[:half] == rows[half:] and rows[-1]["chosen"] == "adapted"
     assert same_bits(first.policy, later.policy)
+
+
+def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
+    attempts = []
+
+    def late(*given: Any) -> tuple[SensedModel, float] | None:
+        attempts.append(given)
+        return None if len(attempts) <= 3 else sensed_from(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model_based_sensed, "sensed_from", late)
+        own, models = optimiser(rollouts=7), []
+        while not own.done:
+            row = own.tell([measured(asked) for asked in own.ask()])
+            models.append(row.get("model"))
+    assert models[2] == "innovations" and models[3] == "sensed"
 
 
 def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
