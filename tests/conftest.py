@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import gc
+import itertools
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -86,9 +87,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Each worker begins with its share of the long tests: so none is left alone with them.
+    """Each worker's share has tests over topics, which mostly wait, next to those that compute.
 
-    Workers are given equal parts of the list. The others stay together by their modules.
+    Workers are given equal parts of the list and take from the end of each other's. So it takes
+    until the last of them for a worker to run out of either kind, and the longest come first.
     """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     topics = [item for item in items if item.get_closest_marker("topics")]
@@ -98,8 +100,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [
         item
         for i in range(workers)
-        for item in (*topics[i::workers], *others[parts[i] : parts[i + 1]])
+        for item in between_modules(topics[i::workers], others[parts[i] : parts[i + 1]])
     ]
+
+
+def between_modules(topics: list[pytest.Item], others: list[pytest.Item]) -> list[pytest.Item]:
+    """The tests over topics, evenly between the modules of the others, which share fixtures."""
+    mixed: list[pytest.Item] = []
+    passed = taken = 0
+    for _, module in itertools.groupby(others, key=lambda item: item.path):
+        together = list(module)
+        passed += len(together)
+        due = -(-len(topics) * passed // len(others))
+        mixed += [*topics[taken:due], *together]
+        taken = due
+    return mixed + topics[taken:]
 
 
 @pytest.hookimpl(wrapper=True)

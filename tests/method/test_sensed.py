@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
@@ -35,6 +37,8 @@ from tests.support.small import same_bits
 Array = np.ndarray
 SENSORS = 8
 FIELD = 11
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=4)
+"""For readings that no equation explains, on which iterations are spent in vain."""
 
 
 def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, float]:
@@ -302,7 +306,9 @@ def test_readings_that_no_equation_explains_are_given_up_early() -> None:
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "SensedProblem", Counted)
-        _, fields, error = fit_sensed(list(readings), list(actions), _equally_spaced(2))
+        _, fields, error = fit_sensed(
+            list(readings), list(actions), _equally_spaced(2), settings=FEW_ITERATIONS
+        )
     assert error == np.inf and np.isfinite(fields).all()
     assert max(simulated) < 40
 
@@ -319,7 +325,9 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
     records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
     loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
-    proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
+    proposals = SensedProposals(
+        loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf, settings=FEW_ITERATIONS
+    )
     with threadpool_limits(1):
         assert proposals.propose(records, records[0].policy, damping=1.0) is None
     assert not proposals.equation.any()

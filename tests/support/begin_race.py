@@ -12,6 +12,7 @@ HOW: `run` begins as a tuner does, `create` as the command line does, which star
 from __future__ import annotations
 
 import fcntl
+import gc
 import json
 import os
 import shutil
@@ -126,7 +127,11 @@ def judged(folder: Path, codes: tuple[int, int]) -> str:
 def run(place: Path, how: str) -> dict[str, Any]:
     """Every order."""
     VALUES.update(parameters())
-    build_training({**VALUES, "resume": False})
+    # What each of them loads, those that are forked find there.
+    with ExitStack() as locks:
+        first = {**VALUES, "out": str(place / "first"), "resume": False}
+        open_run(first, build_training(first), locks, print)
+    gc.freeze()  # what a fork touches is copied
     wrong, orders, n, last = [], 0, 0, False
     while not last:
         m, ended = 0, False

@@ -25,18 +25,20 @@ import argparse
 import contextlib
 import errno
 import gc
+import io
 import json
 import os
 import shutil
 import signal
 import sys
 import tempfile
+import threading
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pdeloop.cli import DONE, FAILED, main, parser
+from pdeloop.cli import DONE, FAILED, main
 from pdeloop.training_run import load_compiled, resolve
 from tests.support.failing_calls import CHANGING, EVERY, FailingCalls
 from tests.support.lossy_disk import LossyDisk
@@ -209,8 +211,7 @@ class Judge:
 
 def run(place: Path, kinds: tuple[str, ...], every: int = 1) -> dict[str, Any]:
     """The failures, one after the other."""
-    parser()  # imports what each training needs
-    load_compiled(resolve(str(problem(place)), {}))
+    first_training(place)
     gc.freeze()  # what a fork touches is copied
     with contextlib.ExitStack() as stack:
         disk = LossyDisk(place / "disk") if "power" in kinds else None
@@ -220,6 +221,18 @@ def run(place: Path, kinds: tuple[str, ...], every: int = 1) -> dict[str, Any]:
         failures = [(n, kind) for kind in kinds for n in judge.failures(kind)[::every]]
         wrong = [sentence for n, kind in failures if (sentence := judge.judged(n, kind))]
     return {"failures": Counter(kind for _, kind in failures), "wrong": wrong}
+
+
+def first_training(place: Path) -> None:
+    """Train in this process: what each training imports and loads, those that are forked find there."""
+    load_compiled(resolve(str(problem(place)), {}))
+    out = place / "first"
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        assert (
+            main(["train", str(problem(place)), "--out", str(out), "--in-process", *BUDGET]) == DONE
+        )
+    assert threading.active_count() == 1
+    shutil.rmtree(out)
 
 
 def command() -> int:

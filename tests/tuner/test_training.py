@@ -373,7 +373,7 @@ def test_model_based_continues_with_the_same_bits_from_any_batch():
 
 
 def test_model_based_with_few_sensors_is_gauss_newton():
-    values = parameters(optimizer="model_based", rollouts=10, sensors=8)
+    values = parameters(optimizer="model_based", rollouts=7, sensors=8)
     assert build_training(values).next_batch().together == 1
     (kind,) = {type(optimizer) for optimizer in train_here(values).optimizers}
     assert kind is GaussNewton
