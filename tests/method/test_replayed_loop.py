@@ -70,6 +70,7 @@ def context(**others: object) -> Context:
     return Context(law.model.U, TARGET, 1.0, 0.3, T, first, **given)
 
 
+@cache
 def loop_and_rollout() -> tuple[ReplayedLoop, Record, np.ndarray]:
     law = first_law()
     theta = law.theta_start
