@@ -180,6 +180,7 @@ def summaries(result: Mapping[str, Any]) -> list[dict[str, Any]]:
             rows = [row for row in good if row["budget"] == budget]
             for key in ("none", "lqt", "adapted"):
                 summary[f"{key} {budget}"] = float(np.mean([row[key] for row in rows]))
+            summary[f"highest {budget}"] = max(row["adapted"] for row in rows)
             ratios = [row["adapted"] / row["lqt"] for row in rows]
             summary[f"ratios {budget}"] = ratios
             summary["worst"] = max([*ratios, summary.get("worst", -math.inf)])
@@ -188,19 +189,27 @@ def summaries(result: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def text(result: Mapping[str, Any]) -> str:
-    """A Markdown table, what lost most against its own first law first."""
+    """A Markdown table, what lost most against its own first law first; worst seeds in brackets."""
     budgets = list(dict.fromkeys(row["budget"] for row in result["rows"]))
     head = ["case", "no control", "first law", *(f"{budget} rollouts" for budget in budgets)]
-    head += ["best affine law", "limit", "adapted / first law, each seed", "failed"]
+    failed = any("error" in row for row in result["rows"])
+    head += ["best affine law", "limit", "adapted / first law, each seed"]
+    head += ["failed"] if failed else []
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for each in summaries(result):
         known = [budget for budget in budgets if f"none {budget}" in each]
         cells = [each["case"]]
         cells += [number(each[f"{key} {known[0]}"]) if known else "-" for key in ("none", "lqt")]
-        cells += [number(each.get(f"adapted {budget}")) for budget in budgets]
+        cells += [
+            f"{number(each[f'adapted {budget}'])} ({number(each[f'highest {budget}'])})"
+            if budget in known
+            else "-"
+            for budget in budgets
+        ]
         cells += [number(each.get(key)) for key in ("affine", "limit")]
         ratios = each.get(f"ratios {known[0]}", ()) if known else ()
-        cells += [" ".join(f"{ratio:.2f}" for ratio in ratios), str(each["failed"] or "")]
+        cells += [" ".join(f"{ratio:.2f}" for ratio in ratios)]
+        cells += [str(each["failed"] or "")] if failed else []
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
