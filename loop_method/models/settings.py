@@ -126,7 +126,7 @@ class FieldModelSettings(Settings):
     )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
     sensed_attempts: int = setting(
-        8, "maximum number of times that an equation is looked for in vain", 1, 1000
+        5, "maximum number of times that an equation is looked for in vain", 1, 1000
     )
     sensed_largest_cost: float = setting(
         3.0, "maximum cost of a rollout in a fit, per cost of the exploration", 1, 1e6
