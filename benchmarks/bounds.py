@@ -43,13 +43,13 @@ FIELDS = 48
 """Initial fields that the best affine law is optimised on."""
 COARSE = ImprovementSettings(iterations=300, least_gain=1e-2)
 """Descents on some of the fields."""
-FINE = ImprovementSettings(iterations=300, window=10, least_gain=1e-3)
-"""Descents on all of them, which end later than those of a training."""
+FINE = ImprovementSettings(iterations=300, least_gain=1e-3)
+"""Descents on all of them."""
 HORIZONS = (8, 4, 2)
 """Divisors of the horizon."""
 ROUNDS = 6
 """Descents from one law at most, each in the coordinates of the one before."""
-INPUTS_TOLERANCE = 1e-3
+INPUTS_TOLERANCE = 2e-3
 """Of `descend`, for the inputs."""
 
 
