@@ -5,7 +5,8 @@ A few trainings of each case give laws and a model. What the first law, the frac
 the improved one and no control cost from many fields that made none of them is measured on the plant
 and on the model. From this table the choice is drawn again thousands of times: other fields for the
 rollouts of the training, from which the rules of the product (`choose_fraction`, `choose`) take a
-fraction and a law. The costs of all fields say whether that was right. Constants of the rules are
+fraction and a law. The costs of all fields say whether that was right. After local steps pairs of
+rollouts are drawn (`local_choices`). Constants of the rules are
 chosen on `--tuning` seeds.
 """
 
@@ -19,6 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import count as count_from
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pdeloop
-from benchmarks.families.cases import CASES
+from benchmarks import local_choices
+from benchmarks.families.cases import CASES, Case
+from benchmarks.local_choices import Pairs, pairs_of
 from benchmarks.optimum import evaluation_seeds
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
@@ -55,6 +59,15 @@ FAMILIES = (
     "benjamin-ono",
     "kawahara",
 )
+PLATE = {
+    "plant": "plate",
+    "physical": {"nx": 8, "ny": 8, "across": 5, "up": 2, "growth": 0.5, "saturation": 0.1},
+    "horizon": 30,
+    "reduced_order": 12,
+    "exploration_variance": 1.0,
+}
+"""The smallest one of `scale`, of which no model predicts whole rollouts."""
+KNOWN = {**CASES, "reacting plate": Case("local steps", "", PLATE)}
 OF_FRACTIONS = 2
 """Rows of a table before those of the fractions of the way: no control and the first law."""
 
@@ -116,7 +129,7 @@ def run(
     Parameters
     ----------
     cases
-        Names of benchmarks/families/cases.py.
+        Names of benchmarks/families/cases.py, or `reacting plate`.
     seeds
         Trainings of each case.
     rollouts
@@ -132,8 +145,8 @@ def run(
     folder
         Where the tables of costs are kept.
     """
-    if unknown := [name for name in cases if name not in CASES]:
-        raise ValueError(f"no case {unknown[0]!r}; known: {', '.join(CASES)}")
+    if unknown := [name for name in cases if name not in KNOWN]:
+        raise ValueError(f"no case {unknown[0]!r}; known: {', '.join(KNOWN)}")
     first = TUNING_SEEDS if tuning else SEEDS
     evaluation = TUNING_EVALUATION if tuning else EVALUATION
     tasks = [(name, seed) for name in cases for seed in range(first, first + seeds)]
@@ -146,7 +159,7 @@ def run(
     with processes(jobs) as pool:
         for (name, seed), table in zip(tasks, pool.map(work, tasks), strict=True):
             own = {"case": name, "seed": seed}
-            rows.append(own | (judge(table, draws, seed) if table else {"error": NO_MODEL}))
+            rows.append(own | judged(table, draws, seed))
             print(
                 f"{name}, seed {seed} ({len(rows)} of {len(tasks)}, "
                 f"{time.monotonic() - began:.0f} s)",
@@ -156,13 +169,22 @@ def run(
     return {"rows": rows, "draws": draws, "fields": fields, "rollouts": rollouts}
 
 
-NO_MODEL = "no model of the whole field predicted the rollouts"
+def judged(table: Table | Pairs | None, draws: int, seed: int) -> dict[str, Any]:
+    """The choices drawn from a table, or that there is none."""
+    if table is None:
+        return {"error": NO_MODEL}
+    if isinstance(table, Pairs):
+        return local_choices.judge(table, draws, seed)
+    return judge(table, draws, seed)
+
+
+NO_MODEL = "no choice was left to the verdict"
 
 
 def measured(
     task: tuple[str, int], *, rollouts: int, fields: int, evaluation: int, folder: Path
-) -> Table | None:
-    """The table of a training; None where no model was believed."""
+) -> Table | Pairs | None:
+    """The table of a training; None where nothing was decided."""
     label = f"{task}, {rollouts}, {fields}, {evaluation}"
     path = folder / f"{hashlib.sha256(label.encode()).hexdigest()[:16]}.json"
     if not path.exists():
@@ -171,12 +193,14 @@ def measured(
         lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in kept.items()}
         write_atomically(path, json.dumps(lists).encode())
     found = json.loads(path.read_text())
-    return Table.of(found) if found else None
+    if not found:
+        return None
+    return Table.of(found) if "true" in found else Pairs.of(found)
 
 
-def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Table | None:
+def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Table | Pairs | None:
     """Train on a case, and measure its laws from the fields of these seeds."""
-    case = CASES[name]
+    case = KNOWN[name]
     problem = pdeloop.problem(
         case.base or None, **case.parameters(), seed=seed, rollouts=rollouts, evaluation_fields=1
     )
@@ -184,13 +208,28 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
     train(training, pair, lambda row: None)
     optimizer, rows = training.optimizers[0], training.history
     state, law = optimizer.state(), training.laws()[0]
-    belief = Belief.of(state)
-    if belief is None or "laws" not in state or training.target is None:
-        return None
-    explored = training.explorations[0]
-    assert explored is not None
+    belief, explored = Belief.of(state), training.explorations[0]
+    assert explored is not None and training.target is not None
     known = explored, training.further[0], training.measured[0]
     context = context_of(training.settings, law, training.target, *known)
+    numbers = count_from(1)
+
+    def costs_of(K: Array, b: Array) -> Array:
+        acts = saturated(affine_law(K, b), context.action_limit)
+        noise = 10**6 * next(numbers) + np.arange(len(seeds))  # of every rollout its own
+        own = noise if context.noise else None
+        found = pdeloop.rollout(pair.plant, acts, seeds, own, keep=False).costs
+        return np.where(found.diverged_step < 0, found.mean, np.inf)
+
+    def costs_of_policy(policy: Array) -> Array:
+        n_s = context.U.shape[1]
+        return costs_of(
+            policy[:, :n_s] @ context.U.T, policy[:, n_s:] @ (context.U.T @ context.target)
+        )
+
+    if belief is None or "laws" not in state:
+        given = training.starts()[0], optimizer.policy
+        return pairs_of(state, rows, given, costs_of_policy, training.settings.explorations)
     loop = belief.loop(context)
     none, first = loop.no_control, loop.theta(training.starts()[0])
     base = first if state["safe"] else none
@@ -200,10 +239,7 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
     returned = loop.theta(optimizer.policy)
 
     def costs(theta: Array) -> Array:
-        K, b = theta[:, :-1] @ context.U.T, loop.constant_feature * theta[:, -1]
-        acts = saturated(affine_law(K, b), context.action_limit)
-        found = pdeloop.rollout(pair.plant, acts, seeds, keep=False).costs
-        return np.where(found.diverged_step < 0, found.mean, np.inf)
+        return costs_of(theta[:, :-1] @ context.U.T, loop.constant_feature * theta[:, -1])
 
     began = pdeloop.rollout(pair.plant, lambda k, z: np.zeros((len(z), len(none))), seeds)
     fields = np.ascontiguousarray(began.fields[0])
