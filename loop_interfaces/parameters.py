@@ -87,7 +87,7 @@ IDENTIFICATION = Spec(
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
     "control law: a shipped or installed name, or code that the user must allow, 'file.py:Class' "
-    "or 'module:Class'; for few sensors with noise, model_based defaults to observer"
+    "or 'module:Class'"
 )
 
 PROBLEM = _section(

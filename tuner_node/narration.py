@@ -127,8 +127,6 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         f"  mean stage cost with LQT         {cost('lqt')}",
         f"  mean stage cost after adaptation {cost('adapted')}",
     ]
-    if law := summary.get("law"):
-        lines.append(f"  law: {law['name']}, {law['reason']}")
     none, lqt, adapted = (sum(summary["costs"][name]) for name in ("none", "lqt", "adapted"))
     if comparable and not diverged["none"] and lqt >= none > 0:
         share = 100 * (1 - adapted / none)

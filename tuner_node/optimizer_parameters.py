@@ -13,7 +13,6 @@ from loop_method.adapt import Optimizer
 from loop_method.adapt.registry import optimizer_kind
 from loop_method.method_settings import Method, law_of, shared_methods
 from loop_method.settings import parameters_of, with_defaults
-from tuner_node.law_choice import preferred_law
 
 
 def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:
@@ -70,9 +69,8 @@ def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")
-    kind = kind_of({"optimizer": name})
-    preferences = preferred_law(given, kind) | dict(kind.preferences)
-    readings = law_of({**preferences, **given}).from_readings
+    preferences = dict(kind_of({"optimizer": name}).preferences)
+    readings = law_of(given).from_readings
     if readings and str(given.get("sensors", 0)) != "0":
         preferences["identification"] = readings
     return {**preferences, **given, "optimizer": name}

@@ -55,9 +55,6 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
     noise = content.get("undeclared_noise", [])
     if not isinstance(noise, list) or not all(isinstance(one, int | float) for one in noise):
         raise ValueError("its 'undeclared_noise' is not a list of numbers")
-    law = content.get("law", {"name": "", "reason": ""})
-    if not (_texts(law) and {"name", "reason"} <= law.keys()):
-        raise ValueError("its 'law' is not a name and a reason")
     outcome = content.get("outcome", [])
     if not isinstance(outcome, list) or not all(
         isinstance(own, dict) and _outcome(own) for own in outcome

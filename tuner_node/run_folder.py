@@ -54,8 +54,6 @@ from loop_interfaces.parameters import (
 )
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
-from tuner_node.law_choice import law_reason
-from tuner_node.optimizer_parameters import kind_of
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
@@ -278,9 +276,7 @@ class RunFolder:
 
     def finish(self, training: Training, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write policy.npz and result.json; returns the latter's content."""
-        values = self.values()
-        law = {"name": values["law"], "reason": law_reason(values, kind_of(values))}
-        known = {"plant": training.plant, "law": law, "versions": versions()}
+        known = {"plant": training.plant, "versions": versions()}
         summary = summarise(training) | dict(extra) | known
         buffer = BytesIO()
         np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]

@@ -276,8 +276,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
         start = "zero gains" if run.values["start"] == "zero" else "the LQT gains"
         method = run.values["optimizer"].replace("_", "-")
         facts.append(("Controller", f"{NAMES[name]}: {method}, started from {start}"))
-    law = first.first.result.get("law", {"name": values["law"]})  # older runs give no reason
-    facts.append(("Law", ", ".join(map(str, law.values()))))
+    if not first.affine:
+        facts.append(("Law", str(values["law"])))
     fields = "{evaluation_fields} initial fields drawn from seed {evaluation_seed}"
     versions = first.first.result.get("versions", {})
     return [

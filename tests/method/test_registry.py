@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +16,6 @@ from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.settings import Settings, setting
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
-from tuner_node.law_choice import law_reason
 from tuner_node.optimizer_parameters import settings_of, training_parameters
 
 FOREIGN = """
@@ -117,34 +115,6 @@ def test_an_observer_of_few_sensors_is_identified_from_readings() -> None:
         training_parameters("burgers", {**few, "identification": "dmdc"})["identification"]
         == "dmdc"
     )
-
-
-@pytest.mark.parametrize(
-    ("given", "law", "why"),
-    [
-        ({}, "affine", "every point is measured"),
-        ({"measurement_noise": 0.1}, "affine", "every point is measured"),
-        ({"sensors": 16}, "affine", "without measurement noise"),
-        ({"sensors": 16, "measurement_noise": 0.1}, "observer", "few sensors with measurement"),
-        ({"sensors": 16, "measurement_noise": 0.1, "law": "affine"}, "affine", "as given"),
-        ({"sensors": 16, "law": "observer"}, "observer", "as given"),
-        ({"sensors": 64, "measurement_noise": 0.1}, "affine", "the default of this optimizer"),
-        ({"sensors": 16, "measurement_noise": 0.1, "sensor_delays": 4}, "affine", "the default of"),
-        (
-            {"sensors": 16, "measurement_noise": 0.1, "optimizer": "gauss-newton"},
-            "affine",
-            "the default of this optimizer",
-        ),
-    ],
-)
-def test_few_sensors_with_noise_get_a_law_that_estimates_the_state(
-    given: dict[str, Any], law: str, why: str
-) -> None:
-    values = training_parameters("allen-cahn", given)
-    assert values["law"] == law
-    assert why in law_reason(values, optimizer_kind(values["optimizer"]))
-    identified = "subspace" if law == "observer" else ("field", "regression")
-    assert values["identification"] in identified
 
 
 def test_settings_are_parameters_of_the_training() -> None:

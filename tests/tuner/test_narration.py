@@ -129,13 +129,6 @@ def test_the_closing_words_have_the_ranges_the_budget_and_the_folder():
     assert warnings(summary()) == [] and not failed(summary())
 
 
-def test_the_closing_words_say_which_law_it_is_and_why():
-    law = {"name": "observer", "reason": "the default for few sensors"}
-    assert "  law: observer, the default for few sensors" in closing_lines(
-        "kdv", summary(law=law), "runs/a"
-    )
-
-
 def test_a_gain_on_a_law_that_is_worse_than_no_control_is_told_against_no_control():
     costs = {"none": [4.0, 4.0], "lqt": [2.0, 30.0], "adapted": [1.0, 2.0]}
     words = "at least as much as no control; the adapted one costs 62.5 % less than no control"
