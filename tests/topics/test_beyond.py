@@ -37,7 +37,7 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
     loop.start("-m", "tests.support.relay.node", "--ros-args", *line, name="relay")
-    options = {"rollouts": 15, "optimizer": "gauss_newton"}
+    options = {"rollouts": 20, "optimizer": "gauss_newton"}
     tuner = start_tuner(loop, out, *WORDS, **options, max_attempts=50)
     for count, victim in ((3, "controller_node"), (6, "pde_sim_node")):
         until(lambda least=count: adapted(out) >= least, LIMIT, f"batch {count}")
