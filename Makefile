@@ -58,8 +58,8 @@ audit: setup .venv/supply
 run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
-# Four workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own.
-PYTEST := $(BIN)/python -m pytest -n 4 --dist worksteal
+# Five workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own.
+PYTEST := $(BIN)/python -m pytest -n 5 --dist worksteal
 
 # All tests, each of them once; with COVERAGE=1, those without topics are run by `coverage`.
 test: setup packages $(if $(COVERAGE),coverage)
