@@ -14,6 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from loop_method.adapt.registry import OWN_OPTIMIZERS
+from loop_method.laws.registry import OWN_LAWS
+from pde_sim_node.equations.loading import OWN_EQUATIONS
+from pde_sim_node.plants.loading import OWN_PLANTS
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.compiled import COMPILED
 from tests.support.loop_harness import Processes, processes
@@ -40,9 +44,12 @@ def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The user's ROS settings do not reach the tests."""
+    """The user's ROS settings do not reach the tests, and no test those after it."""
     for name in ("ROS_DOMAIN_ID", "FASTRTPS_DEFAULT_PROFILES_FILE", "PDELOOP_NETWORK"):
         monkeypatch.delenv(name, raising=False)
+    for kind in (OWN_EQUATIONS, OWN_LAWS, OWN_OPTIMIZERS, OWN_PLANTS):
+        # Set, if only to what it is: code that a test allows is not allowed afterwards.
+        monkeypatch.setenv(kind.variable, os.environ.get(kind.variable, ""))
 
 
 @pytest.hookimpl(wrapper=True)
