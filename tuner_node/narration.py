@@ -213,12 +213,6 @@ def warnings(summary: Row) -> list[str]:
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     costs = summary["costs"]
     found = several_publishers(summary.get("several_publishers", {}))
-    if any(noise := summary.get("undeclared_noise", [])):
-        level = span([one for one in noise if one], ".2g")
-        found.append(
-            f"the states carry white noise of standard deviation {level}, but measurement_noise is 0: "
-            "the optimiser accounted for it, the first law did not; declare it as measurement_noise"
-        )
     if lost["lqt"] == rollouts:
         found.append(
             "every rollout of the first laws diverged; likely causes: an exploration that is too "

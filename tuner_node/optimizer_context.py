@@ -9,16 +9,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.adapt import Context, Record, Trajectory
 from loop_method.laws import Law
-from loop_method.models.noise_level import noise_level
 from tuner_node.batch import TrainingSettings
-
-
-def undeclared_noise(settings: TrainingSettings, explorations: Sequence[Trajectory]) -> float:
-    """The standard deviation of the noise that explorations show, where none was declared; 0: none."""
-    fields = settings.trajectories and (settings.line or settings.shape) and not settings.sensors
-    if settings.noise or not fields:  # also declared process noise
-        return 0.0
-    return noise_level([known.states for known in explorations])
 
 
 def context_of(
@@ -44,7 +35,7 @@ def context_of(
         exploration=exploration,
         measured=measured,
         action_limit=settings.action_limit,
-        noise=settings.measurement_noise or undeclared_noise(settings, [exploration, *further]),
+        noise=settings.measurement_noise,
         sensors=settings.sensors,
         actuator_positions=settings.actuator_positions,
         periodic=settings.periodic,

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Affine
 from tuner_node.budget import PURPOSES
-from tuner_node.optimizer_context import undeclared_noise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
@@ -52,9 +51,6 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError(f"its 'rollouts' are not a table of {', '.join(kinds)} for each seed")
     if not all(_texts(content.get(name, {})) for name in ("versions", "environment")):
         raise ValueError("its 'versions' or 'environment' are not a table of texts")
-    noise = content.get("undeclared_noise", [])
-    if not isinstance(noise, list) or not all(isinstance(one, int | float) for one in noise):
-        raise ValueError("its 'undeclared_noise' is not a list of numbers")
     outcome = content.get("outcome", [])
     if not isinstance(outcome, list) or not all(
         isinstance(own, dict) and _outcome(own) for own in outcome
@@ -117,9 +113,8 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
-    one it began with; undeclared_noise: standard deviation of the noise that its explorations show,
-    where none was declared; outcome: what came of each seed, and why, as its optimiser says, also why
-    it left rollouts over.
+    one it began with; outcome: what came of each seed, and why, as its optimiser says, also why it
+    left rollouts over.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
@@ -145,10 +140,6 @@ def summarise(training: Training) -> dict[str, Any]:
         "seeds": training.settings.seeds,
         "rollouts": training.budget.by_purpose(),
         "changed": changed,
-        "undeclared_noise": [
-            undeclared_noise(training.settings, [] if one is None else [one, *more])
-            for one, more in zip(training.explorations, training.further, strict=True)
-        ],
         "outcome": [
             {
                 "verdict": verdict(*mean[m].tolist(), changed=moved),
