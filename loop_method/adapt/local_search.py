@@ -117,8 +117,8 @@ class LocalSearch:
             if self._search.done:
                 unchanged = np.array_equal(self.policy, self._start)
                 self.stage = ENDED if unchanged else CONFIRMING
-                row["early"] = self._search.early
                 if unchanged:
+                    row["early"] = self._search.early
                     row["reason"] = "no local step was better than the law that they began with"
                     row["chosen"] = NONE if self._from_none else FIRST
         else:
@@ -163,10 +163,15 @@ class LocalSearch:
         return self._none_costs if self._from_none else first
 
     @property
+    def _left(self) -> int:
+        """Rollouts that are left after the steps."""
+        assert self._search is not None
+        return self._budget - self._compared - self._search.used
+
+    @property
     def _pairs(self) -> tuple[int, int]:
         """On how many fields of the law before, and on how many fresh ones, the laws are compared."""
-        assert self._search is not None
-        left, most = self._budget - self._compared - self._search.used, self._settings.pairs
+        left, most = self._left, self._settings.pairs
         known = min(len(self._costs_before), left, most)
         return known, min((left - known) // 2, most - known)
 
@@ -196,9 +201,10 @@ class LocalSearch:
         base = NONE if self._from_none else FIRST
         evidence = evidence_of_pairs({base: before, ADAPTED: costs[: known + fresh]}, base)
         verdict = choose(evidence, base, self._settings.confidence)
-        assert self._search is not None
         row["reason"], row["chosen"] = verdict.reason, verdict.chosen
-        row["early"] = self._search.early
+        if len(costs) < self._left:
+            assert self._search is not None
+            row["early"] = self._search.early
         if verdict.change:
             row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
         if verdict.chosen != ADAPTED:

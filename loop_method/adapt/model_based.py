@@ -180,10 +180,6 @@ class ModelBased(Optimizer):
             elif self._progress.stage == JUDGING:
                 row = self._measured(added)
                 self._judge(row)
-        if self.done and self._records.count < self._budget:
-            row.setdefault("early", row["reason"])
-        else:
-            row.pop("early", None)
         row["rollouts"] = self._records.count
         row["diverged"] = sum(not result.usable for result in results)
         return row
@@ -355,7 +351,8 @@ class ModelBased(Optimizer):
 
     def _end(self, row: Row, reason: str, early: str = "") -> None:
         row["reason"], self._progress.stage = reason, ENDED
-        row["early"] = early or reason
+        if self._records.count < self._budget:
+            row["early"] = early or reason
 
     def _begin_search(self, row: Row) -> None:
         self._progress.begun = self._records.count

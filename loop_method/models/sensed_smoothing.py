@@ -111,7 +111,7 @@ class Smoothing:
 
 
 def settled(spread: Array, before: Array, settings: FieldModelSettings) -> bool:
-    """Whether a spread is as good as the one before."""
+    """True if a spread is as good as the one before."""
     return bool(np.linalg.norm(spread - before) <= settings.sensed_settled * np.linalg.norm(before))
 
 
