@@ -123,6 +123,30 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     return law
 
 
+def actuator_centres(values: Mapping[str, Any]) -> list[float]:
+    """Centres of the actuators as shares of the domain; none: equally spaced.
+
+    Indicators are whole numbers of grid points apart (`pde_sim_node.supports`), so that they do not
+    fill the domain if n_a does not divide n_z.
+    """
+    positions: list[float] = list(values["actuator_positions"])
+    if positions or values["plant"] or values["actuator_shape"] == "gaussian":
+        return positions
+    n_z, n_a = values["n_z"], values["n_a"]
+    return [int((j + 0.5) * (n_z // n_a)) / n_z for j in range(n_a)]
+
+
+def indicator_width(values: Mapping[str, Any]) -> float:
+    """Width of an indicator like the declared actuators; 0 where a plant of one's own declares none.
+
+    That of a Gaussian has the same second moment.
+    """
+    if values["plant"]:
+        return 0.0
+    width = float(values["actuator_width"])
+    return math.sqrt(12.0) * width if values["actuator_shape"] == "gaussian" else width
+
+
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     order = model_order(values)
@@ -181,6 +205,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "law": law,
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
+        "actuator_positions": actuator_centres(values),
+        "actuator_width": indicator_width(values),
         "periodic": grid is None or grid.is_circle,
         "line": grid is None or len(grid.axes) < 2,
         "shape": points if len(points) > 1 and not sensors else (),

@@ -21,6 +21,7 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.laws.base import Law
+from loop_method.models.sensed import Actuators
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.settings import Settings as _Settings
 
@@ -146,6 +147,8 @@ class Context:
         consist; 0: the states are whole.
     actuator_positions : sequence of float
         Centres of the actuators as shares of the domain; none: equally spaced.
+    actuator_width : float
+        Width of each as a share of the domain; 0: not declared.
     periodic : bool
         Whether the states are fields on one periodic axis, which models of the whole field assume.
     line : bool
@@ -176,6 +179,7 @@ class Context:
     noise: float = 0.0
     sensors: int = 0
     actuator_positions: Sequence[float] = ()
+    actuator_width: float = 0.0
     periodic: bool = True
     line: bool = True
     shape: tuple[int, ...] = ()
@@ -190,9 +194,10 @@ class Context:
         """The exploration of the reduced model first."""
         return (self.exploration, *self.further)
 
-    def actuator_centres(self, n_a: int) -> Array:
-        """Centres of the n_a actuators as shares of the domain, (n_a,)."""
-        return np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)
+    def actuators(self, n_a: int) -> Actuators:
+        """What is declared of the n_a actuators."""
+        centres = np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)
+        return Actuators(centres, self.actuator_width)
 
 
 class Optimizer(Protocol):

@@ -84,11 +84,11 @@ class Proposer:
         self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
         if can_be_sensed(context):
-            centres = context.actuator_centres(n_a)
+            actuators = context.actuators(n_a)
             largest_cost = context.field_models.sensed_largest_cost
             largest_cost *= self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(
-                *(self.loop, centres, context.noise, largest_cost, context.field_models), settings
+                *(self.loop, actuators, context.noise, largest_cost, context.field_models), settings
             )
 
     def propose(

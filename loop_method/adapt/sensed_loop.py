@@ -17,7 +17,7 @@ from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.laws.observer import Observer
-from loop_method.models.sensed import SensedModel, interpolated, sensed_model
+from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing, settled
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
@@ -54,7 +54,7 @@ class SensedLoop(ObservedLoop):
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[every // 2 :: every], self.state_weight * every
         smoothing = Smoothing(
-            *(model.shared, model.centres, model.noise, target, model.spread), self.settings
+            *(model.shared, model.actuators, model.noise, target, model.spread), self.settings
         )
         known = distance(record, weight, self.action_weight, self.horizon)
         return smoothing.field(record.acted_from, record.actions, known)
@@ -99,7 +99,7 @@ def of_rollouts(
 def fit_rollouts(
     problem: ClosedLoopProblem,
     rollouts: Sequence[Record],
-    centres: Array,
+    actuators: Actuators,
     noise: float,
     start: Array | None,
     settings: FieldModelSettings = DEFAULTS,
@@ -113,7 +113,7 @@ def fit_rollouts(
     readings, actions, distances = of_rollouts(problem, rollouts)
     for first in (None,) if start is None else (start, None):
         found = fit_sensed(
-            *(readings, actions, centres, noise, first, problem.target, distances),
+            *(readings, actions, actuators, noise, first, problem.target, distances),
             *(spread, settings),
         )
         if found[2] <= settings.sensed_reproduced:
@@ -142,10 +142,10 @@ def sensed_from(
     chosen = whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
     if not chosen:
         return None
-    centres = context.actuator_centres(n_a)
+    actuators = context.actuators(n_a)
     start, spread = (None, None) if before is None else (before.shared, before.spread)
     spread = spread if context.noise else None
-    found = fit_rollouts(problem, chosen, centres, context.noise, start, settings, spread)
+    found = fit_rollouts(problem, chosen, actuators, context.noise, start, settings, spread)
     if found is None:
         return None
     shared, fields, error = found
@@ -156,7 +156,7 @@ def sensed_from(
     def learned() -> tuple[Smoothing, Array]:
         # The unpredicted part of a reading is noise to a filter.
         noise = float(np.sqrt(context.noise**2 + error * size))
-        smoothing = Smoothing(shared, centres, noise, context.target, spread, settings)
+        smoothing = Smoothing(shared, actuators, noise, context.target, spread, settings)
         smoothing = smoothing.learned(known, fields)
         assert smoothing.spread is not None
         return smoothing, smoothing.spread
@@ -167,7 +167,7 @@ def sensed_from(
         if spread is not None and settled(likely, spread, settings):
             break
         again = fit_sensed(
-            *(readings, actions, centres, context.noise, shared, context.target, distances),
+            *(readings, actions, actuators, context.noise, shared, context.target, distances),
             *(likely, settings, fields),
         )
         if again[2] > settings.sensed_reproduced:
@@ -175,7 +175,7 @@ def sensed_from(
         (shared, fields, error), spread = again, likely
         smoothing, likely = learned()
     largest = settings.sensed_extrapolation * float(np.abs(fields).max())
-    model = sensed_model(shared, sensors, centres, largest, settings, noise=smoothing.noise)
+    model = sensed_model(shared, sensors, actuators, largest, settings, noise=smoothing.noise)
     return replace(model, spread=likely), error
 
 

@@ -17,7 +17,7 @@ from loop_method.adapt.field_step import extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
 from loop_method.adapt.settings import GaussNewtonSettings
-from loop_method.models.sensed import KIND, interpolated, sensed_model, unknowns
+from loop_method.models.sensed import KIND, Actuators, interpolated, sensed_model, unknowns
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 
@@ -28,8 +28,8 @@ class SensedProposals:
     ----------
     loop : ClosedLoopProblem
         Its states are one reading of each sensor.
-    centres : (n_a,) array
-        Of the actuators, as shares of the domain.
+    actuators : Actuators
+        What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
     largest_cost : float
@@ -48,16 +48,16 @@ class SensedProposals:
     def __init__(
         self,
         loop: ClosedLoopProblem,
-        centres: Array,
+        actuators: Actuators,
         noise: float,
         largest_cost: float,
         settings: FieldModelSettings = DEFAULTS,
         own: GaussNewtonSettings | None = None,
     ) -> None:
-        self._loop, self._centres, self._noise = loop, centres, noise
+        self._loop, self._actuators, self._noise = loop, actuators, noise
         self._largest_cost, self._settings = largest_cost, settings
         self._own = own or GaussNewtonSettings()
-        self.equation: Array = np.zeros(unknowns(len(centres)))
+        self.equation: Array = np.zeros(unknowns(len(actuators.centres)))
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""
@@ -65,7 +65,7 @@ class SensedProposals:
         newest = settings.sensed_newest
         rollouts = whole_rollouts(self._loop, data, self._largest_cost, newest)
         start = self.equation if self.equation.any() else None
-        fitted = fit_rollouts(self._loop, rollouts, self._centres, self._noise, start, settings)
+        fitted = fit_rollouts(self._loop, rollouts, self._actuators, self._noise, start, settings)
         if fitted is None:
             return None
         shared, fields, error = fitted
@@ -82,7 +82,7 @@ class SensedProposals:
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            model=sensed_model(shared, sensors, self._centres, reach * largest, settings),
+            model=sensed_model(shared, sensors, self._actuators, reach * largest, settings),
             noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))

@@ -1,12 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation of a field of which a few points are measured.
 
-    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,    B_i(x) = (b + b_i) 1[|x - x_i| < w/2],
-                                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,    B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
+                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = p_w + w / n_a
 
-on a periodic domain of length 1, with time in sampling times and the declared centres p_i of the
-actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
-unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds them.
+on a periodic domain of length 1, with time in sampling times and the declared centres p_i and width p_w
+of the actuators. Nothing else depends on where on the domain something happens, so that there are a
+dozen unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds
+them.
 
 A sampling time has internal steps, the more the larger the field: a front moves through several grid
 points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
@@ -77,6 +78,28 @@ def interpolated(readings: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Actuators:
+    """What is declared of the actuators.
+
+    Attributes
+    ----------
+    centres : (n_a,) array
+        p_i, as shares of the domain.
+    width : float
+        p_w, as a share of the domain; 0: not declared, and half of the domain divided among them.
+        Readings hardly tell it, as an actuator between two sensors looks weaker as well as narrower.
+    """
+
+    centres: Array
+    width: float = 0.0
+
+    @property
+    def known_width(self) -> float:
+        """p_w, also where it is not declared."""
+        return self.width or 0.5 / len(self.centres)
+
+
+@dataclass(frozen=True, eq=False)
 class SensedModel(SpectralModel):
     """The equation on a grid of which every so many points are sensors.
 
@@ -84,8 +107,8 @@ class SensedModel(SpectralModel):
     ----------
     shared : (12 + n_a,) array
         Its unknowns, in their units.
-    centres : (n_a,) array
-        x_i, as it was declared.
+    actuators : Actuators
+        What is declared of them.
     sensors : int
         n_y.
     noise : float
@@ -95,7 +118,7 @@ class SensedModel(SpectralModel):
     """
 
     shared: Array = field(kw_only=True)
-    centres: Array = field(kw_only=True)
+    actuators: Actuators = field(kw_only=True)
     sensors: int = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
     spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
@@ -111,7 +134,8 @@ class SensedModel(SpectralModel):
         own = {
             "form": np.array("sensed"),
             "shared": self.shared,
-            "centres": self.centres,
+            "centres": self.actuators.centres,
+            "width": np.array(self.actuators.width),
             "sensors": np.array(self.sensors),
             "noise": np.array(self.noise),
             "spread": self.spread,
@@ -125,10 +149,13 @@ class SensedModel(SpectralModel):
         sensors = int(checked_array(arrays, "sensors", "i", ()))
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
+        width = float(checked_array(arrays, "width", "f", ())) if "width" in arrays else 0.0
+        if width < 0.0:
+            raise ValueError(f"a model has actuators of the width {width:g}; expected at least 0")
         return SensedModel(
             **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
             shared=_shared_of(arrays, whole.n_a),
-            centres=numbers_of(arrays, "centres", whole.n_a),
+            actuators=Actuators(numbers_of(arrays, "centres", whole.n_a), width),
             sensors=sensors,
             noise=float(checked_array(arrays, "noise", "f", ())),
             spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
@@ -146,7 +173,7 @@ def _shared_of(arrays: Arrays, n_a: int) -> Array:
 def sensed_model(
     shared: Array,
     sensors: int,
-    centres: Array,
+    actuators: Actuators,
     largest: float,
     settings: FieldModelSettings = DEFAULTS,
     noise: float = 0.0,
@@ -159,8 +186,8 @@ def sensed_model(
         The unknowns that all rollouts share, in their units.
     sensors : int
         n_y.
-    centres : (n_a,) array
-        x_i, as it was declared.
+    actuators : Actuators
+        What is declared of them.
     largest : float
         Largest |z| that is simulated; the internal steps follow it.
     settings : FieldModelSettings
@@ -169,7 +196,7 @@ def sensed_model(
         As of `SensedModel`.
     """
     n = grid_points(sensors)
-    equation = SensedEquation(shared, n, centres, settings)
+    equation = SensedEquation(shared, n, actuators, settings)
     symbols = np.stack([equation.linear, equation.square, equation.cube])
     substeps = substeps_of(symbols, largest, settings)
     return SensedModel(
@@ -182,7 +209,7 @@ def sensed_model(
         substeps=substeps,
         fewer=fewer_of(symbols, largest, substeps, settings),
         shared=shared,
-        centres=centres,
+        actuators=actuators,
         sensors=sensors,
         noise=noise,
     )
@@ -195,7 +222,7 @@ class SensedEquation:
         self,
         shared: Array,
         n: int,
-        centres: Array,
+        actuators: Actuators,
         settings: FieldModelSettings = DEFAULTS,
     ) -> None:
         waves, self._settings = np.arange(n // 2 + 1), settings
@@ -211,10 +238,10 @@ class SensedEquation:
         self.constant = float(shared[COEFFICIENTS - 1]) / _TIME
         b, x_0, s, w = shared[COEFFICIENTS:SHARED] / _TIME
         self.strengths: Array = b + shared[SHARED:] / _TIME
-        n_a = len(centres)
+        n_a = len(actuators.centres)
         own = np.arange(n_a)
-        places = centres + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
-        width = (0.5 + w) / n_a
+        places = actuators.centres + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
+        width = actuators.known_width + w / n_a
         # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
         shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
         shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])

@@ -33,7 +33,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import TERMS, coefficients_of, field_of, grid_points
+from loop_method.models.sensed import TERMS, Actuators, coefficients_of, field_of, grid_points
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -47,7 +47,7 @@ _WHOLE = 2
 def fit_sensed(
     readings: Sequence[Array],
     actions: Sequence[Array],
-    centres: Array,
+    actuators: Actuators,
     noise: float = 0.0,
     start: Array | None = None,
     target: Array | None = None,
@@ -62,8 +62,8 @@ def fit_sensed(
     ----------
     readings, actions : sequences of (T, n_y) and (T, n_a) arrays
         Of rollouts of one length: y_k and a_k.
-    centres : (n_a,) array
-        Of the actuators, as shares of the domain.
+    actuators : Actuators
+        What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
     start : (12 + n_a,) array, optional
@@ -90,7 +90,7 @@ def fit_sensed(
     y, a = np.stack(readings), np.stack(actions)
     if target is None or distances is None:
         target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
-    problem = SensedProblem(y, a, centres, noise, target, distances, settings)
+    problem = SensedProblem(y, a, actuators, noise, target, distances, settings)
     problem.spread = spread
     fields, n = problem.interpolated(), grid_points(y.shape[2])
     if start is None:
@@ -98,7 +98,7 @@ def fit_sensed(
         acted = [m for m in calmest if a[m].any()]
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
         few = SensedProblem(
-            *(y[pair], a[pair], centres, noise, target, distances[pair], settings),
+            *(y[pair], a[pair], actuators, noise, target, distances[pair], settings),
             settings.sensed_place_ridge,
         )
         error, shared, fields[pair] = _first_guess(few, settings)
@@ -111,11 +111,30 @@ def fit_sensed(
     else:
         known = coefficients_of(near)
     whole = [y.shape[1]] * _WHOLE
-    if problem.error(shared, known) <= settings.sensed_reproduced:
+    # With noise two rollouts leave much of an equation open.
+    guessed = start is None and problem.noise > 0.0
+    if not guessed and problem.error(shared, known) <= settings.sensed_reproduced:
         error, shared, fields = problem.fit(shared, known, lengths=whole)
     else:  # the equation does not hold for the other rollouts: nothing is near enough for a whole fit
-        error, shared, fields = problem.fit(shared, fields)
+        error, shared, fields = part_by_part(problem, shared, fields, settings)
     return shared, field_of(fields, n), max(error - problem.noise, 0.0)
+
+
+def part_by_part(
+    problem: SensedProblem, shared: Array, fields: Array, settings: FieldModelSettings
+) -> tuple[float, Array, Array]:
+    """The fit over longer and longer parts, with noise of actuators as they are declared.
+
+    The beginning of noisy rollouts does not determine where and how strong each of them is: what the
+    equation does would be taken for that, and no descent leads back.
+    """
+    if not problem.noise:
+        return problem.fit(shared, fields)
+    problem.place_ridge = settings.sensed_held_ridge
+    _, shared, fields = problem.fit(shared, fields)
+    problem.place_ridge = 0.0
+    problem.forget()
+    return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
 
 
 def _first_guess(

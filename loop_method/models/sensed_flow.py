@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import COEFFICIENTS, SHARED, TERMS, WAVES, SensedEquation
+from loop_method.models.sensed import COEFFICIENTS, SHARED, TERMS, WAVES, Actuators, SensedEquation
 from loop_method.models.settings import FieldModelSettings
 from spectral_solver.polynomial_step import PolynomialStep, PolynomialSteps
 
@@ -31,8 +31,8 @@ class SensedFlow:
         The unknowns.
     n : int
         Number of grid points.
-    centres : (n_a,) array
-        Of the actuators.
+    actuators : Actuators
+        What is declared of them.
     sizes : (T,) array
         How large the fields are at the time steps, which the internal steps follow.
     settings : FieldModelSettings
@@ -47,7 +47,7 @@ class SensedFlow:
         self,
         shared: Array,
         n: int,
-        centres: Array,
+        actuators: Actuators,
         sizes: Array,
         settings: FieldModelSettings,
         clip: float,
@@ -56,7 +56,7 @@ class SensedFlow:
         changes = np.zeros((1, shared.size))
         if difference:
             changes = np.vstack([changes, difference * np.eye(shared.size)])
-        equations = [SensedEquation(shared - own, n, centres, settings) for own in changes]
+        equations = [SensedEquation(shared - own, n, actuators, settings) for own in changes]
         first, self._terms = equations[0], equations[1 : 1 + len(TERMS)]
         self.finite = all(
             bool(np.abs(each.linear).max() < _FASTEST) for each in [first, *self._terms]
@@ -67,7 +67,7 @@ class SensedFlow:
         # Shift, spacing and width of the actuators change the supports; the others only strengths.
         moved = range(COEFFICIENTS + 2, SHARED + 1) if difference else ()
         self._supports = np.hstack([equations[i].supports for i in (0, *moved)])
-        n_a, self._blocks = len(centres), 1 + len(moved)
+        n_a, self._blocks = len(actuators.centres), 1 + len(moved)
         self._gains = np.zeros((len(equations), self._blocks * n_a + 1))
         for i, equation in enumerate(equations):
             block = 1 + moved.index(i) if i in moved else 0

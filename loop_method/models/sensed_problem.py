@@ -12,6 +12,7 @@ from loop_method.models.sensed import (
     COEFFICIENTS,
     SHARED,
     WAVES,
+    Actuators,
     coefficients_of,
     grid_points,
     interpolated,
@@ -40,7 +41,7 @@ class SensedProblem:
         self,
         y: Array,
         a: Array,
-        centres: Array,
+        actuators: Actuators,
         noise: float,
         target: Array,
         distances: Array,
@@ -48,11 +49,12 @@ class SensedProblem:
         place_ridge: float = 0.0,
         least: float = 0.0,
     ) -> None:
-        self.y, self.a, self._centres, self._settings = y, a, centres, settings
-        self.shared = unknowns(len(centres))
+        self.y, self.a, self._actuators, self._settings = y, a, actuators, settings
+        self.shared = unknowns(len(actuators.centres))
         self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
         self.noise: float = (noise / self._size) ** 2
-        self._place_ridge = place_ridge
+        self.place_ridge = place_ridge
+        """That of the shifts, widths and differences of actuators."""
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
         self._sizes = settings.sensed_margin * windows.max(axis=1)
@@ -222,7 +224,7 @@ class SensedProblem:
         shared = np.full(self.shared, weight / settings.sensed_deviation**2)
         shared[SHARED:] = weight / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
         shared += settings.sensed_ridge**2 + self._precision
-        shared[COEFFICIENTS + 1 :] += self._place_ridge**2
+        shared[COEFFICIENTS + 1 :] += self.place_ridge**2
         rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
         field = settings.sensed_field_ridge**2 / rollouts * rising
         if self.spread is None:
@@ -250,7 +252,7 @@ class SensedProblem:
         difference, P is followed by the first fields with each of the unknowns less by it.
         """
         stride, own = self._stride(steps), (self._settings, self._clip, difference)
-        flow = SensedFlow(shared, self._n, self._centres, self._sizes, *own)
+        flow = SensedFlow(shared, self._n, self._actuators, self._sizes, *own)
         compared = len(range(0, steps, stride))
         rows, (rollouts, _, sensors) = len(fields), self.y.shape
         rows += self.shared if difference else 0

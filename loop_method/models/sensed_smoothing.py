@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import WAVES, coefficients_of, field_of, grid_points
+from loop_method.models.sensed import WAVES, Actuators, coefficients_of, field_of, grid_points
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -32,8 +32,8 @@ class Smoothing:
     ----------
     shared : (12 + n_a,) array
         The equation's unknowns.
-    centres : (n_a,) array
-        Of the actuators, as shares of the domain.
+    actuators : Actuators
+        What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
     target : (n_y,) array
@@ -46,7 +46,7 @@ class Smoothing:
     """
 
     shared: Array
-    centres: Array
+    actuators: Actuators
     noise: float
     target: Array
     spread: Array | None = None
@@ -102,7 +102,7 @@ class Smoothing:
         # Readings that a law brings to the target say little of the size of the field before.
         first = float(np.sqrt(np.mean(readings[0] ** 2)))
         problem = SensedProblem(
-            *(readings[None], actions[None], self.centres, self.noise, self.target),
+            *(readings[None], actions[None], self.actuators, self.noise, self.target),
             *(np.array([distance]), self.settings),
             least=first,
         )

@@ -192,6 +192,12 @@ class FieldModelSettings(Settings):
         0,
         1,
     )
+    sensed_held_ridge: float = setting(
+        0.1,
+        "the same with measurement noise, until whole rollouts are fitted",
+        0,
+        1e6,
+    )
     sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
     sensed_deviation: float = setting(
         10.0,

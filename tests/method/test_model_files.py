@@ -14,7 +14,7 @@ from loop_method.models.finite_difference import FiniteDifferenceModel, features
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
-from loop_method.models.sensed import SHARED, SensedModel, grid_points, unknowns
+from loop_method.models.sensed import SHARED, Actuators, SensedModel, grid_points, unknowns
 from loop_method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2
@@ -74,7 +74,7 @@ MODELS: dict[str, FieldModel] = {
     "sensed": SensedModel(
         **spectral(grid_points(SENSORS)),  # type: ignore[arg-type]
         shared=numbers(unknowns(N_A)),
-        centres=numbers(N_A),
+        actuators=Actuators(numbers(N_A), 0.25),
         sensors=SENSORS,
     ),
 }
@@ -88,11 +88,19 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     assert all(np.array_equal(again[name], arrays[name]) for name in arrays)
 
 
-def test_an_older_model_between_sensors_has_equal_actuators() -> None:
+def test_an_older_model_between_sensors_has_equal_actuators_of_no_declared_width() -> None:
     arrays = MODELS["sensed"].arrays()
-    older = model_of({**arrays, "shared": arrays["shared"][:SHARED]}).arrays()["shared"]
-    np.testing.assert_array_equal(older[:SHARED], arrays["shared"][:SHARED])
-    assert older.shape == arrays["shared"].shape and not older[SHARED:].any()
+    older = {name: own for name, own in arrays.items() if name != "width"}
+    found = model_of({**older, "shared": arrays["shared"][:SHARED]}).arrays()
+    shared = found["shared"]
+    np.testing.assert_array_equal(shared[:SHARED], arrays["shared"][:SHARED])
+    assert shared.shape == arrays["shared"].shape and not shared[SHARED:].any()
+    assert found["width"] == 0.0
+
+
+def test_a_model_has_no_actuators_of_negative_width() -> None:
+    with pytest.raises(ValueError, match=r"width -0\.1"):
+        model_of({**MODELS["sensed"].arrays(), "width": np.array(-0.1)})
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from loop_method.models.sensed import (
     COEFFICIENTS,
     SHARED,
     TERMS,
+    Actuators,
     SensedEquation,
     SensedModel,
     grid_points,
@@ -26,13 +28,14 @@ from loop_method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from loop_method.models.sensed_fit import fit_sensed
+from loop_method.models.sensed_fit import fit_sensed, part_by_part
 from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
+from tuner_node.build import build_training
 
 Array = np.ndarray
 SENSORS = 8
@@ -47,15 +50,16 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, 
     explored, actions = problem.explore(seed)
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
     readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
-    positions = problem.values["actuator_positions"] or _equally_spaced(plant.n_a)
+    positions = problem.values["actuator_positions"]
+    actuators = Actuators(np.array(positions)) if positions else _equally_spaced(plant.n_a)
     with threadpool_limits(1):
         shared, fields, error = fit_sensed(
             readings,
             [actions, uncontrolled.actions[:, 0]],
-            np.array(positions),
+            actuators,
             problem.values["measurement_noise"] * _scale(problem),
         )
-    return sensed_model(shared, SENSORS, np.array(positions), _largest(fields)), fields, error
+    return sensed_model(shared, SENSORS, actuators, _largest(fields)), fields, error
 
 
 def _largest(fields: Array) -> float:
@@ -79,10 +83,10 @@ def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
     def off(*known: Array) -> float:
         """The relative error of the simulated distance from the target."""
         with threadpool_limits(1):
-            centres = _equally_spaced(plant.n_a)
-            shared, fields, error = fit_sensed(readings, actions, centres, 0.0, None, *known)
+            actuators = _equally_spaced(plant.n_a)
+            shared, fields, error = fit_sensed(readings, actions, actuators, 0.0, None, *known)
         assert error < 1e-5
-        model = sensed_model(shared, SENSORS, centres, _largest(fields))
+        model = sensed_model(shared, SENSORS, actuators, _largest(fields))
         z, target, squares = fields[1], interpolated(plant.target), []
         for action in actions[1]:
             squares.append(np.mean((z - target) ** 2))
@@ -98,8 +102,8 @@ def _scale(problem: pdeloop.Problem) -> float:
     return float(np.sqrt(problem.values["n_z"] / SENSORS))
 
 
-def _equally_spaced(n_a: int) -> Array:
-    return (np.arange(n_a) + 0.5) / n_a
+def _equally_spaced(n_a: int) -> Actuators:
+    return Actuators((np.arange(n_a) + 0.5) / n_a)
 
 
 def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
@@ -184,19 +188,19 @@ def _readings(model: SensedModel, actions: Array, field: Array) -> Array:
 
 def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     """The second of three is reversed and the third does nothing."""
-    centres, rng = _equally_spaced(3), np.random.default_rng(2)
+    actuators, rng = _equally_spaced(3), np.random.default_rng(2)
     shared = np.zeros(unknowns(3))
     shared[[TERMS.index((1, 0)), TERMS.index((1, 2)), COEFFICIENTS]] = 1.0, 0.5, 5.0
     shared[SHARED:] = 0.0, -10.0, -5.0
-    model = sensed_model(shared, SENSORS, centres, 4.0)
+    model = sensed_model(shared, SENSORS, actuators, 4.0)
     x = np.arange(model.n_z) / model.n_z
     actions = 5.0 * rng.standard_normal((2, 20, 3))
     fields = [np.cos(2 * np.pi * x), 0.5 + np.sin(4 * np.pi * x)]
     readings = [_readings(model, *pair) for pair in zip(actions, fields, strict=True)]
     with threadpool_limits(1):
-        found, _, error = fit_sensed(readings, list(actions), centres)
+        found, _, error = fit_sensed(readings, list(actions), actuators)
     assert error < 1e-4
-    B = sensed_model(found, SENSORS, centres, 4.0).B
+    B = sensed_model(found, SENSORS, actuators, 4.0).B
     assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
 
 
@@ -204,8 +208,8 @@ def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() 
     """Burgers' equation, of which one internal step would be beyond the stability limit."""
     shared = np.zeros(unknowns(1))
     shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
-    n, centres = grid_points(16), np.array([0.5])
-    equation, x = SensedEquation(shared, n, centres), np.arange(n) / n
+    n, actuators = grid_points(16), Actuators(np.array([0.5]))
+    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
     field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
     (substeps,) = equation.substeps(largest)
     assert 1 < substeps < 64 and equation.substeps(0.01 * largest) == 1
@@ -224,13 +228,13 @@ def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() 
 
 def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
     rng = np.random.default_rng(2)
-    centres, n, T, R = _equally_spaced(3), grid_points(SENSORS), 6, 2
+    actuators, n, T, R = _equally_spaced(3), grid_points(SENSORS), 6, 2
     shared = rng.standard_normal(unknowns(3))
     fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
     sizes = np.linspace(3.0, 0.1, T)
 
     def last(unknowns: Array, fields: Array, difference: float) -> Array:
-        flow = SensedFlow(unknowns, n, centres, sizes, DEFAULTS, 10.0, difference)
+        flow = SensedFlow(unknowns, n, actuators, sizes, DEFAULTS, 10.0, difference)
         found = [z.copy() for z in flow.path(fields, actions, T)]
         return found[-1]
 
@@ -248,16 +252,16 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
     plant = problem.plant()
     explored, actions = problem.explore(1000)
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
-    scale, centres = np.sqrt(plant.n_z / 16), _equally_spaced(plant.n_a)
+    scale, actuators = np.sqrt(plant.n_z / 16), _equally_spaced(plant.n_a)
     with threadpool_limits(1):
         shared, _, error = fit_sensed(
             [explored[:-1], uncontrolled.states[:-1, 0]],
             [actions, uncontrolled.actions[:, 0]],
-            centres,
+            actuators,
             0.03 * scale,
         )
     assert error < DEFAULTS.sensed_reproduced
-    square = SensedEquation(shared, grid_points(16), centres).square
+    square = SensedEquation(shared, grid_points(16), actuators).square
     # -1/2 (u^2)_x of readings that are scaled, in a sampling time of 0.05.
     assert square[1].imag == pytest.approx(-0.05 * np.pi / scale, rel=0.15)
 
@@ -366,3 +370,81 @@ def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits
     for optimizer in (first, later):
         optimizer.tell([measure(asked) for asked in optimizer.ask()])
     assert same_bits(first.ask()[0].policy, later.ask()[0].policy)
+
+
+@pytest.mark.parametrize("shape", ["indicator", "gaussian"])
+@pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv", "fisher"])
+def test_actuators_are_declared_as_they_are(name: str, shape: str) -> None:
+    """Between two sensors nothing else tells where an actuator ends."""
+    problem = pdeloop.problem(name, sensors=SENSORS, actuator_shape=shape)
+    supports = problem.plant().supports
+    n, n_a = supports.shape
+    settings = build_training(problem.values).settings
+    zero, explored = np.zeros((SENSORS, 1)), Trajectory(np.zeros((2, SENSORS)), np.zeros((1, n_a)))
+    context = Context(
+        *(zero, zero[:, 0], 1.0, 1.0, 1, explored),
+        actuator_positions=settings.actuator_positions,
+        actuator_width=settings.actuator_width,
+    )
+    declared = context.actuators(n_a)
+    moments = np.exp(2j * np.pi * np.arange(n) / n) @ supports
+    centres = np.angle(moments) / (2 * np.pi) % 1.0
+    np.testing.assert_allclose(declared.centres, centres, atol=1.2 / n)
+    distance = (np.arange(n)[:, None] / n - centres + 0.5) % 1.0 - 0.5
+    second = np.sum(supports * distance**2, axis=0) / supports.sum(axis=0)
+    np.testing.assert_allclose(declared.width, np.sqrt(12.0 * second), atol=1.2 / n)
+
+
+def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> None:
+    n, shared = grid_points(SENSORS), np.zeros(unknowns(3))
+    centres = _equally_spaced(3).centres
+    for actuators, width in ((Actuators(centres, 0.1), 0.1), (Actuators(centres), 0.5 / 3)):
+        supports = SensedEquation(shared, n, actuators).supports
+        np.testing.assert_allclose(supports.mean(axis=0), width)
+
+
+def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
+    """What an equation does would be taken for it; over whole rollouts each may be where it is."""
+    rng, actuators, sigma = np.random.default_rng(5), _equally_spaced(3), 0.1
+    shared = np.zeros(unknowns(3))
+    shared[[TERMS.index((1, 0)), COEFFICIENTS]] = 1.0, 5.0
+    shared[SHARED:] = 0.0, 3.0, -3.0
+    model = sensed_model(shared, SENSORS, actuators, 4.0)
+    actions = 5.0 * rng.standard_normal((2, 30, 3))
+    readings = np.stack([_readings(model, own, np.zeros(model.n_z)) for own in actions])
+    readings += sigma * rng.standard_normal(readings.shape)
+    found = []
+
+    class Recorded(SensedProblem):
+        def fit(self, *given: Array, **options: Any) -> tuple[float, Array, Array]:
+            found.append(super().fit(*given, **options))
+            return found[-1]
+
+    problem = Recorded(
+        *(readings, actions, actuators, sigma, np.zeros(SENSORS), np.full(2, np.nan))
+    )
+    with threadpool_limits(1):
+        last = part_by_part(problem, shared, problem.interpolated(), DEFAULTS)[1]
+    before = found[0][1]
+    assert np.abs(before[COEFFICIENTS + 1 :]).max() < 0.1
+    np.testing.assert_allclose(last[SHARED:], [0.0, 3.0, -3.0], atol=1.0)
+
+
+def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
+    """What they suggest is fitted to all rollouts from their beginning."""
+    rng, actuators = np.random.default_rng(6), _equally_spaced(3)
+    readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
+    asked = []
+
+    def recorded(*given: Any) -> tuple[float, Array, Array]:
+        asked.append(given)
+        return part_by_part(*given)
+
+    with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
+        patch.setattr(sensed_fit, "part_by_part", recorded)
+        # Of noise alone, which any equation explains.
+        few = {"settings": FEW_ITERATIONS}
+        shared, fields, error = fit_sensed(readings, actions, actuators, 1.0, None, **few)
+        assert error < DEFAULTS.sensed_reproduced and len(asked) == 1
+        fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
+    assert len(asked) == 1

@@ -32,6 +32,7 @@ from loop_method.models.files import model_of
 from loop_method.models.sensed import (
     COEFFICIENTS,
     TERMS,
+    Actuators,
     SensedModel,
     interpolated,
     sensed_model,
@@ -44,7 +45,7 @@ from tests.support.small import same_bits
 
 Array = np.ndarray
 SENSORS, N_A, T = 8, 3, 24
-CENTRES = (np.arange(N_A) + 0.5) / N_A
+ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A)
 RNG = np.random.default_rng(17)
 
 
@@ -63,7 +64,7 @@ CUBIC = equation(z1_x0=5.0, z1_x2=0.5, z3_x0=-5.0)
 
 
 def model_with(shared: Array, noise: float) -> SensedModel:
-    return sensed_model(shared, SENSORS, CENTRES, 4.0, noise=noise)
+    return sensed_model(shared, SENSORS, ACTUATORS, 4.0, noise=noise)
 
 
 def field(model: SensedModel, seed: int) -> Array:
@@ -102,7 +103,7 @@ def test_the_initial_field_is_what_the_readings_came_from() -> None:
     for a in actions:
         seen.append(z[0, every // 2 :: every])
         z = model.step(z, a[None])
-    smoothing = Smoothing(moving, CENTRES, 0.0, np.zeros(SENSORS))
+    smoothing = Smoothing(moving, ACTUATORS, 0.0, np.zeros(SENSORS))
     found, error = smoothing.field(np.array(seen), actions, np.nan)
     assert error < 1e-6
     assert np.linalg.norm(found - true) < 0.01 * np.linalg.norm(true)
@@ -119,7 +120,7 @@ def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
             rows.append(z[0, every // 2 :: every] + sigma * rng.standard_normal(SENSORS))
             z = model.step(z, a[None])
         seen.append((np.array(rows), actions, np.nan))
-    first = Smoothing(CUBIC, CENTRES, sigma, np.zeros(SENSORS))
+    first = Smoothing(CUBIC, ACTUATORS, sigma, np.zeros(SENSORS))
     learned = first.learned(seen)
     assert learned.spread is not None
     # Means of 0.3, and waves of half of 1 at the first two wavenumbers.
@@ -134,7 +135,7 @@ def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
     known = np.zeros(SENSORS), np.full(len(seen), np.nan)
     off = [
         np.linalg.norm(
-            fit_sensed(readings, taken, CENTRES, sigma, CUBIC, *known, spread)[1] - np.array(true)
+            fit_sensed(readings, taken, ACTUATORS, sigma, CUBIC, *known, spread)[1] - np.array(true)
         )
         for spread in (learned.spread, None)
     ]
