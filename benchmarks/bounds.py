@@ -39,8 +39,6 @@ from pdeloop.in_process import LocalPair
 
 __all__ = ["best_inputs", "best_law", "bounds_of", "inputs_cost", "loop_of"]
 
-FIELDS = 48
-"""Initial fields that the best affine law is optimised on."""
 COARSE = ImprovementSettings(iterations=300, least_gain=1e-2)
 """Descents on some of the fields."""
 FINE = ImprovementSettings(iterations=300, least_gain=1e-3)
@@ -60,7 +58,7 @@ def bounds_of(case: Case, seed: int, held_out: Sequence[int]) -> dict[str, Array
     """
     with threadpool_limits(limits=1), np.errstate(all="ignore"):
         plant, loop, first = loop_of(case, seed)
-        own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, FIELDS))
+        own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, case.law_fields))
         theta = best_law(loop, first, own)
         K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
         noise = np.arange(len(held_out))

@@ -73,12 +73,11 @@ def test_the_best_law_is_that_of_the_descent_with_the_plant_s_own_gradients() ->
     assert loop.costs(own, fields).mean() == pytest.approx(found.cost, rel=5e-3)
 
 
-def test_limits_and_noise_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_and_noise_count() -> None:
     """With them the best law costs more, and noise does not change the limit for known fields."""
-    monkeypatch.setattr(bounds, "FIELDS", 4)
 
     def means(**settings: Any) -> tuple[float, float]:
-        costs = bounds.bounds_of(Case("", str(SMALL), settings), 0, [1, 2])
+        costs = bounds.bounds_of(Case("", str(SMALL), settings, law_fields=4), 0, [1, 2])
         assert (costs["limit"] <= costs["affine"]).all()
         return costs["affine"].mean(), costs["limit"].mean()
 
