@@ -5,24 +5,30 @@ Where one equation reproduces the readings of the rollouts (`loop_method.models.
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
 current law and those of `observer_design`; its result is used only if it is cheaper on other draws.
+The last rollouts of the final law begin where those of the first law did, and these pairs decide
+between the two: an equation that reproduces the readings may be wrong where no sensor is.
 Where no equation reproduces the rollouts, it continues with a model of the readings
 (`model_based_readings`) and tries again with more of them.
 """
 
 from __future__ import annotations
 
+from itertools import cycle, takewhile
+
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.base import Row
+from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
-from loop_method.adapt.estimate import Estimate, mean_of
+from loop_method.adapt.estimate import ZERO, Estimate, mean_of
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
-from loop_method.adapt.model_based_readings import ModelBasedReadings
+from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
 from loop_method.adapt.observer_design import compensators, whole_field_law
+from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of, evidence_of_pairs
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -108,12 +114,62 @@ class ModelBasedSensed(ModelBasedReadings):
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
+    def ask(self) -> list[Rollout]:
+        """The final law is judged on the fields of the first one."""
+        asked = super().ask()
+        if self._progress.stage != JUDGING or self._sensed is None:
+            return asked
+        begun = len(self._begun())
+        return [self._rollout(own.policy, i % begun) for i, own in enumerate(asked)]
+
+    def _begun(self) -> list[Record]:
+        """The rollouts of the first law that the optimisation began with."""
+        own = self._records.all()
+        return list(takewhile(lambda record: np.array_equal(record.policy, self._first), own))
+
+    def _not_worse_than_before(self) -> Array:
+        """The final law, or the one that measured best before it if that is better."""
+        final, own = self._progress.policy, self._records.all()
+        before = best_measured([r for r in own if not np.array_equal(r.policy, final)], self._first)
+        if np.array_equal(before, self._first):
+            return final
+        belief = self._progress.belief
+        assert belief is not None
+        loop, fields = belief.loop(self._context), self._fields()
+        # The names are those of a law to stay with and of another one.
+        evidence = evidence_of(loop, {FIRST: final, NONE: before}, FIRST, own, fields, ZERO)
+        if choose(evidence, FIRST, self._settings.confidence).chosen == FIRST:
+            return final
+        base = self._first if self._progress.safe else self._none
+        costs = (loop.costs(loop.theta(law), fields) for law in (before, base))
+        self._progress.change = gained(*costs)
+        return before.copy()
+
     def _judge(self, row: Row) -> None:
-        """As on a model of the whole field, where there is one."""
+        """As on a model of the whole field, where there is one, if measured pairs agree."""
         if self._sensed is None:
             super()._judge(row)
-        else:
-            ModelBased._judge(self, row)
+            return
+        self._progress.policy = final = self._not_worse_than_before()
+        judged = self._records.all()[-self._judging :]
+        pairs = [
+            (own.cost, before.cost)
+            for own, before in zip(judged, cycle(self._begun()))
+            if np.array_equal(own.policy, final)
+        ]
+        ModelBased._judge(self, row)
+        if len(pairs) < FEWEST or np.array_equal(final, self._first) or row["chosen"] == NONE:
+            return
+        costs = dict(zip((ADAPTED, FIRST), np.array(pairs).T, strict=True))
+        measured = choose(evidence_of_pairs(costs, FIRST), FIRST, self._settings.confidence)
+        safe = self._progress.safe
+        if not safe and (measured.chosen == ADAPTED or row["chosen"] == FIRST):
+            return  # no control was the law to stay with
+        kept = measured.chosen if safe else NONE
+        laws = {FIRST: self._first, ADAPTED: final, NONE: self._none}
+        self._progress.policy = laws[kept].copy()
+        row["chosen"], row["reason"] = kept, measured.reason
+        row["predicted_change"], row["deviation"] = measured.change, measured.deviation
 
 
 def gained(costs: Array, base: Array) -> Estimate:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -25,6 +27,7 @@ from loop_method.adapt.belief import Belief
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
 from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
+from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.laws import Observer
@@ -225,14 +228,15 @@ def measured(asked: Rollout) -> RolloutResult:
     return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
 
 
-def optimiser(rollouts: int = 3) -> Optimizer:
+def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -> Optimizer:
     _, context = small()
     kind = ModelBased.for_context(context)
     assert kind is ModelBasedSensed
-    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=1)
+    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=judging)
     law = context.law
     assert law is not None
-    return kind(law.theta_start, seed=0, rollouts=rollouts, settings=settings, context=context)
+    start = law.theta_start if first is None else first
+    return kind(start, seed=0, rollouts=rollouts, settings=settings, context=context)
 
 
 def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -> None:
@@ -248,6 +252,46 @@ def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -
     half = len(rows) // 2
     assert rows[:half] == rows[half:] and rows[-1]["chosen"] == "adapted"
     assert same_bits(first.policy, later.policy)
+
+
+def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
+    """An equation that reproduces the readings may be wrong between them."""
+    before = optimiser()
+    before.tell([measured(asked) for asked in before.ask()])
+    own, costs = optimiser(rollouts=7, judging=3, first=before.policy), {}
+    for number in range(100):
+        asked = own.ask()
+        results = [measured(each) for each in asked]
+        if number == 0:
+            costs = {each.field_seed: r.cost for each, r in zip(asked, results, strict=True)}
+            assert len(costs) > 1
+        elif own._progress.stage == JUDGING:
+            again = [each.field_seed for each in asked]
+            assert again == list(costs)[: len(again)] and len(again) == 3
+            # A little more than chance explains.
+            results = [
+                replace(result, cost=costs[each.field_seed] + 5.0 + 0.1 * i)
+                for i, (each, result) in enumerate(zip(asked, results, strict=True))
+            ]
+        row = own.tell(results)
+        if own.done:
+            break
+    assert row["chosen"] == "first" and same_bits(own.policy, own._first)
+
+
+def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
+    own = optimiser(rollouts=7, judging=3)
+    own.tell([measured(asked) for asked in own.ask()])
+    before = own.policy
+    final = own._progress.policy = before + 1e-6
+    asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
+    results = [measured(each) for each in asked]
+    for more, best in ((0.0, final), (50.0, before)):
+        again = copy.deepcopy(own)
+        for each, result in zip(asked, results, strict=True):
+            cost = result.cost + more * np.array_equal(each.policy, final)
+            again._records.add(each.policy, replace(result, cost=cost), set())
+        assert same_bits(again._not_worse_than_before(), best)
 
 
 def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
