@@ -92,6 +92,8 @@ def fit_field_model(
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load
         for kind in kinds:
             least = min(judged.values(), default=np.inf)
+            if not least > kind.needed:
+                continue
             error = _error(kind, rollouts, target, settings, least, noise)
             if error is not None:
                 judged[kind] = error

@@ -7,14 +7,19 @@ for every component c of the field; M_f is a monomial of the components, and D^j
 a ring of grid points of distance 1: none for j = 0, the first and second one along the last axis for
 j = 1, 2, along the axis before for j = 3, 4, and so on. Anything else (walls) has coefficients of its
 own where that shows. Time is in sampling times, each of equal Runge-Kutta steps of order 4.
+
+On one axis the factors of M_f may be of neighbours, each at a distance of its own from x: products that
+are no difference of any monomial, such as those of chains and rings of oscillators or species.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +28,30 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.text import shown
 from loop_method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
-from loop_method.models.finite_difference_kernels import advance, mean_features, pull_back
+from loop_method.models.finite_difference_kernels import (
+    MOST_FACTORS,
+    advance,
+    mean_features,
+    pull_back,
+)
 
-Feature = tuple[tuple[int, ...], int]
-"""A monomial, as its components, and the order of its derivative."""
-MOST_FACTORS = 5
+
+class Feature(NamedTuple):
+    """A monomial and its derivative.
+
+    Attributes
+    ----------
+    factors : tuple of int
+        The component of each factor.
+    order : int
+        Of the derivative.
+    shifts : tuple of int
+        By how many points each factor is ahead; empty: by none.
+    """
+
+    factors: tuple[int, ...]
+    order: int = 0
+    shifts: tuple[int, ...] = ()
 
 
 def features_of(components: int, degree: int = 3, axes: int = 1) -> tuple[Feature, ...]:
@@ -40,7 +64,21 @@ def features_of(components: int, degree: int = 3, axes: int = 1) -> tuple[Featur
     orders = {1: list(every), 2: of_squares}
     monomials = [m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)]
     monomials += [(c,) * p for c in range(components) for p in range(4, degree + 1)]
-    return tuple((m, j) for m in monomials for j in orders.get(len(m), [0]))
+    return tuple(Feature(m, j) for m in monomials for j in orders.get(len(m), [0]))
+
+
+def neighbour_features(components: int) -> tuple[Feature, ...]:
+    """Monomials of a point and its neighbours: up to degree 2 of two at each side, cubic ones of one.
+
+    Of several components all of them are of one neighbour at each side.
+    """
+    reach = {1: 2, 2: 2, 3: 1} if components == 1 else {1: 1, 2: 1, 3: 1}
+    found = []
+    for degree, most in reach.items():
+        places = [(c, s) for s in range(-most, most + 1) for c in range(components)]
+        for chosen in combinations_with_replacement(places, degree):
+            found.append(Feature(tuple(c for c, _ in chosen), 0, tuple(s for _, s in chosen)))
+    return tuple(found)
 
 
 Table = NDArray[np.int64]
@@ -54,8 +92,8 @@ class FiniteDifferenceModel:
     Attributes
     ----------
     kind : str
-    features : sequence of (components of a monomial, order of its derivative)
-        F of them; those of one monomial are neighbours.
+    features : sequence of Feature
+        F of them; derivatives of one monomial stand together, beginning with that of order 0.
     coefficients : (F, components, n_x) array
         C.
     B : (n_z, n_a) array
@@ -86,8 +124,11 @@ class FiniteDifferenceModel:
 
     @cached_property
     def table(self) -> Table:
-        """Rows: number of factors, the factors, and the order, of each feature."""
-        rows = [[len(m), *m, *(-1,) * (MOST_FACTORS - len(m)), order] for m, order in self.features]
+        """Rows: number of factors, the factors, their shifts, and the order, of each feature."""
+        n_x, rows = self.coefficients.shape[2], []
+        for factors, order, shifts in self.features:
+            ahead = [shift % n_x for shift in shifts]
+            rows.append([len(factors), *_filled(factors, -1), *_filled(ahead, 0), order])
         return np.array(rows, dtype=np.int64)
 
     def step(self, states: Array, actions: Array) -> Array:
@@ -123,11 +164,13 @@ class FiniteDifferenceModel:
         return linearised(self, state, action)
 
     def arrays(self) -> Arrays:
-        axes = {"shape": self._axes} if self.shape else {}
-        return axes | {
+        own: Arrays = {"shape": self._axes} if self.shape else {}
+        if any(any(feature.shifts) for feature in self.features):
+            own["shifts"] = np.array([_filled(feature.shifts, 0) for feature in self.features])
+        return own | {
             "form": np.array("finite-difference"),
             "kind": np.array(self.kind),
-            "table": self.table,
+            "table": np.delete(self.table, np.s_[1 + MOST_FACTORS : -1], axis=1),
             "coefficients": self.coefficients,
             "B": self.B,
             "constant": self.constant,
@@ -140,14 +183,24 @@ class FiniteDifferenceModel:
         table = checked_array(arrays, "table", "i", (None, MOST_FACTORS + 2))
         coefficients = numbers_of(arrays, "coefficients", len(table), None, None)
         _, components, n_x = coefficients.shape
-        features = tuple((tuple(row[1 : 1 + row[0]]), row[-1]) for row in table.tolist())
+        shifts = [()] * len(table)
+        if "shifts" in arrays:
+            every = checked_array(arrays, "shifts", "i", (len(table), MOST_FACTORS)).tolist()
+            shifts = [tuple(own[: row[0]]) for own, row in zip(every, table.tolist(), strict=True)]
+        features = tuple(
+            Feature(tuple(row[1 : 1 + row[0]]), row[-1], own)
+            for row, own in zip(table.tolist(), shifts, strict=True)
+        )
         shape: tuple[int, ...] = ()
         if "shape" in arrays:
             shape = tuple(checked_array(arrays, "shape", "i", (None,)).tolist())
             if len(shape) < 2 or min(shape) < 1 or math.prod(shape) != n_x:
                 raise ValueError(f"a model of {n_x} points has axes of {shown(shape)}")
-        if known := set(features) - set(features_of(components, MOST_FACTORS, len(shape) or 1)):
-            raise ValueError(f"a model has unknown terms: {shown(sorted(known))}")
+        known = set(features_of(components, MOST_FACTORS, len(shape) or 1))
+        if "shifts" in arrays and not shape:
+            known = set(neighbour_features(components))
+        if unknown := set(features) - known:
+            raise ValueError(f"a model has unknown terms: {shown(sorted(unknown))}")
         return FiniteDifferenceModel(
             text_of(arrays, "kind"),
             features,
@@ -164,6 +217,10 @@ class FiniteDifferenceModel:
 
     def _arrays(self) -> tuple[Array, Array, Array]:
         return self.coefficients, self.B, self.constant
+
+
+def _filled(numbers: Sequence[int], value: int) -> list[int]:
+    return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
 
 
 def _contiguous(values: Array) -> Array:

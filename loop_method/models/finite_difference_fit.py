@@ -9,12 +9,14 @@ own, which a ridge holds at zero where the data say nothing of it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
 from loop_method.models.settings import FieldModelSettings
 
 
@@ -39,52 +41,157 @@ def fit_finite_difference(
     axis, where there are several.
     """
     samples = samples.thinned(settings.point_samples)
-    (count, n_z), n_a = samples.before.shape, samples.actions.shape[1]
-    n_x, features = n_z // components, features_of(components, degree, len(shape) or 1)
-    size = np.quantile(np.abs(samples.before).max(axis=1), 0.9)
-    growth = np.array([len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j in features])
-    root = samples.weights()
-    change = (samples.after - samples.before) * root[:, None]
-    C, B, c = np.zeros((len(features), components, n_x)), np.zeros((n_z, n_a)), np.zeros(n_z)
-    model, fitted = FiniteDifferenceModel(kind, features, C, B, c, 8, shape), None
+    features = features_of(components, degree, len(shape) or 1)
+    size = largest_of(samples)
+    model, fitted = nothing(kind, features, samples, components, shape), None
     for _ in range(settings.point_passes):
-        means, miss = model.means(samples.before, samples.actions, samples.after)
-        ok = np.isfinite(means).all(axis=(1, 2)) & np.isfinite(miss).all(axis=1)
-        if 2 * ok.sum() < count:
+        data = Regression.along(model, samples)
+        if data is None:
             break
-        X = (means[ok] * root[ok, None, None]).transpose(2, 0, 1)  # (n_x, N, F)
-        y = change[ok].reshape(-1, components, n_x).transpose(2, 0, 1)  # (n_x, N, components)
-        common = np.hstack([samples.actions, np.ones((count, 1))])[ok] * root[ok, None]
-        C = _coefficients(X, y, common, ridge, settings)
-        inputs = least_squares(common, (y - X @ C).transpose(1, 0, 2).reshape(len(common), -1))
-        if not (np.isfinite(C).all() and np.isfinite(inputs).all()):
+        found = data.solved(coefficients(data.columns(), ridge, settings), model)
+        if found is None:
             break
-        inputs = inputs.reshape(n_a + 1, n_x, components).transpose(2, 1, 0).reshape(n_z, n_a + 1)
-        C = np.ascontiguousarray(C.transpose(1, 2, 0))
-        rate = float((np.abs(C) * growth[:, None, None]).sum(axis=0).max())
-        substeps = int(np.clip(np.ceil(rate / settings.point_reach), 2, settings.point_substeps))
-        B, c = np.ascontiguousarray(inputs[:, :-1]), np.ascontiguousarray(inputs[:, -1])
-        model = fitted = FiniteDifferenceModel(kind, features, C, B, c, substeps, shape)
+        substeps = substeps_of(found, size, settings.point_reach, settings)
+        model = fitted = replace(found, substeps=substeps)
     return fitted
 
 
-def _coefficients(
-    X: Array, y: Array, common: Array, ridge: float | None, settings: FieldModelSettings
-) -> Array:
+def nothing(
+    kind: str,
+    features: tuple[Feature, ...],
+    samples: Samples,
+    components: int,
+    shape: tuple[int, ...] = (),
+) -> FiniteDifferenceModel:
+    """The equation of which nothing is known: a field stays as it is."""
+    n_z, n_a = samples.before.shape[1], samples.actions.shape[1]
+    C = np.zeros((len(features), components, n_z // components))
+    return FiniteDifferenceModel(kind, features, C, np.zeros((n_z, n_a)), np.zeros(n_z), 8, shape)
+
+
+def largest_of(samples: Samples) -> float:
+    """The size of a field, for which internal steps are counted."""
+    return float(np.quantile(np.abs(samples.before).max(axis=1), 0.9))
+
+
+def substeps_of(
+    model: FiniteDifferenceModel, size: float, reach: float, settings: FieldModelSettings
+) -> int:
+    """Enough internal steps for a field of that size, of `reach` over its fastest rate each."""
+    growth = np.array(
+        [len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j, _ in model.features]
+    )
+    rate = float((np.abs(model.coefficients) * growth[:, None, None]).sum(axis=0).max())
+    return int(np.clip(np.ceil(rate / reach), 2, settings.point_substeps))
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The normal equations of each point, free of the inputs, in columns X with a sum of squares of 1.
+
+    Attributes
+    ----------
+    gram, moment : (n_x, F, F) and (n_x, F, components) arrays
+        X^T X and X^T y.
+    square : float
+        The sum of y^2 over all points.
+    scale : (F,) array
+        By which the columns were divided.
+    """
+
+    gram: Array
+    moment: Array
+    square: float
+    scale: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """What a pass regresses.
+
+    Attributes
+    ----------
+    X : (n_x, N, F) array
+        Means of the features, weighted.
+    y : (n_x, N, components) array
+        The change to be explained.
+    common : (N, n_a + 1) array
+        The inputs and 1.
+    miss, change : float
+        Root of the mean square of what the steps of the model missed, and of what the plant's changed.
+    """
+
+    X: Array
+    y: Array
+    common: Array
+    miss: float
+    change: float
+
+    @classmethod
+    def along(
+        cls, model: FiniteDifferenceModel, samples: Samples, *, missed: bool = False
+    ) -> Regression | None:
+        """That of the model's paths, or None where half of the samples overflow it.
+
+        missed: explain what the model's own steps miss, apart from what it explains already. Where it
+        is best, an error of the means then has no effect on it.
+        """
+        components, n_x = model.coefficients.shape[1:]
+        root = samples.weights()
+        means, miss = model.means(samples.before, samples.actions, samples.after)
+        ok = np.isfinite(means).all(axis=(1, 2)) & np.isfinite(miss).all(axis=1)
+        if 2 * ok.sum() < len(samples):
+            return None
+        means, miss, actions, root = means[ok], miss[ok], samples.actions[ok], root[ok]
+        if missed:
+            own = np.einsum("nfx,fcx->ncx", means, model.coefficients).reshape(miss.shape)
+            change = (miss + own + actions @ model.B.T + model.constant) * root[:, None]
+        else:
+            change = (samples.after - samples.before)[ok] * root[:, None]
+        return cls(
+            (means * root[:, None, None]).transpose(2, 0, 1),
+            change.reshape(-1, components, n_x).transpose(2, 0, 1),
+            np.hstack([actions, np.ones((len(actions), 1))]) * root[:, None],
+            float(np.sqrt(np.mean((miss * root[:, None]) ** 2))),
+            float(np.sqrt(np.mean(((samples.after - samples.before)[ok] * root[:, None]) ** 2))),
+        )
+
+    def columns(self) -> Columns:
+        """The normal equations without the inputs."""
+        basis = orthonormal(self.common)
+        X, y = (values - basis @ (basis.T @ values) for values in (self.X, self.y))
+        scale = np.sqrt(np.sum(X**2, axis=(0, 1)))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        X = X / scale
+        transposed = X.transpose(0, 2, 1)
+        return Columns(transposed @ X, transposed @ y, float(np.sum(y**2)), scale)
+
+    def solved(self, C: Array, model: FiniteDifferenceModel) -> FiniteDifferenceModel | None:
+        """The equation with coefficients (n_x, F, components); None where it is not finite."""
+        n_x, _, components = self.y.shape
+        left = (self.y - self.X @ C).transpose(1, 0, 2).reshape(len(self.common), -1)
+        inputs = least_squares(self.common, left)
+        if not (np.isfinite(C).all() and np.isfinite(inputs).all()):
+            return None
+        inputs = inputs.reshape(-1, n_x, components).transpose(2, 1, 0).reshape(model.n_z, -1)
+        return replace(
+            model,
+            coefficients=np.ascontiguousarray(C.transpose(1, 2, 0)),
+            B=np.ascontiguousarray(inputs[:, :-1]),
+            constant=np.ascontiguousarray(inputs[:, -1]),
+        )
+
+
+def coefficients(columns: Columns, ridge: float | None, settings: FieldModelSettings) -> Array:
     """Coefficients of every point, (n_x, F, components)."""
-    basis = orthonormal(common)
-    X, y = (values - basis @ (basis.T @ values) for values in (X, y))
-    scale = np.sqrt(np.sum(X**2, axis=(0, 1)))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    X = X / scale
-    gram, moment = X.transpose(0, 2, 1) @ X, X.transpose(0, 2, 1) @ y
-    eye = np.eye(X.shape[2])
+    gram, moment, scale = columns.gram, columns.moment, columns.scale
+    eye = np.eye(len(scale))
     shared = np.linalg.solve(
         gram.sum(axis=0) + settings.coefficient_ridge * eye, moment.sum(axis=0)
     )
     found = np.broadcast_to(shared, moment.shape)
     if ridge is not None:
-        own = np.linalg.solve(gram + ridge / len(X) * eye, moment - gram @ shared)
+        own = np.linalg.solve(gram + ridge / len(gram) * eye, moment - gram @ shared)
         found = found + own
-    coefficients: Array = found / scale[:, None]
-    return coefficients
+    every: Array = found / scale[:, None]
+    return every

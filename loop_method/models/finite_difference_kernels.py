@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 from loop_interfaces.arrays import Array
 from loop_interfaces.jit.cache import cached_njit, jit
 
+MOST_FACTORS = 5
 Table = NDArray[np.int64]
-"""A feature a row: its number of factors, the factors, and the order of its difference."""
+"""A feature a row: its number of factors, the factors, their shifts, and the order of its difference.
+
+A shift is 0 .. n_x - 1, counted on the ring.
+"""
 
 
 @jit
@@ -25,15 +29,28 @@ def forcing(action: Array, B: Array, constant: Array, force: Array) -> None:
 
 
 @jit
+def multiply(z: Array, row: Array, without: int, value: Array) -> None:
+    """Multiply by all factors of a monomial but one."""
+    n_x = z.shape[1]
+    for factor in range(row[0]):
+        if factor != without:
+            c, ahead = row[1 + factor], row[1 + MOST_FACTORS + factor]
+            for i in range(n_x - ahead):
+                value[i] *= z[c, i + ahead]
+            for i in range(n_x - ahead, n_x):
+                value[i] *= z[c, i + ahead - n_x]
+
+
+@jit
 def monomial(z: Array, row: Array, ring: Array) -> None:
     """A monomial at the points 1 .. n_x of a ring, whose ends are repeated."""
     n_x = z.shape[1]
-    for i in range(n_x):
-        ring[1 + i] = z[row[1], i]
-    for factor in range(1, row[0]):
-        c = row[1 + factor]
-        for i in range(n_x):
-            ring[1 + i] *= z[c, i]
+    c, ahead = row[1], row[1 + MOST_FACTORS]
+    for i in range(n_x - ahead):
+        ring[1 + i] = z[c, i + ahead]
+    for i in range(n_x - ahead, n_x):
+        ring[1 + i] = z[c, i + ahead - n_x]
+    multiply(z, row, 0, ring[1:])
     ring[0], ring[n_x + 1] = ring[n_x], ring[1]
 
 
@@ -121,14 +138,12 @@ def transposed_rate(
         for own in range(table[f, 0]):
             for i in range(n_x):
                 value[i] = on_m[i]
-            for factor in range(table[f, 0]):
-                if factor != own:
-                    c = table[f, 1 + factor]
-                    for i in range(n_x):
-                        value[i] *= z[c, i]
-            c = table[f, 1 + own]
-            for i in range(n_x):
-                out[c, i] += value[i]
+            multiply(z, table[f], own, value)
+            c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
+            for i in range(n_x - ahead):
+                out[c, i + ahead] += value[i]
+            for i in range(n_x - ahead, n_x):
+                out[c, i + ahead - n_x] += value[i]
         on_m[:] = 0.0
 
 

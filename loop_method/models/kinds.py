@@ -11,10 +11,11 @@ from typing import Any
 
 from loop_method.models.base import FieldModel, Measured, Samples
 from loop_method.models.coarse import fit_coarse
-from loop_method.models.finite_difference import features_of
+from loop_method.models.finite_difference import features_of, neighbour_features
 from loop_method.models.finite_difference_fit import fit_finite_difference
 from loop_method.models.linear import fit_convolution, fit_linear
 from loop_method.models.low_rank import fit_low_rank
+from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.noisy_fit import fit_noisy
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral_fit import fit_spectral
@@ -33,6 +34,7 @@ FORMS = (
     Form(name="free3", degree=3, free="all"),
 )
 POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
+NEAR_RIDGES = {"near-shared": None, "near1e-5": 1e-5, "near1e-9": 1e-9}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
 LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
@@ -53,12 +55,15 @@ class Kind:
     fit_noisy : callable, optional
         The model of rollouts whose states have noise of a known standard deviation, or None; without
         it, `fit` is given the denoised states.
+    needed : float
+        It is tried only where the best E so far is larger.
     """
 
     name: str
     fit: Callable[[Samples], FieldModel | None]
     unknowns: tuple[float, int]
     fit_noisy: Callable[[Sequence[Measured], float], FieldModel | None] | None = None
+    needed: float = 0.0
 
 
 def kinds_of(
@@ -94,12 +99,14 @@ def kinds_of(
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
         ]
     kinds += _several_fields(n_z, components, settings)
+    near = _neighbours(n_z, components, settings)
     if components == 1:  # two fields that were not declared
         two = _several_fields(n_z, 2, settings, "two-")
         # Linear ones are tried early, as that is quick.
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
-    return kinds + _linear(n_z, settings)
+        near += _neighbours(n_z, 2, settings, "two-")
+    return kinds + _linear(n_z, settings) + near
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
@@ -136,6 +143,27 @@ def _several_fields(
         )
         kinds.append(Kind(name, convolution, (float(components), 0)))
     return kinds + _finite_difference(components, settings, prefix)
+
+
+def _neighbours(
+    n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
+) -> list[Kind]:
+    """Products of neighbours, for states that are no fields; arguments: as of `_several_fields`."""
+    count = components * len(neighbour_features(components))
+    if n_z % components or n_z // components < 5 or n_z > settings.dense:
+        return []
+    kinds = []
+    for name, ridge in NEAR_RIDGES.items():
+        fit = partial(
+            fit_neighbours,
+            components=components,
+            kind=prefix + name,
+            settings=settings,
+            ridge=ridge,
+        )
+        own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-7 else 1.0)
+        kinds.append(Kind(prefix + name, fit, (own, count), needed=settings.near_needed))
+    return kinds
 
 
 def _finite_difference(

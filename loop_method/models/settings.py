@@ -34,7 +34,10 @@ class FieldModelSettings(Settings):
     )
     worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
     dense: int = setting(
-        512, "largest state for the kinds whose cost grows with its square", 2, 65536
+        512,
+        "largest state for the kinds whose cost grows with its square, and for models of neighbours",
+        2,
+        65536,
     )
     largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
     fewest_points: int = setting(8, "minimum number of grid points of a spectral model", 4, 65536)
@@ -66,6 +69,26 @@ class FieldModelSettings(Settings):
     point_substeps: int = setting(32, "as `substeps`, for finite-difference models", 2, 1000)
     point_reach: float = setting(
         2.5, "as `reach`, for finite-difference models, whose rule is of order 4", 0.1, 2.8
+    )
+    near_needed: float = setting(
+        0.05, "least E of the other kinds above which models of neighbours are tried", 0, 10
+    )
+    near_passes: int = setting(
+        8, "further passes of a model of neighbours, on what its steps miss", 1, 50
+    )
+    near_samples: int = setting(400, "as `samples`, for models of neighbours", 50, 1_000_000)
+    near_hopeless: float = setting(
+        0.1, "share of the change that its first passes may miss for others to follow", 0, 10
+    )
+    near_settled: float = setting(
+        0.1, "relative change of what its steps miss at which the passes end", 0, 1
+    )
+    near_reach: float = setting(0.5, "as `point_reach`, for models of neighbours", 0.1, 2.8)
+    near_dropped: float = setting(
+        0.5, "share by which its residual may grow for products that are left out", 0, 100
+    )
+    near_negligible: float = setting(
+        1e-12, "squared error that counts as none there, as a share of the squared change", 0, 1
     )
     coarse_points: int = setting(
         256,

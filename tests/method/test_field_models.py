@@ -12,7 +12,11 @@ from scipy.integrate import solve_ivp
 
 from loop_method.models import Measured, affine_law
 from loop_method.models.files import model_of
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.finite_difference import (
+    FiniteDifferenceModel,
+    features_of,
+    neighbour_features,
+)
 from loop_method.models.linear import LinearModel
 from loop_method.models.prediction import errors, pieces, predicted
 from loop_method.models.spectral import SpectralModel
@@ -42,6 +46,15 @@ def finite_difference(components, degree=3, n_x=9):
     return FiniteDifferenceModel("x1e-5", features, C, B, c, 3)
 
 
+def neighbours(components, n_x=7):
+    rng = np.random.default_rng(components)
+    features = neighbour_features(components)
+    C = 0.03 * rng.normal(size=(len(features), components, n_x))
+    n_z = components * n_x
+    B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
+    return FiniteDifferenceModel("near1e-5", features, C, B, c, 3)
+
+
 def linear(n_z=10):
     rng = np.random.default_rng(0)
     return LinearModel(
@@ -57,6 +70,8 @@ MODELS = {
     "fewer steps": lambda: replace(spectral(), fewer=np.array([[0.9, 1.0], [1.2, 2.0]])),
     "one component": lambda: finite_difference(1, 5),
     "two components": lambda: finite_difference(2),
+    "neighbours": lambda: neighbours(1),
+    "neighbours of two components": lambda: neighbours(2),
     "linear": linear,
 }
 

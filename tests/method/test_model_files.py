@@ -10,7 +10,11 @@ from loop_method.models import FieldModel
 from loop_method.models.base import MAX_SUBSTEPS
 from loop_method.models.coarse import CoarseModel
 from loop_method.models.files import FORMS, model_of
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.finite_difference import (
+    FiniteDifferenceModel,
+    features_of,
+    neighbour_features,
+)
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
@@ -80,7 +84,18 @@ MODELS: dict[str, FieldModel] = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
+NEIGHBOURS = "neighbours"
+MODELS[NEIGHBOURS] = FiniteDifferenceModel(
+    "k",
+    neighbour_features(1),
+    numbers(len(neighbour_features(1)), 1, N_Z),
+    numbers(N_Z, N_A),
+    numbers(N_Z),
+    4,
+)
+
+
+@pytest.mark.parametrize("form", [*FORMS, NEIGHBOURS])
 def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     arrays = MODELS[form].arrays()
     again = model_of(arrays).arrays()
@@ -103,7 +118,7 @@ def test_a_model_has_no_actuators_of_negative_width() -> None:
         model_of({**MODELS["sensed"].arrays(), "width": np.array(-0.1)})
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS, NEIGHBOURS])
 def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
     arrays = MODELS[form].arrays()
     # Axes that nothing else tells the length of; the sensed model has a centre for each actuator.
@@ -131,6 +146,7 @@ def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
         ("finite-difference", "substeps", np.array(2**62)),
         ("finite-difference", "table", np.full((len(features_of(1)), 7), 9)),
         ("finite-difference", "table", np.full((len(features_of(1)), 7), -9)),
+        (NEIGHBOURS, "shifts", np.full((len(neighbour_features(1)), 5), 3)),
         ("sensed", "sensors", np.array(-1)),
         ("sensed", "sensors", np.array(SENSORS + 1)),
         ("linear", "form", np.array("quantum")),

@@ -10,7 +10,7 @@ from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.models import FieldModelSettings, Measured, fit_field_model
 from loop_method.models.coarse import CoarseModel, coarse_points
 from loop_method.models.files import model_of
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
 
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX
@@ -38,7 +38,7 @@ def test_a_difference_is_along_one_axis_of_a_ring(order: int) -> None:
     features = features_of(1, axes=2)
     C = np.zeros((len(features), 1, N_Z))
     size = 1e-6
-    C[features.index(((0,), order))] = size
+    C[features.index(Feature((0,), order))] = size
     own = FiniteDifferenceModel(
         "x-shared", features, C, np.zeros((N_Z, N_A)), np.zeros(N_Z), 1, SHAPE
     )

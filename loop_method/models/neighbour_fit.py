@@ -1,0 +1,124 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The fit of an equation of products of neighbours, for states that are values of cells, not fields.
+
+    dz_i/dt = sum_f C_f m_f(z_{i-r} .. z_{i+r}) + (B a + c)_i,
+
+with all monomials m_f of a few neighbours to begin with (`neighbour_features`). Three things differ
+from `finite_difference_fit`, as the plants are often chaotic, so that a small error of a step is a
+large one of a rollout:
+
+- After its passes, others regress what the model's own steps miss. The error of the means along its
+  paths has no effect on where they end: of a plant without noise the coefficients are exact.
+- Monomials that explain nothing are then left out, one by one, as long as the residual stays what it
+  is. A simulation takes as long as there are monomials, and what is left out cannot mislead a law that
+  goes beyond the data.
+- The pass with the least residual is selected, as passes need not be contractions.
+
+References
+----------
+Brunton, Proctor, Kutz, "Discovering governing equations from data by sparse identification of
+nonlinear dynamical systems", PNAS 113(15), 2016. Miller, "Subset Selection in Regression", 2nd ed.,
+Chapman & Hall 2002, chapter 3 (backward elimination).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from loop_method.models.base import Samples
+from loop_method.models.finite_difference import FiniteDifferenceModel, neighbour_features
+from loop_method.models.finite_difference_fit import (
+    Columns,
+    Regression,
+    coefficients,
+    largest_of,
+    nothing,
+    substeps_of,
+)
+from loop_method.models.settings import FieldModelSettings
+
+
+def fit_neighbours(
+    samples: Samples,
+    *,
+    kind: str,
+    settings: FieldModelSettings,
+    components: int = 1,
+    ridge: float | None = None,
+) -> FiniteDifferenceModel | None:
+    """The equation, or None where half of the samples overflow the first ones.
+
+    ridge: of the points' own parts in normalised columns; None: all points share their coefficients.
+    """
+    samples = samples.thinned(settings.near_samples)
+    model = nothing(kind, neighbour_features(components), samples, components)
+    every = _passes(model, samples, ridge, settings, settings.point_passes)
+    data = every and Regression.along(every, samples, missed=True)
+    if not (every and data):
+        return every
+    kept = explaining(data.columns(), ridge is None, settings)
+    fewer = replace(
+        every,
+        features=tuple(every.features[f] for f in kept),
+        coefficients=np.ascontiguousarray(every.coefficients[kept]),
+    )
+    return _passes(fewer, samples, ridge, settings, 0) or every
+
+
+def _passes(
+    model: FiniteDifferenceModel,
+    samples: Samples,
+    ridge: float | None,
+    settings: FieldModelSettings,
+    first: int,
+) -> FiniteDifferenceModel | None:
+    """The best equation of some passes, the first ones of which do not regress what steps miss."""
+    size = largest_of(samples)
+    best, least = None, np.inf
+    for turn in range(first + settings.near_passes + 1):
+        data = Regression.along(model, samples, missed=turn >= first)
+        if data is None:
+            break
+        if turn == first and data.miss > settings.near_hopeless * data.change:
+            return model if turn else None  # the plant is of another kind
+        if turn and data.miss < least:
+            settled = data.miss > (1.0 - settings.near_settled) * least
+            best, least = model, data.miss
+            if settled and turn > first:
+                break
+        elif turn > first + 1:
+            break
+        found = data.solved(coefficients(data.columns(), ridge, settings), model)
+        if found is None:
+            break
+        model = replace(found, substeps=substeps_of(found, size, settings.near_reach, settings))
+    return best
+
+
+def explaining(columns: Columns, shared: bool, settings: FieldModelSettings) -> list[int]:
+    """The features without which the residual is clearly larger, left out one by one."""
+    gram, moment = columns.gram, columns.moment
+    if shared:
+        gram, moment = gram.sum(axis=0)[None], moment.sum(axis=0)[None]
+    size = settings.coefficient_ridge * np.trace(gram, axis1=1, axis2=2)[:, None, None]
+    inverse = np.linalg.inv(gram + size * np.eye(gram.shape[1]))
+    w = inverse @ moment
+    residual = max(columns.square - float(np.sum(moment * w)), 0.0)
+    most = settings.near_dropped * residual + settings.near_negligible * columns.square
+    kept = list(range(gram.shape[1]))
+    lost = 0.0
+    while len(kept) > 1:
+        diagonal = np.diagonal(inverse, axis1=1, axis2=2)
+        own = np.sum(np.sum(w**2, axis=2) / diagonal, axis=0)
+        f = int(np.argmin(own))
+        if lost + own[f] > most:
+            break
+        lost += float(own[f])
+        ratio = inverse[:, :, f] / diagonal[:, f, None]
+        w = np.delete(w - ratio[:, :, None] * w[:, f, None, :], f, axis=1)
+        inverse = inverse - ratio[:, :, None] * inverse[:, f, None, :]
+        inverse = np.delete(np.delete(inverse, f, axis=1), f, axis=2)
+        del kept[f]
+    return kept

@@ -1,0 +1,133 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Equations of products of neighbours are recovered exactly, with no other terms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.models import FieldModelSettings, Measured, fit_field_model
+from loop_method.models.base import Samples
+from loop_method.models.kinds import NEAR_RIDGES, kinds_of
+from loop_method.models.neighbour_fit import fit_neighbours
+from loop_method.models.prediction import errors
+
+N_X, DT = 12, 0.1
+SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)
+B = np.repeat(np.eye(3), 4, axis=0)
+
+
+def neighbour(z, by):
+    return np.roll(z, -by, axis=-1)
+
+
+def rolled_out(rate, count, n_z, steps=60, variance=1.0, start=1.0):
+    """Rollouts of dz/dt = rate(z) + B a in fine steps, white inputs acting on the last cells."""
+    rng, h = np.random.default_rng(0), DT / 20
+    actions = np.sqrt(variance) * rng.normal(size=(count, steps, B.shape[1]))
+    states = [start + 0.5 * rng.normal(size=(count, n_z))]
+    for k in range(steps):
+        z, force = states[-1], np.zeros((count, n_z))
+        force[:, n_z - N_X :] = actions[:, k] @ B.T
+        for _ in range(20):  # the classical method of order 4
+            k1 = rate(z) + force
+            k2 = rate(z + h / 2 * k1) + force
+            k3 = rate(z + h / 2 * k2) + force
+            k4 = rate(z + h * k3) + force
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        states.append(z)
+    return [Measured(z, a) for z, a in zip(np.stack(states, axis=1), actions, strict=True)]
+
+
+def chain(z):
+    """Products at distances 1, 2 and of three neighbours; no difference of any power."""
+    product = 0.8 * neighbour(z, 1) * neighbour(z, -2) - 0.5 * neighbour(z, -1) ** 2
+    return product - z + 0.7 * neighbour(z, 2) - 0.2 * z * neighbour(z, 1) * neighbour(z, -1) + 0.3
+
+
+CHAIN = {
+    ((0,), (0,)): -1.0,
+    ((0,), (2,)): 0.7,
+    ((0, 0), (-2, 1)): 0.8,
+    ((0, 0), (-1, -1)): -0.5,
+    ((0, 0, 0), (-1, 0, 1)): -0.2,
+}
+
+
+def test_a_plant_of_products_of_neighbours_is_recovered_to_1e_6_without_other_terms():
+    rollouts = rolled_out(chain, 2, N_X)
+    model = fit_neighbours(Samples.of(rollouts), kind="near-shared", settings=SETTINGS)
+    found = {
+        (f.factors, f.shifts): C for f, C in zip(model.features, model.coefficients, strict=True)
+    }
+    assert found.keys() == CHAIN.keys()
+    for term, C in found.items():
+        np.testing.assert_allclose(C / DT, CHAIN[term], atol=1e-6)
+    np.testing.assert_allclose(model.B / DT, B, atol=1e-6)
+    np.testing.assert_allclose(model.constant / DT, 0.3, atol=1e-6)
+
+
+def lorenz(z):
+    """Lorenz-96, which is chaotic."""
+    return (neighbour(z, 1) - neighbour(z, -2)) * neighbour(z, -1) - z + 8.0
+
+
+def test_whole_rollouts_of_a_chaotic_plant_are_predicted():
+    """Errors of the path's means alone, 1e-4 of a step, would be as large as the plant at the end."""
+    rollouts = rolled_out(lorenz, 4, N_X, steps=50, variance=4.0, start=4.0)
+    fitted = fit_field_model(rollouts[:3], np.zeros(N_X), settings=SETTINGS, first="near-shared")
+    assert fitted is not None
+    assert fitted.model.kind == "near-shared" and fitted.error < 1e-4
+    assert errors(fitted.model, rollouts[3:], np.zeros(N_X), 2.0)[0] < 1e-4
+    assert len(fitted.model.features) == 3
+
+
+GROWTH = 1.0 + 0.3 * np.cos(np.arange(N_X))
+
+
+def species(z):
+    """A ring of competing species, each with a growth of its own."""
+    return z * (GROWTH - z - 0.4 * neighbour(z, 1) - 0.6 * neighbour(z, -1))
+
+
+def oscillators(z):
+    """A Fermi-Pasta-Ulam ring: displacements, then speeds, with cubic springs to neighbours."""
+    q, p = np.split(z, 2, axis=-1)
+    stretch = neighbour(q, 1) - q
+    force = stretch + 0.5 * stretch**3
+    return np.concatenate([p, force - neighbour(force, -1) - 0.1 * p], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("rate", "components", "ridge", "variance", "terms"),
+    [(species, 1, 1e-9, 0.05, 4), (oscillators, 2, None, 0.3, 11)],
+)
+def test_cells_of_their_own_and_pairs_of_components_are_described(
+    rate, components, ridge, variance, terms
+):
+    """The oscillators': the speed, three displacements, and the seven cubes of (q_i, q_{i+1})."""
+    n_z, start = components * N_X, 1.0 if rate is species else 0.0
+    rollouts = rolled_out(rate, 4, n_z, variance=variance, start=start)
+    model = fit_neighbours(
+        Samples.of(rollouts[:3]),
+        kind="k",
+        settings=FieldModelSettings(near_samples=90),
+        components=components,
+        ridge=ridge,
+    )
+    assert len(model.features) == terms
+    assert errors(model, rollouts[3:], np.zeros(n_z), 2.0)[0] < 1e-8
+
+
+@pytest.mark.parametrize(("components", "prefix"), [(1, "two-"), (2, "")])
+def test_pairs_of_components_need_not_be_declared(components, prefix):
+    names = {kind.name for kind in kinds_of(2 * N_X, components, SETTINGS)}
+    assert {prefix + name for name in NEAR_RIDGES} <= names
+
+
+def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():
+    rollouts = rolled_out(lambda z: 0.2 * (neighbour(z, 1) - 2 * z + neighbour(z, -1)) - z, 3, N_X)
+    settings = FieldModelSettings(reproduced=0.0, largest_degree=2, passes=2, folds=2)
+    fitted = fit_field_model(rollouts, np.zeros(N_X), settings=settings)
+    assert fitted is not None and fitted.error < settings.near_needed
+    assert not any(kind.startswith(("near", "two-near")) for kind, _ in fitted.candidates)
