@@ -5,6 +5,7 @@ ros2 launch pdeloop loop.launch.py problem:=kdv namespace:=lab
 ros2 launch pdeloop loop.launch.py --show-args
 """
 
+from dataclasses import replace
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
@@ -19,6 +20,7 @@ from launch.events.process import ProcessExited
 from launch_ros.actions import Node
 
 from loop_interfaces.isolation import NETWORK
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.parameters import OF_THE_PLANT, flags
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
 from loop_method.laws.registry import OWN_LAWS
@@ -91,18 +93,22 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
         # The type of an empty list cannot be told.
         own |= {name: value for name, value in filled.items() if value != []}
     problem = find_problem(given["problem"]).resolve()
+    in_file = read_problem(problem)
+    own = {name: value for name, value in own.items() if value != in_file.get(name)}
+    nodes = pair_nodes(pair_cores(PAIRS.parse(given["pairs"])))
+    nodes = [replace(node, parameters={**own, **node.parameters}) for node in nodes]
     return actions + [
         Node(
             package="pdeloop",
             executable=node.package,
             namespace=node.namespace_in(given["namespace"]),
-            parameters=[problem, {**own, **node.parameters}],
-            ros_arguments=["--log-level", given["log_level"]],
+            # Not as `parameters`: launch_ros leaves a file for each dictionary in the temporary folder.
+            ros_arguments=["--log-level", given["log_level"], *node.parameter_arguments(problem)],
             output="screen",
             respawn=True,
             respawn_delay=1.0,
         )
-        for node in pair_nodes(pair_cores(PAIRS.parse(given["pairs"])))
+        for node in nodes
     ]
 
 

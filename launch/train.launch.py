@@ -99,17 +99,20 @@ def training(context: LaunchContext) -> list[Any]:
     for node in transport.nodes(folder):
         if node.package in PAIR:
             continue  # of the loop
-        own, options = dict(node.parameters), {"respawn": True, "respawn_delay": 1.0}
+        options: dict[str, Any] = {"respawn": True, "respawn_delay": 1.0}
         if node.package == "recorder_node":  # not started again: it has a bag to finish
-            own["bag"] = str(unused(folder / "bag"))
+            node = node.having(bag=str(unused(folder / "bag")))
             grace = str(RECORDER_GRACE)
             options = {"sigterm_timeout": grace, "sigkill_timeout": grace}
         action = Node(
             package="pdeloop",
             executable=node.package,
             namespace=node.namespace_in(given["namespace"]),
-            parameters=[folder / "parameters.yaml", own],
-            ros_arguments=["--log-level", given["log_level"]],
+            # Not as `parameters`: launch_ros leaves a file for each dictionary in the temporary folder.
+            ros_arguments=[
+                *("--log-level", given["log_level"]),
+                *node.parameter_arguments(folder / "parameters.yaml"),
+            ],
             output="screen",
             **options,
         )

@@ -66,11 +66,16 @@ class LoopNode:
         """The same node where the recorder has ended: only a tuner that requires one waits for it."""
         return self.having(recorder="none") if self.parameters.get("recorder") == "start" else self
 
-    def ros_arguments(self, parameter_file: Path) -> list[str]:
-        """All that follows `--ros-args` in its command."""
+    def parameter_arguments(self, parameter_file: Path) -> list[str]:
+        """The arguments after `--ros-args` that give it the file's parameters, then its own."""
         words = ["--params-file", str(parameter_file)]
         for assignment in self.assignments:
             words += ["-p", assignment]
+        return words
+
+    def ros_arguments(self, parameter_file: Path) -> list[str]:
+        """All that follows `--ros-args` in its command."""
+        words = self.parameter_arguments(parameter_file)
         return [*words, "-r", f"__ns:=/{self.namespace}"] if self.namespace else words
 
 

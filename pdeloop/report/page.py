@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import jinja2
 import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from loop_interfaces.files import make_own_folder, write_atomically
@@ -81,16 +83,22 @@ def report(data: ReportData, out: Path | None, *, animate: bool = False) -> Path
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
     png, svg, dark = io.BytesIO(), io.BytesIO(), io.BytesIO()
-    figure.savefig(png, format="png")
+    _draw(figure, png)
     figure.set_layout_engine("none")  # it is laid out, which takes as long as a drawing
-    figure.savefig(svg, format="svg", metadata={"Date": None})
+    FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None})
     for kind, content in (("png", png), ("svg", svg)):
         write_atomically(target / f"{name}.{kind}", content.getvalue())
     darken(figure)
-    figure.savefig(dark, format="png")
+    _draw(figure, dark)
     width = round(PIXELS_PER_INCH * figure.get_figwidth())
     shown = (base64.b64encode(kind.getvalue()).decode() for kind in (png, dark))
     return Picture(name, heading, caption, width, *shown)
+
+
+def _draw(figure: Figure, png: io.BytesIO) -> None:
+    """Draw a figure once. `savefig` draws it twice: first to lay it out, which drawing does anyway."""
+    figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
+    FigureCanvasAgg(figure).print_png(png)
 
 
 def _moving(target: Path, problem: ProblemData) -> Picture | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from loop_interfaces.isolation import NETWORK
 from loop_interfaces.loop_parameters import read_problem
@@ -176,8 +178,16 @@ for line in sys.stdin:
 
 def given_to(node: dict[str, Any]) -> dict[str, Any]:
     """What a node is told besides the parameter file."""
-    own: dict[str, Any] = node["parameters"][1]
-    return own
+    words = node["arguments"]
+    own = [word for before, word in itertools.pairwise(words) if before == "-p"]
+    return {name: yaml.safe_load(value) for name, value in (word.split(":=", 1) for word in own)}
+
+
+def file_of(node: dict[str, Any]) -> str:
+    """The parameter file of a node, which comes before what it is told besides."""
+    words: list[str] = node["arguments"]
+    assert "-p" not in words[: words.index("--params-file")]
+    return words[words.index("--params-file") + 1]
 
 
 def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, tmp_path) -> None:
@@ -205,7 +215,7 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
         assert node["executable"] in PROJECT["project"]["scripts"]
         assert importlib.util.find_spec(f"{node['executable']}.node") is not None
         assert set(given_to(node)) <= known
-        assert node["parameters"][0] == str(run / "parameters.yaml")
+        assert file_of(node) == str(run / "parameters.yaml")
     values = read_problem(run / "parameters.yaml")
     assert (values["iterations"], values["real_time_factor"], values["n_z"]) == (3, 50.0, 32)
     assert (values["physical.viscosity"], values["horizon"]) == (2e-2, 20)
@@ -214,6 +224,8 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
     assert by_name["tuner_node"]["plant_fingerprint"] == fingerprint(values)
     assert by_name["tuner_node"]["pairs"] == by_name["recorder_node"]["pairs"] == ["pair0", "pair1"]
     assert [given_to(node).get("publish_clock") for node in nodes[3::2]] == [None, False]
+    # The run's file has the rest: a cost over time would not fit into an argument.
+    assert all(set(given_to(node)) <= {"pin", "publish_clock"} for node in nodes[3:])
 
 
 def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(
@@ -221,7 +233,7 @@ def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(
 ) -> None:
     launched(TRAIN, problem=SMALL, out=tmp_path / "run", iterations=3)
     again = launched(TRAIN, resume=tmp_path / "run", record_or_stop="true")
-    assert again[0]["parameters"][0] == str(tmp_path / "run" / "parameters.yaml")
+    assert file_of(again[0]) == str(tmp_path / "run" / "parameters.yaml")
     by_name = {node["executable"]: given_to(node) for node in again}
     assert by_name["tuner_node"]["recorder"] == "required"
     with pytest.raises(ValueError, match="leave out seed"):

@@ -144,7 +144,7 @@ def start(action: Any, command: list[str], context: LaunchContext) -> None:
     """Start a process for an action, or say so."""
     if os.environ.get("LAUNCH_DRY_RUN"):
         told = {"executable": action.executable, "namespace": action.namespace}
-        told["parameters"] = [dict(p) if isinstance(p, dict) else str(p) for p in action.parameters]
+        told["arguments"] = action.ros_arguments
         told["environment"] = {n: v for n, v in os.environ.items() if n.startswith("PDELOOP_")}
         json.dump(told, sys.stdout)
         print(flush=True)
