@@ -9,6 +9,7 @@ import gc
 import itertools
 import os
 import signal
+import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations.loading import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
+from tests.support import leftovers
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.compiled import COMPILED
 from tests.support.loop_harness import Processes, processes
@@ -32,7 +34,23 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+def temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The temporary folder of whatever the tests run, of this worker alone; see `leftovers`."""
+    folder = tmp_path_factory.mktemp("tmp", numbered=False)  # short: sockets are in it
+    os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_left(temporary_folder: Path, request: pytest.FixtureRequest) -> Iterator[None]:
+    """No file of the temporary folder, and no process, remains of the tests in a file."""
+    before = leftovers.files(temporary_folder)
+    yield
+    leftovers.check(temporary_folder, before, f"the tests of {request.node.name}")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled(tmp_path_factory: pytest.TempPathFactory, temporary_folder: Path) -> None:
     """What nearly all tests use is compiled once, its parts by as many workers, not by each of them."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return

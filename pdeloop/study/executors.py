@@ -12,11 +12,13 @@ import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from importlib import metadata
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from loop_interfaces.affinity import usable_cores
 from loop_interfaces.module_path import SAFE_PATH, safe_children
 from loop_interfaces.start import die_with
+from pdeloop.study import training
 from pdeloop.study.description import StudyError
 from spectral_solver.workers import use_cores
 
@@ -32,12 +34,17 @@ WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
 def processes(count: int | None = None) -> Iterator[Executor]:
     """This many processes on this machine, one core each; by default as many as cores.
 
-    An exception in the block ends them at once, in the middle of what they do.
+    An exception in the block ends them at once, in the middle of what they do, so their files are in
+    a folder of this process, which it removes.
     """
     context = multiprocessing.get_context("spawn")
     others = {process.pid for process in multiprocessing.active_children()}
     workers = count or len(usable_cores())
-    with safe_children(), ProcessPoolExecutor(workers, context, _begin, (os.getpid(),)) as pool:
+    with (
+        TemporaryDirectory(prefix="pdeloop-") as folder,
+        safe_children(),
+        ProcessPoolExecutor(workers, context, _begin, (os.getpid(), folder)) as pool,
+    ):
         try:
             yield pool
         except BaseException:
@@ -48,12 +55,16 @@ def processes(count: int | None = None) -> Iterator[Executor]:
             raise
 
 
-def _begin(parent: int) -> None:
-    """In a process that is about to train. Ctrl-C is for its parent, which then ends it."""
+def _begin(parent: int, folder: str) -> None:
+    """In a process that is about to train. Ctrl-C is for its parent, which then ends it.
+
+    folder: where its trainings keep their files.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with(parent)
     use_cores(usable_cores()[:1])  # the others have trainings of their own
+    training.work_in(folder)
 
 
 @contextlib.contextmanager

@@ -27,10 +27,17 @@ CURVE = "curve.npz"
 """The file of `curve`, of a study with curves."""
 _ONE_AT_A_TIME = Lock()
 """A worker that runs tasks in threads: a training uses NumPy's and Numba's own threads."""
+_folder: str | None = None
 
 
 class EnvironmentMismatchError(ValueError):
     """A worker has other versions or another processor than the study."""
+
+
+def work_in(folder: str) -> None:
+    """Let the trainings of this process keep their files in `folder`, not in the temporary one."""
+    global _folder
+    _folder = folder
 
 
 def environment() -> dict[str, str]:
@@ -68,7 +75,7 @@ def train_one(
     another environment; ValueError or RuntimeError for a training that cannot be carried out.
     """
     here = require_environment(expected)
-    with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-") as place:
+    with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-", dir=_folder) as place:
         folder = RunFolder(Path(place) / "run")
         folder.create(parameters)
         training = build_training(parameters)

@@ -17,6 +17,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -28,6 +29,7 @@ import pytest
 
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.start import die_with
+from pde_sim_node import run_record
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 from tests.support import forked_nodes
 
@@ -275,6 +277,8 @@ class Processes:
 def processes(folder: Path) -> Iterator[Processes]:
     """The processes of one test in a domain that nobody else uses."""
     with own_domain() as domain:
+        # The nodes have another temporary folder than this process when it looked for it.
+        run_record.forget(domain, Path(tempfile.gettempdir()) / run_record.FOLDER.name)
         running = Processes(folder, domain)
         try:
             yield running

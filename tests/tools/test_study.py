@@ -28,6 +28,7 @@ from pdeloop.study import Failure, Study, StudyError, rows, run
 from pdeloop.study.executors import cluster
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
+from tests.support.loop_harness import until
 from tests.support.small import SMALL, same_bits, train_here
 
 LIMIT = 300.0
@@ -271,13 +272,20 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
     file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 9, "settings": endless}))
     words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
     process = subprocess.Popen(
-        [*words, "--processes", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*words, "--processes", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
     )
     assert process.stdout is not None
     try:
         # A busy machine may say first that it compiles.
         assert any("0 of 9 trainings" in line for line in process.stdout)
+        until(lambda: [*temporary.rglob("run.json")], LIMIT, "training that has files")
         process.send_signal(signal.SIGINT)
         told, _ = process.communicate(timeout=LIMIT)
     finally:
@@ -285,6 +293,7 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     assert process.returncode == 130 and f"continue with: pdeloop study --out {out}" in told
     assert "Traceback" not in told, told
     assert not list(out.rglob("result.json"))
+    assert not [*temporary.iterdir()]
 
 
 def dask(command: str, *options: str, packages: str = "") -> subprocess.Popen[bytes]:
