@@ -40,9 +40,9 @@ def animated(run: FinishedRun, *, field: int = 0, seconds: float = 6.0) -> Pictu
     run
         A finished run, whose first seed is shown.
     field
-        Which of the fields.
+        Its number.
     seconds
-        That the episode lasts in the animation.
+        Duration of the episode in the animation.
 
     Returns
     -------

@@ -145,12 +145,12 @@ def problem(
     physical
         The parameters of the equation, like {"viscosity": 1e-3}, or of the named plant.
     cost
-        Of an equation's plant, what is another cost than that of the numbers `state_weight` and
-        `action_weight` and the equation's target: arguments of `loop_interfaces.cost.Cost` by name,
-        like {"output": C, "target": y_r}.
+        The cost for an equation, where `state_weight`, `action_weight` and the equation's own target
+        do not suffice: arguments of `loop_interfaces.cost.Cost` by name, like
+        {"output": C, "target": y_r}.
     parameters
-        Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
-        one's own ('file.py:Class', or the class itself) is run if it is given here as `equation`,
+        Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Your
+        own code ('file.py:Class', or the class itself) is run if it is given here as `equation`,
         `optimizer` or `law`.
 
     Returns

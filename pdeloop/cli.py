@@ -75,8 +75,8 @@ def _run(
         return NOBODY_READS
     except MemoryError as error:
         return _failed(
-            f"not enough memory{f' ({error})' if str(error) else ''}: take a smaller problem, or fewer "
-            "at once"
+            f"not enough memory{f' ({error})' if str(error) else ''}: use a smaller problem, or run "
+            "fewer at once"
         )
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
@@ -86,13 +86,13 @@ def _run(
 
 
 def _sentence(error: Exception) -> str:
-    """The text of an error; one of linear algebra names a routine's argument, and not the cause."""
+    """The text of an error; NumPy's errors of linear algebra name a routine, not the cause."""
     if type(error).__name__ != "LinAlgError":  # of NumPy, which not every command imports
         return str(error)
     return (
-        "the numbers given determine no result, as a matrix that is made of them is singular: check "
-        "the data for states or actions that are constant, equal or out of all proportion, and the "
-        "weights for extreme ones"
+        "these numbers lead to a singular matrix and so to no unique result: check the data for "
+        "states or actions that are constant, equal or badly scaled, and the weights for extreme "
+        "values"
     )
 
 

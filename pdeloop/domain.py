@@ -20,7 +20,7 @@ DOMAINS = range(1, 101)
 DOMAINS_FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
 """Locks of the domains in use, and who uses them (pdeloop.live)."""
 FIRST_PARTICIPANTS = 16
-"""Participants of a domain whose ports are looked at: more than a run of a few pairs has."""
+"""Participants whose ports are checked: more than a run of a few pairs has."""
 
 
 class DomainError(RuntimeError):

@@ -183,7 +183,7 @@ class Reduction:
 
     ratio_of_means: of the means over the seeds, 1 - mean J / mean J_LQT; mean_of_ratios: the mean of
     the seeds' own 1 - J / J_LQT; both from `seeds` seeds, those in which no rollout diverged.
-    The intervals are percentile bootstraps over the seeds, None of a single seed.
+    The intervals are percentile bootstraps over the seeds, None for a single seed.
     """
 
     ratio_of_means: float

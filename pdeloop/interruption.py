@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Interruptions of resumable work: by a signal, an operator's request, a reader who leaves."""
+"""Interruptions of resumable work: by a signal, an operator's request, or a reader who leaves."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def announced(domain: int, folder: Path, *, network: bool = False) -> Iterator[N
 
 
 def running() -> list[Live]:
-    """The loops of this user that run now, the newest first."""
+    """The loops that this user has running now, the newest first."""
     found = []
     with contextlib.suppress(OSError):
         if not is_private(DOMAINS_FOLDER):

@@ -35,11 +35,11 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
     Parameters
     ----------
     plant
-        Whose episode it was: it gives the axes, in m and s.
+        The plant of the episode; it gives the axes, in m and s.
     episode
         As `rollout` returns it.
     environment
-        Which of the M, from 0 on.
+        Its index, 0 to M - 1.
 
     Returns
     -------

@@ -103,7 +103,9 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
     """The steps of the exploration, each computed again from its state with half the step."""
     finer = plant.refined()
     if finer is None:
-        return Finding("integration step", True, "none: the plant has no step that can be halved")
+        return Finding(
+            "integration step", True, "not checked: the plant has no step that can be halved"
+        )
     end = int(explored.costs.diverged_step[explored.costs.diverged_step >= 0].min(initial=2**31))
     states = explored.fields[:-1][:end].reshape(-1, plant.n_z)
     actions = explored.actions[:end].reshape(-1, plant.n_a)
@@ -127,10 +129,10 @@ def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
     states, actions = explored.fields[some, 1], explored.actions[some, 1]
     together = plant.evaluate(states, actions)[0]
     if not np.array_equal(plant.evaluate(states, actions)[0], together):
-        told = "a step of the same state and action is another one when it is computed again: keep "
-        return Finding(
-            name, False, f"{told}nothing from one call to the next, and draw nothing in it"
+        told = (
+            "a step is another one when it is computed again from the same state and action: keep "
         )
+        return Finding(name, False, f"{told}nothing between calls, and draw no random numbers")
     alone = [plant.evaluate(z[None], a[None])[0][0] for z, a in zip(states, actions, strict=True)]
     if not np.array_equal(alone, together):
         told = (

@@ -37,7 +37,7 @@ START = "loop_interfaces.start"
 _WARNING = re.compile(r"\[WARN\] \[([\d.]+)\] (\[.*)")
 """A warning in a node's log."""
 _KILLED = range(-64, 0)
-"""Exit codes by signals."""
+"""Exit codes of processes that a signal killed."""
 
 
 class NodeError(RuntimeError):

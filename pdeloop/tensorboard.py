@@ -14,7 +14,7 @@ from loop_interfaces.spec import ParameterError
 from pdeloop.finished_run import FinishedRun
 
 _IDS = ("event", "seed", "rollouts")
-"""Entries of a row of the history that say which one it is."""
+"""Entries that identify a row of the history."""
 
 
 def scalars(run: FinishedRun, m: int) -> Iterator[tuple[str, float, int]]:

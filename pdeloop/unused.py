@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Parameters that are given but would have no effect: refused rather than ignored."""
+"""Refuses parameters that are given but would have no effect, rather than ignoring them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def add(commands: Commands) -> None:
         commands,
         "animate",
         _animate,
-        help="animation of a run: no control, LQT and the adapted law",
+        help="animate a run without control, with LQT and with the adapted law",
         description="Show an episode of a finished run without control, with LQT and with the "
         "adapted law side by side, from the same initial field and in the same colours, as a GIF, "
         "or as an MP4 if ffmpeg is installed.",
@@ -31,13 +31,13 @@ def add(commands: Commands) -> None:
     )
     add = animate.add_argument
     add("folder", type=a_path, metavar="RUN", help="folder of a finished run")
-    add("--out", type=a_path, metavar="FILE", help=f".gif or .mp4 [RUN/{NAME}]")
+    add("--out", type=a_path, metavar="FILE", help=f"file to write, .gif or .mp4 [RUN/{NAME}]")
     add(
         "--field",
         type=int,
         default=0,
         metavar="I",
-        help="initial field of the closing evaluation, by its number [0]",
+        help="number of the initial field in the closing evaluation [0]",
     )
     add("--seconds", type=float, default=6.0, metavar="S", help="duration in seconds [6]")
     add_own_code(animate, ("equation", "plant", "optimizer", "law"))

@@ -35,16 +35,16 @@ def add(commands: Commands) -> None:
         actions,
         "info",
         _bag_info,
-        help="topics and episodes of a bag",
+        help="list the topics and episodes of a bag",
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
     verify = command(
         actions,
         "verify",
         _bag_verify,
-        help="recompute states, actions, costs, models and policies",
+        help="recompute a recording and compare it bit by bit",
         description="Recompute states, actions, costs, models and policies, and compare them to "
-        "the bit. Exit code 1 if anything differs or is missing, or nothing can be recomputed.",
+        "the bit. The exit code is 1 if anything differs or is missing, or nothing can be recomputed.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
     info.add_argument("bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
@@ -59,7 +59,8 @@ def add(commands: Commands) -> None:
         "--parameters",
         type=a_path,
         metavar="FILE",
-        help="instead of those in the bag: a run's parameters.yaml, a bag's parameters.json",
+        help="take the parameters from this file, not from the bag: a run's parameters.yaml, or a "
+        "bag's parameters.json",
     )
     add_own_code(verify, ("equation", "plant", "optimizer", "law"))
     for action in (info, verify):

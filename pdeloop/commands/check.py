@@ -40,8 +40,8 @@ def add(commands: Commands) -> None:
         help="check a problem before training, or a node of your own against the protocol",
         description="Check a problem before training on it: halve the integration step, see "
         "whether the actuators reach the modes that are unstable at the target, explore once, "
-        "report which order the data support and the cost of the first law, and draw fields and "
-        "supports. Exit code 1 if a check fails. With plant, controller or tuner instead of a "
+        "report the order that the data support and the cost of the first law, and draw fields and "
+        "supports. The exit code is 1 if a check fails. With plant, controller or tuner instead of a "
         "FILE, check that a node of your own, alone in this ROS_DOMAIN_ID, conforms to "
         "docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
@@ -51,19 +51,26 @@ def add(commands: Commands) -> None:
         nargs="?",
         default="",
         metavar="FILE",
-        help="a problem's YAML file, or a shipped name; or plant, controller, tuner; not needed with "
-        "--plant",
+        help="a problem's YAML file or a shipped name, or one of plant, controller and tuner; not "
+        "needed with --plant",
     )
     whole, real = _number(int, 1, 65536), _number(float, 0.1, 86400.0)
-    add_option = check.add_argument_group("of a node").add_argument
-    add_option("--n-a", type=_number(int, 1, 1024), metavar="N", help="number of its actuators [1]")
+    add_option = check.add_argument_group("for the check of a node").add_argument
+    add_option("--n-a", type=_number(int, 1, 1024), metavar="N", help="number of actuators [1]")
     add_option(
-        "--n-z", type=whole, metavar="N", help="size of a controller's state [64, and its order]"
+        "--n-z",
+        type=whole,
+        metavar="N",
+        help="size of the state sent to a controller [64, and its order]",
     )
-    add_option("--patience", type=real, metavar="S", help="seconds that an answer may take [10]")
-    add_option("--limit", type=real, metavar="S", help="seconds that the check may take [600]")
-    add_option("--namespace", metavar="NS", help="namespace of its topics")
-    add_option("--network", action="store_true", default=None, help="it may run on another machine")
+    add_option("--patience", type=real, metavar="S", help="seconds to wait for an answer [10]")
+    add_option(
+        "--limit", type=real, metavar="S", help="seconds that the whole check may take [600]"
+    )
+    add_option("--namespace", metavar="NS", help="namespace of the node's topics")
+    add_option(
+        "--network", action="store_true", default=None, help="the node may run on another machine"
+    )
     add_own_code(check)
     check.add_argument(
         "--picture",

@@ -15,7 +15,7 @@ def add(commands: Commands) -> None:
         commands,
         "compare",
         _compare,
-        help="costs of finished runs side by side, and the parameters that differ",
+        help="compare finished runs: their costs, and the parameters that differ",
         description="Show the costs of finished runs in one table, each adapted policy against "
         "that of the first run on the same initial fields, with a 95 percent bootstrap interval "
         "over the fields, and the parameters in which the runs differ. Where these change the "

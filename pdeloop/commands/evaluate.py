@@ -27,23 +27,24 @@ def add(commands: Commands) -> None:
         commands,
         "evaluate",
         _evaluate,
-        help="cost of a run's policies on other fields",
-        description="Roll out no control, LQT and the adapted policy of a finished run.",
+        help="evaluate a run's policies on other initial fields",
+        description="Roll out the plant of a finished run without control, with LQT and with the "
+        "adapted policy, from the same initial fields, and print the mean stage costs.",
         example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
     )
     evaluate.add_argument("folder", type=a_path, metavar="DIR", help="folder of a finished run")
-    evaluate.add_argument("--fields", type=int, metavar="N", help="sampled initial fields [10]")
+    evaluate.add_argument("--fields", type=int, metavar="N", help="number of initial fields [10]")
     evaluate.add_argument(
-        "--seed", type=int, default=0, metavar="S", help="seed of those fields [0]"
+        "--seed", type=int, default=0, metavar="S", help="seed of these fields [0]"
     )
     evaluate.add_argument(
         "--mean-field",
         action="store_true",
-        help="the mean of the initial distribution instead of sampled fields",
+        help="start from the mean of the initial distribution instead of sampled fields",
     )
     add_set(
         evaluate,
-        "evaluate under another value of a parameter of the plant or the cost",
+        "change a parameter of the plant or the cost",
         trains=False,
     )
     add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))

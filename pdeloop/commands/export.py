@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
         commands,
         "export",
         _export,
-        help="a run's law as .npz or C, its curve as .csv or for TensorBoard",
+        help="export a run's law as .npz or C, its learning curve as .csv or for TensorBoard",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: "
         "as .npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` also reads, or "
         "as a C99 function; for another law, its parameters as .npz; and the cost after each step "
@@ -56,7 +56,7 @@ def _export(options: argparse.Namespace) -> int:
             "expected --out FILE for the law, --curve FILE or --tensorboard DIR for the curve"
         )
     if options.law is not None:
-        print("WARNING: --law of export is called --controller now", file=sys.stderr)
+        print("WARNING: --law of export is now called --controller", file=sys.stderr)
     which = options.controller or options.law
     if options.out is None and not (which is None and options.seed is None):
         options.refuse("--controller and --seed choose a law: give --out FILE, or leave them out")

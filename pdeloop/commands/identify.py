@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
         commands,
         "identify",
         _identify,
-        help="reduced model from recorded episodes or your own measurements",
+        help="identify a reduced model from recorded episodes or your own measurements",
         description="Identify a reduced model by least squares in reduced coordinates, design "
         "LQ-tracking gains, and show which order the data support: singular values, and errors on "
         "held-out steps. The data are the exploratory episodes of a bag of any plant (all episodes "
@@ -46,43 +46,47 @@ def add(commands: Commands) -> None:
         help="states, actions, target and sampling time as .npz or .csv, one file or several of one "
         "plant (docs/identification.md)",
     )
-    add = identify.add_argument_group("of --data").add_argument
-    add("--time", metavar="NAME", help="the column of times in s, or the array sample_time [t]")
+    add = identify.add_argument_group("with --data").add_argument
+    add("--time", metavar="NAME", help="the column of times (s), or the array sample_time [t]")
     add(
         "--states",
         metavar="NAME,...",
         help="the columns of the state: names or patterns like 'T*'; other columns are ignored "
-        "[those that begin with z]",
+        "[those whose names begin with z]",
     )
-    add("--inputs", metavar="NAME,...", help="the columns of the inputs [those that begin with a]")
-    add("--sample-time", type=float, metavar="S", help="sampling time, if no column holds times")
+    add(
+        "--inputs",
+        metavar="NAME,...",
+        help="the columns of the inputs [those whose names begin with a]",
+    )
+    add("--sample-time", type=float, metavar="S", help="sampling time (s), if no column has times")
     add = identify.add_argument
     add(
         "--target",
         type=_numbers,
         metavar="X,X,...",
-        help="the target state, one number per entry [that of the data; without a target only a "
-        "model is identified]",
+        help="the target state, one number per entry [the data's; without a target, only a model "
+        "is identified]",
     )
     add(
         "--order",
         type=int,
         metavar="NS",
-        help="order n_s of the model [that of the recorded run, or the suggested one]",
+        help="order n_s of the model [the recorded run's, or the suggested one]",
     )
     add(
         "--identification",
         choices=IDENTIFICATION.choices,
         help="field: a model of the whole field where its law is better; regression: least squares "
         "in reduced coordinates; subspace: a model with its filter, from measurements alone; dmdc: "
-        "truncated DMDc [that of the run, or regression]",
+        "truncated DMDc [the run's, or regression]",
     )
     add_own_code(identify, ("law",))
-    add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
-    add("--episode", metavar="N", help="only this episode, as `pdeloop bag info` names it")
-    add("--environment", type=int, metavar="M", help="only this environment of each episode")
-    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
-    add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
+    add("--rank", type=int, metavar="P", help="rank p of --identification dmdc [the run's]")
+    add("--episode", metavar="N", help="use only this episode, as `pdeloop bag info` names it")
+    add("--environment", type=int, metavar="M", help="use only this environment of each episode")
+    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [the run's, or 1]")
+    add("--action-weight", type=float, metavar="R", help="r of R = r I [the run's, or 1]")
     add("--out", type=a_path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
     add(
         "--plot",

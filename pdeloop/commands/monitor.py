@@ -20,7 +20,7 @@ def add(commands: Commands) -> None:
         commands,
         "monitor",
         _monitor,
-        help="live page of a running loop",
+        help="serve a live page of a running loop",
         description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the "
         "actions, the profile against the target, the training curve, the nodes, and buttons to "
         "pause. Without DIR and ROS_DOMAIN_ID it shows the newest training on this machine, then "
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
         nargs="?",
         type=a_path,
         metavar="DIR",
-        help="folder of a run: show this one only [the newest that runs]",
+        help="folder of the run to show [the newest one that is running]",
     )
     add(
         "--port",
@@ -43,20 +43,22 @@ def add(commands: Commands) -> None:
         help=f"port of the page; 0: any free one [{PORT}]",
     )
     add(
-        "--namespace", metavar="NS", help="namespace of the pair to show first [the first there is]"
+        "--namespace",
+        metavar="NS",
+        help="namespace of the pair to show first [the first one found]",
     )
     add(
         "--environment",
         type=int,
         default=0,
         metavar="M",
-        help="environment to show of each episode [0]",
+        help="environment of each episode to show [0]",
     )
     add("--open", action="store_true", help="open the page in the browser")
     add(
         "--network",
         action="store_true",
-        help="the loop's messages may leave this machine (the page never does)",
+        help="also find a loop whose messages leave this machine (the page never does)",
     )
 
 

@@ -22,8 +22,9 @@ def add(commands: Commands) -> None:
         commands,
         "report",
         _report,
-        help="figures and an HTML page of a run or a reproduction",
-        description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
+        help="draw figures and write an HTML page of a run or a reproduction",
+        description="Draw figures for a paper (PNG and SVG), and write one HTML page that needs no "
+        "network.",
         example="pdeloop report runs/paper",
     )
     report.add_argument(

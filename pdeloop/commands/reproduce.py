@@ -29,15 +29,15 @@ def add(commands: Commands) -> None:
         commands,
         "reproduce",
         _reproduce,
-        help="the paper's experiment, over several seeds: its four controllers and Gauss-Newton",
-        description="For each problem and seed: no control, LQT, LQT-PO and pure PO of the paper, and "
-        "Gauss-Newton, with the cost of every policy on the evaluation fields. Ctrl-C interrupts; "
-        "--out DIR of an interrupted reproduction continues it.",
+        help="reproduce the paper's experiment over several seeds, and compare Gauss-Newton with it",
+        description="For each problem and seed, train the paper's LQT-PO and pure PO, and "
+        "Gauss-Newton, and compare them with LQT and no control on the same evaluation fields. Ctrl-C "
+        "interrupts; --out DIR of an interrupted reproduction continues it.",
         example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
     add = reproduce.add_argument
-    add_problem(reproduce, "shipped names or YAML files [the paper's]", "problems", "*")
-    add("--seeds", type=int, metavar="N", help="trainings of each problem, side by side [6]")
+    add_problem(reproduce, "shipped names or YAML files [the paper's problems]", "problems", "*")
+    add("--seeds", type=int, metavar="N", help="number of trainings of each problem [6]")
     add("--iterations", type=int, metavar="N", help="iterations of the adapt phase [40]")
     add("--seed", type=int, metavar="S", help="the first seed [0]")
     add(

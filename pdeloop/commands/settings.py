@@ -28,14 +28,14 @@ OWN_FLAGS = {
 def add_set(
     parser: argparse._ActionsContainer, what: str = "any parameter", *, trains: bool = True
 ) -> None:
-    """The flag --set, which may be given several times. trains: whether methods have a say."""
-    methods = "; {}NAME, {}NAME and {}NAME of a method".format(*SETTINGS)
+    """The flag --set, which may be given several times. trains: whether methods have settings."""
+    methods = "; {}NAME, {}NAME and {}NAME for one of a method".format(*SETTINGS)
     action = parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME of the equation"
+        help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME for one of the equation"
         f"{methods if trains else ''}; may be repeated",
     )
 

@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
         commands,
         "study",
         _study,
-        help="many trainings (problems, variants, seeds) on this machine or a cluster",
+        help="run many trainings (problems, variants, seeds) on this machine or a cluster",
         description="Train every problem of a study with every variant and every seed, each in a "
         "process of its own, and compare them. Ctrl-C interrupts; --out DIR of an interrupted study "
         "continues it. docs/scaling.md shows a study's file.",
@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
         nargs="?",
         type=a_path,
         metavar="STUDY.yaml",
-        help="problems, seeds, variants, settings",
+        help="file with problems, seeds, variants and settings",
     )
     add_set(study, "any parameter, for all trainings")
     add_own_code(study, ("equation", "plant", "optimizer", "law"))
@@ -57,7 +57,12 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
     """The options for where a study's trainings run, and for output; see `carry_out`."""
     name, add = parser.prog.rpartition(" ")[2], parser.add_argument
     add("--out", type=a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
-    add("--processes", type=int, metavar="N", help="trainings at the same time [one per core]")
+    add(
+        "--processes",
+        type=int,
+        metavar="N",
+        help="number of trainings at the same time [one per core]",
+    )
     add(
         "--scheduler",
         metavar="ADDRESS",

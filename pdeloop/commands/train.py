@@ -29,10 +29,10 @@ def add(commands: Commands) -> None:
         commands,
         "train",
         _train,
-        help="identify, design, adapt and evaluate",
+        help="train a controller: identify, design, adapt, evaluate",
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
-        "them from rollouts, evaluate. The plant, the controller and the tuner run as ROS 2 nodes "
-        "in separate processes.",
+        "them from rollouts, and evaluate them. The plant, the controller and the tuner run as ROS 2 "
+        "nodes in separate processes.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
     problem = train.add_argument_group("problem")
@@ -65,14 +65,14 @@ def add(commands: Commands) -> None:
     add(
         "--record-or-stop",
         action="store_true",
-        help="as --record, and stop the training if the recording fails",
+        help="like --record, but stop the training if the recording fails",
     )
     add(
         "--record-every",
         type=int,
         default=1,
         metavar="N",
-        help="record the states of every N-th step only, for large fields [1]",
+        help="record only the states of every N-th step, for large fields [1]",
     )
     add(
         "--view",
@@ -85,7 +85,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="let messages leave this machine (default: loopback interface only)",
     )
-    add("--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]")
+    add(
+        "--pairs",
+        type=int,
+        default=1,
+        metavar="K",
+        help="number of plants, each with a controller [1]",
+    )
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -39,12 +39,12 @@ def environment_id(problem: str) -> str:
     Parameters
     ----------
     problem
-        Its name, like allen-cahn.
+        Its name, such as allen-cahn.
 
     Returns
     -------
     str
-        Of `gymnasium.make`, like pdeloop/AllenCahn-v0.
+        The id for `gymnasium.make`, such as pdeloop/AllenCahn-v0.
     """
     return f"pdeloop/{''.join(word.capitalize() for word in problem.split('-'))}-v0"
 

@@ -25,7 +25,7 @@ def seed_of_each(seed: int | Sequence[int | None] | None, num_envs: int) -> list
         return [int(seed) + m for m in range(num_envs)]
     given: list[int | None] = np.asarray(seed, dtype=object).ravel().tolist()
     if len(given) != num_envs:
-        raise ValueError(f"expected {num_envs} seeds, one for each, got {len(given)}")
+        raise ValueError(f"expected {num_envs} seeds, one per environment, got {len(given)}")
     return given
 
 

@@ -33,7 +33,7 @@ class Environment(gymnasium.Env[Array, Array]):
     divergence_penalty
         Subtracted from the reward of the step that diverges.
     render_mode : {"rgb_array"}, optional
-        How `render` draws the field, which needs Matplotlib (the extra `report`); None: not at all.
+        How `render` draws the field, which needs Matplotlib (the extra `report`); None: not drawn.
     parameters
         As of `pdeloop.problem`, those of the plant: n_z, horizon, measurement_noise, action_limit,
         sensors, physical={"viscosity": 1e-3}, ...
@@ -72,7 +72,7 @@ class Environment(gymnasium.Env[Array, Array]):
         Parameters
         ----------
         seed
-            Of the initial field; without one it is drawn.
+            Seed of the initial field, which is drawn if none is given.
         options
             {"field": z_0}, (n_z,), begins with this field instead.
 

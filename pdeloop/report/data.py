@@ -208,8 +208,7 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
     data = ProblemData(runs, curves, shown, build_plant(values))
     if not curves:
         data.missing.append(
-            "Training curves: no rollout of the adaptation was completed, or there was none to "
-            "compare with."
+            "Training curves: the adaptation completed no rollout, or there was none to compare with."
         )
     if reason := another_loop(data.first):
         data.missing.append(

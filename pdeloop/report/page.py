@@ -85,7 +85,8 @@ def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -
     png, svg, dark = io.BytesIO(), io.BytesIO(), io.BytesIO()
     _draw(figure, png)
     figure.set_layout_engine("none")  # it is laid out, which takes as long as a drawing
-    FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None})
+    canvas: Any = FigureCanvasSVG(figure)
+    canvas.print_svg(svg, metadata={"Date": None})
     for kind, content in (("png", png), ("svg", svg)):
         write_atomically(target / f"{name}.{kind}", content.getvalue())
     darken(figure)
@@ -98,7 +99,8 @@ def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -
 def _draw(figure: Figure, png: io.BytesIO) -> None:
     """Draw a figure once. `savefig` draws it twice: first to lay it out, which drawing does anyway."""
     figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
-    FigureCanvasAgg(figure).print_png(png)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.print_png(png)
 
 
 def _moving(target: Path, problem: ProblemData) -> Picture | None:
@@ -111,7 +113,7 @@ def _moving(target: Path, problem: ProblemData) -> Picture | None:
     return Picture(
         name,
         "Moving picture",
-        f"From a field of the closing evaluation, the same for all (seed "
+        f"Episodes from one field of the closing evaluation (seed "
         f"{problem.first.seeds[problem.shown]}): the field, its target (dashed), and the actions.",
         drawn[0].shape[1],
         base64.b64encode((target / f"{name}.gif").read_bytes()).decode(),
@@ -132,8 +134,8 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
         what = (
             "Mean stage cost divided by that of LQT, both on the fields of the closing evaluation."
             if over_lqt
-            else "Mean stage cost of the training's own rollouts. Their initial fields change on the "
-            "way: compare controllers in the table, where all meet the same fields."
+            else "Mean stage cost of the training's own rollouts, whose initial fields change: compare "
+            "controllers in the table, where all start from the same fields."
         )
         over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)
         yield (
@@ -163,9 +165,10 @@ def _of_problem(problem: ProblemData) -> Drawn:
                 f"{name}-steps",
                 f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
                 f"Seed {seed}, steps accepted: {sum(judged)} of {len(judged)}. A candidate that "
-                f"diverged or cost more than {learning.EDGE:g} times as much is drawn at "
-                f"{learning.EDGE:g}. Below: the damping, which a rejection raises, and the relative "
-                "error of the best fitted model in predicting how measured trajectories differ.",
+                f"diverged, or cost more than {learning.EDGE:g} times what the incumbent costs, is "
+                f"drawn at {learning.EDGE:g}. Below: the damping, which a rejection raises, and the "
+                "relative error of the best fitted model in predicting how measured trajectories "
+                "differ.",
                 learning.steps(history, COLOURS[controller]),
             )
     if not problem.behaviours:
@@ -173,15 +176,15 @@ def _of_problem(problem: ProblemData) -> Drawn:
     yield (
         f"{name}-behaviour",
         "Behaviour",
-        f"From the mean initial field (seed {seed}): the field in space and time, the actions, and "
-        "the initial field, the final field and the target.",
+        f"Episodes from the mean initial field (seed {seed}): the field in space and time, the "
+        "actions, and the initial field, the final field and the target.",
         figures.behaviour(problem),
     )
     if problem.affine:
         yield (
             f"{name}-gains",
             "Gains",
-            f"Before (LQT) and after learning (seed {seed}).",
+            f"The gains before (LQT) and after learning (seed {seed}).",
             figures.gains(problem),
         )
     if problem.orders is not None:
@@ -200,8 +203,8 @@ def _of_problem(problem: ProblemData) -> Drawn:
     yield (
         f"{name}-spectrum",
         "Eigenvalues",
-        "Of the reduced model, open loop and closed with each controller's gains, and the unit "
-        f"circle (filled: seed {seed}, open: other seeds).",
+        "Eigenvalues of the reduced model, in open loop and with each controller's gains, and the "
+        f"unit circle (filled: seed {seed}, open: other seeds).",
         figures.spectrum(problem),
     )
 

@@ -74,7 +74,8 @@ class Study:
             seeds = range(seeds)
         elif not isinstance(seeds, list) or not seeds or any(type(s) is not int for s in seeds):
             raise StudyError(
-                f"'seeds' is {shown(seeds)}; expected how many, at most {MAX_SEEDS}, or a list of them"
+                f"'seeds' is {shown(seeds)}; expected their number, at most {MAX_SEEDS}, or a list of "
+                "them"
             )
         variants, settings = content.get("variants", {"default": {}}), content.get("settings", {})
         curves = content.get("curves", False)

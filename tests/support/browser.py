@@ -10,6 +10,7 @@ import os
 import shutil
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -159,6 +160,13 @@ def browser(folder: Path) -> Iterator[Browser]:
     """A browser with a new profile in `folder`; it is gone at the end."""
     if not shutil.which(COMMAND[0]):
         pytest.skip("needs a real browser, the command `chromium` (make packages)")
+    # It leaves a folder with a socket, whose path may have 107 characters.
+    with tempfile.TemporaryDirectory(dir="/tmp") as temporary, _started(folder, temporary) as tab:
+        yield tab
+
+
+@contextlib.contextmanager
+def _started(folder: Path, temporary: str) -> Iterator[Browser]:
     profile = folder / "profile"
     with (folder / "browser.log").open("wb") as log:
         process = subprocess.Popen(
@@ -168,6 +176,7 @@ def browser(folder: Path) -> Iterator[Browser]:
             stderr=log,
             start_new_session=True,
             preexec_fn=partial(die_with, os.getpid()),
+            env={**os.environ, "TMPDIR": temporary},
         )
     port_file = profile / "DevToolsActivePort"
     try:

@@ -578,7 +578,8 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
     (tmp_path / "zzz-other.txt").write_text("")
     (tmp_path / "runs").mkdir()
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    home = {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT), "PS1": "$ ", "PATH": path}
+    home = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path)}  # fish leaves a folder there
+    home |= {"PYTHONPATH": str(ROOT), "PS1": "$ ", "PATH": path}
     with terminal(*command, cwd=tmp_path, **home) as shown:
         shown.type(load + "; echo load''ed\n")
         shown.until("loaded")

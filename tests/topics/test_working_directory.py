@@ -44,7 +44,10 @@ WORDS: dict[str, tuple[str, ...]] = {
     "identify": ("identify", "--bag", "run"),
     "bag": ("bag", "verify", "run"),
     "monitor": ("monitor", "--port", "0"),
-    "reproduce": ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "5", "--out", "paper"),
+    "reproduce": (
+        *("reproduce", str(SMALL), "--seeds", "1", "--iterations", "5", "--out", "paper"),
+        *("--processes", "1"),
+    ),
     "report": ("report", "run"),
     "animate": ("animate", "run", "--out", "run.gif", "--seconds", "1"),
     "compare": ("compare", "run", "run"),
@@ -140,22 +143,16 @@ def test_modules_that_python_starts_run_no_file_of_the_working_directory(
     assert not taken.exists(), taken.read_text()
 
 
-def test_an_empty_entry_of_the_module_path_is_not_the_working_directory(
+def test_code_that_the_user_names_runs_from_the_working_directory_and_no_other(
     loop: Processes, tmp_path: Path
 ) -> None:
     # As of `export PYTHONPATH=$PYTHONPATH:/some/folder` where it was not set.
     loop.environment["PYTHONPATH"] = f":{loop.environment['PYTHONPATH']}"
-    taken = set_traps(tmp_path, {"numpy", "scipy", "numba", "yaml", "rich", "rclpy", "std_msgs"})
-    loop.wait(loop.program(str(BIN / "pdeloop"), *TRAIN), LIMIT)
-    assert not taken.exists(), taken.read_text()
-
-
-def test_code_that_the_user_names_runs_from_the_working_directory(
-    loop: Processes, tmp_path: Path
-) -> None:
+    taken = set_traps(tmp_path, {"scipy", "numba", "yaml", "rich", "rclpy", "std_msgs"})
     own = "from pde_sim_node.equations import Burgers\nclass Own(Burgers):\n    name = 'own'\n"
     (tmp_path / "numpy.py").write_text(own)
     said = loop.wait(
         loop.program(str(BIN / "pdeloop"), *TRAIN, "--equation", "numpy.py:Own"), LIMIT
     )
     assert re.search("mean stage cost after adaptation", said)
+    assert not taken.exists(), taken.read_text()
