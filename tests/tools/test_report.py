@@ -350,7 +350,8 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
 
     out = tmp_path / "run"
     command = ["train", "wave", "--iterations", "1", "--optimizer", "two_point", "--in-process"]
-    assert main([*command, "--out", str(out)]) == 0
+    short = ["--set", "horizon=40", "--evaluation-fields", "1"]
+    assert main([*command, *short, "--out", str(out)]) == 0
     with matplotlib.rc_context(STYLE):
         behaviour(gather(out).problems[0]).savefig(tmp_path / "both.svg")
     svg = (tmp_path / "both.svg").read_text()

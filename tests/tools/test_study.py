@@ -296,11 +296,17 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     assert not [*temporary.iterdir()]
 
 
-def dask(command: str, *options: str, packages: str = "") -> subprocess.Popen[bytes]:
-    """A Dask process on loopback, in a session of its own, with packages of another folder first."""
+def dask(folder: Path, command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
+    """A Dask process on loopback, in a session of its own, with packages of another folder first.
+
+    folder: for its temporary files, which it leaves when it is killed.
+    """
     words = [sys.executable, "-m", "distributed.cli." + command, "--host", "127.0.0.1", *options]
-    quiet, first = subprocess.DEVNULL, {**os.environ, "PYTHONPATH": packages}
-    return subprocess.Popen(words, stdout=quiet, stderr=quiet, start_new_session=True, env=first)
+    quiet, own = subprocess.DEVNULL, {"PYTHONPATH": packages, "TMPDIR": str(folder)}
+    environment = {**os.environ, **own}
+    return subprocess.Popen(
+        words, stdout=quiet, stderr=quiet, start_new_session=True, env=environment
+    )
 
 
 def installed_before(name: str, folder: Path, *others: str) -> str:
@@ -338,7 +344,7 @@ def dask_cluster(
 
         def started(command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
             shared = ("--scheduler-file", str(file), "--no-dashboard")
-            process = dask(command, *shared, *options, packages=packages)
+            process = dask(folder, command, *shared, *options, packages=packages)
             stack.callback(process.wait, LIMIT)
             stack.callback(lambda: process.poll() is None and os.kill(process.pid, signal.SIGKILL))
             return process
