@@ -99,7 +99,7 @@ def fit_sensed(
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
         few = SensedProblem(
             *(y[pair], a[pair], actuators, noise, target, distances[pair], settings),
-            settings.sensed_place_ridge,
+            settings.sensed_held_ridge if noise else settings.sensed_place_ridge,
         )
         error, shared, fields[pair] = _first_guess(few, settings)
         if not np.isfinite(error):
@@ -110,13 +110,16 @@ def fit_sensed(
         _, _, known = problem.fit(shared, fields, known=True)
     else:
         known = coefficients_of(near)
-    whole = [y.shape[1]] * _WHOLE
+    whole, found = [y.shape[1]] * _WHOLE, []
+    # Else the equation does not hold for the other rollouts: nothing is near enough for a whole fit.
+    holds = problem.error(shared, known) <= settings.sensed_reproduced
+    if holds:
+        found.append(problem.fit(shared, known, lengths=whole))
     # With noise two rollouts leave much of an equation open.
-    guessed = start is None and problem.noise > 0.0
-    if not guessed and problem.error(shared, known) <= settings.sensed_reproduced:
-        error, shared, fields = problem.fit(shared, known, lengths=whole)
-    else:  # the equation does not hold for the other rollouts: nothing is near enough for a whole fit
-        error, shared, fields = part_by_part(problem, shared, fields, settings)
+    if not holds or (start is None and problem.noise):
+        problem.forget()
+        found.append(part_by_part(problem, shared, fields, settings))
+    error, shared, fields = min(found, key=lambda own: own[0])
     return shared, field_of(fields, n), max(error - problem.noise, 0.0)
 
 

@@ -434,17 +434,30 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     """What they suggest is fitted to all rollouts from their beginning."""
     rng, actuators = np.random.default_rng(6), _equally_spaced(3)
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
-    asked = []
+    asked, worse = [], 0.0
 
     def recorded(*given: Any) -> tuple[float, Array, Array]:
         asked.append(given)
-        return part_by_part(*given)
+        error, *found = part_by_part(*given)
+        return error + worse, found[0], found[1]
+
+    ridges, guess = [], sensed_fit._first_guess
+
+    def guessed(problem: SensedProblem, *given: Any) -> tuple[float, Array, Array]:
+        ridges.append(problem.place_ridge)
+        return guess(problem, *given)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "part_by_part", recorded)
+        patch.setattr(sensed_fit, "_first_guess", guessed)
         # Of noise alone, which any equation explains.
         few = {"settings": FEW_ITERATIONS}
         shared, fields, error = fit_sensed(readings, actions, actuators, 1.0, None, **few)
         assert error < DEFAULTS.sensed_reproduced and len(asked) == 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
-    assert len(asked) == 1
+        assert len(asked) == 1
+        worse = 10.0  # then what two of them suggest is kept
+        _, _, error = fit_sensed(readings, actions, actuators, 1.0, None, **few)
+    assert error < DEFAULTS.sensed_reproduced and len(asked) == 2
+    # What two of them have to say of each actuator is noise.
+    assert ridges == [DEFAULTS.sensed_held_ridge] * 2
