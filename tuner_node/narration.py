@@ -213,6 +213,7 @@ def warnings(summary: Row) -> list[str]:
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     costs = summary["costs"]
     found = several_publishers(summary.get("several_publishers", {}))
+    found += misjudged_noise(summary)
     if lost["lqt"] == rollouts:
         found.append(
             "every rollout of the first laws diverged; likely causes: an exploration that is too "
@@ -234,6 +235,20 @@ def warnings(summary: Row) -> list[str]:
         )
         found.append(f"after adaptation the cost is not below that without control{which}")
     return found
+
+
+def misjudged_noise(summary: Row) -> list[str]:
+    """The measurement noise that was found where another, or none, was declared."""
+    noise = summary.get("noise", {})
+    if not (found := [one for one in noise.get("found", []) if one]):
+        return []
+    declared = f"{noise['declared']:.2g}" if noise["declared"] else "none"
+    seeds = summary["seeds"]
+    of_seeds = f" for {len(found)} of {seeds} seeds" if seeds > 1 else ""
+    return [
+        f"measurement noise of about {span(found, '.2g')} was found{of_seeds}, and {declared} was "
+        "declared (measurement_noise): the optimiser accounted for it, the first law did not"
+    ]
 
 
 def costlier_than_none(summary: Row) -> bool:

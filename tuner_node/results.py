@@ -51,6 +51,11 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError(f"its 'rollouts' are not a table of {', '.join(kinds)} for each seed")
     if not all(_texts(content.get(name, {})) for name in ("versions", "environment")):
         raise ValueError("its 'versions' or 'environment' are not a table of texts")
+    noise = content.get("noise", {"declared": 0.0, "found": []})
+    if not isinstance(noise, dict) or not _numbers(
+        [noise.get("declared"), *noise.get("found", [])]
+    ):
+        raise ValueError("its 'noise' has other entries than numbers 'declared' and 'found'")
     outcome = content.get("outcome", [])
     if not isinstance(outcome, list) or not all(
         isinstance(own, dict) and _outcome(own) for own in outcome
@@ -89,6 +94,13 @@ def _outcome(own: Mapping[str, Any]) -> bool:
     )
 
 
+def _numbers(*lists: object) -> bool:
+    return all(
+        isinstance(values, list) and all(isinstance(value, int | float) for value in values)
+        for values in lists
+    )
+
+
 def _texts(table: object) -> bool:
     return isinstance(table, dict) and all(isinstance(text, str) for text in table.values())
 
@@ -113,8 +125,9 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
-    one it began with; outcome: what came of each seed, and why, as its optimiser says, also why it
-    left rollouts over.
+    one it began with; noise: the measurement noise that was declared, and what each optimiser found in
+    its place, 0 where nothing else; outcome: what came of each seed, and why, as its optimiser says,
+    also why it left rollouts over.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
@@ -140,6 +153,10 @@ def summarise(training: Training) -> dict[str, Any]:
         "seeds": training.settings.seeds,
         "rollouts": training.budget.by_purpose(),
         "changed": changed,
+        "noise": {
+            "declared": training.settings.measurement_noise,
+            "found": [found_noise(training.history, seed) for seed in training.settings.all_seeds],
+        },
         "outcome": [
             {
                 "verdict": verdict(*mean[m].tolist(), changed=moved),
@@ -196,6 +213,12 @@ def last_reason(history: Sequence[Mapping[str, Any]], seed: int) -> str:
     """The last reason that the optimiser of a seed gave; empty: none."""
     given = [str(row["reason"]) for row in history if row["seed"] == seed and row.get("reason")]
     return given[-1] if given else ""
+
+
+def found_noise(history: Sequence[Mapping[str, Any]], seed: int) -> float:
+    """The measurement noise that the optimiser of a seed found, and was not declared; 0: none."""
+    found = [float(row["noise"]) for row in history if row["seed"] == seed and "noise" in row]
+    return found[-1] if found else 0.0
 
 
 def early_end(training: Training, m: int) -> str:

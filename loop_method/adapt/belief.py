@@ -79,6 +79,14 @@ class Belief:
             return ObservedLoop(*problem, **on, law=context.law)
         return ClosedLoop(*problem, **on)
 
+    def predicted_costs(self, context: Context, records: Sequence[Record]) -> list[float]:
+        """The costs of rollouts that the model predicts from their initial fields."""
+        loop = self.loop(context)
+        return [
+            float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
+            for record in records
+        ]
+
 
 def believe(
     context: Context, records: Sequence[Record], first: str = "", parts: int = 1

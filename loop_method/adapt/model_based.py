@@ -44,6 +44,7 @@ from loop_method.adapt.renewal import renew
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
+from loop_method.adapt.undeclared_noise import believe_in_noise
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
 from loop_method.laws.observer import Observer
 from loop_method.seeds import field_seed
@@ -98,6 +99,7 @@ class ModelBased(Optimizer):
             raise ValueError("this optimiser needs the context: trajectories were not asked for")
         self._settings = settings or ModelBasedSettings()
         self._context, self._seed, self._budget = context, seed, rollouts
+        self._declared = context.noise
         observed = isinstance(context.law, Observer)
         self._first = checked_theta(policy0) if observed else checked_policy(policy0)
         self._none = np.zeros_like(self._first)
@@ -180,9 +182,8 @@ class ModelBased(Optimizer):
             elif self._progress.stage == JUDGING:
                 row = self._measured(added)
                 self._judge(row)
-        row["rollouts"] = self._records.count
-        row["diverged"] = sum(not result.usable for result in results)
-        return row
+        diverged = sum(not result.usable for result in results)
+        return row | {"rollouts": self._records.count, "diverged": diverged}
 
     @property
     def _judging(self) -> int:
@@ -218,13 +219,11 @@ class ModelBased(Optimizer):
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
         """The costs of rollouts on the last model; none without one."""
-        if (belief := self._progress.belief) is None:
-            return []
-        loop = belief.loop(self._context)
-        return [
-            float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
-            for record in added
-        ]
+        return (
+            belief.predicted_costs(self._context, added)
+            if (belief := self._progress.belief)
+            else []
+        )
 
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""
@@ -252,6 +251,10 @@ class ModelBased(Optimizer):
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._last_renewal()
         before, belief = self._progress.belief, self._believe()
+        other = believe_in_noise(self._context, self._measurements(), belief, self._settings)
+        if other is not None:
+            belief, row["noise"] = other
+            self._take_noise(other[1])
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
@@ -271,6 +274,11 @@ class ModelBased(Optimizer):
         before = self._progress.belief
         kind = "" if before is None else before.model.kind
         return believe(self._context, self._measurements(), kind)
+
+    def _take_noise(self, noise: float) -> None:
+        """Go on as if this measurement noise had been declared; 0: it was as declared."""
+        self._progress.noise = noise
+        self._context = replace(self._context, noise=noise or self._declared)
 
     _unpredicted = "no model of the whole field predicts the rollouts"
 
@@ -334,20 +342,17 @@ class ModelBased(Optimizer):
             return
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
         base = FIRST if self._progress.safe else NONE
+        known = self._data()[len(self._context.every_exploration) :]
         evidence = evidence_of(
-            self._progress.belief.loop(self._context),
-            laws,
-            base,
-            self._data()[len(self._context.every_exploration) :],
-            self._fields(),
-            self._progress.change,
+            *(self._progress.belief.loop(self._context), laws, base),
+            *(known, self._fields(), self._progress.change),
         )
         verdict = choose(evidence, base, self._settings.confidence)
         self._progress.policy = laws[verdict.chosen].copy()
         row["chosen"] = verdict.chosen
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
-        known = len(self._fields())
-        self._end(row, verdict.reason, f"more than {known} fields would not change the law")
+        count = len(self._fields())
+        self._end(row, verdict.reason, f"more than {count} fields would not change the law")
 
     def _end(self, row: Row, reason: str, early: str = "") -> None:
         row["reason"], self._progress.stage = reason, ENDED
@@ -364,9 +369,7 @@ class ModelBased(Optimizer):
     def _search_from(self, begun: int) -> LocalSearch:
         """Local steps after this many rollouts of its own."""
         return LocalSearch(
-            self._context,
-            self._first,
-            self._records.all()[:begun],
+            *(self._context, self._first, self._records.all()[:begun]),
             seed=self._seed,
             rollouts=self._budget - begun,
             settings=self._settings,
@@ -391,6 +394,7 @@ class ModelBased(Optimizer):
         """Continue from a checkpoint of an optimiser with the same arguments."""
         n_z, shape = len(self._context.U), self._first.shape
         self._progress = Progress.of(state, shape)
+        self._take_noise(self._progress.noise)
         if self._progress.belief is not None:
             self._progress.belief.check(self._context)
         self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])

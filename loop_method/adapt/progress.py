@@ -49,6 +49,8 @@ class Progress:
         True if no control is judged as well.
     safe : bool
         True if the first law is better than no control on the model.
+    noise : float
+        Measurement noise that was found in place of the declared one; 0: none was.
     """
 
     policy: Array
@@ -62,6 +64,7 @@ class Progress:
     begun: int = 0
     none_is_close: bool = False
     safe: bool = True
+    noise: float = 0.0
 
     def state(self) -> State:
         """All of it, as the arrays of a checkpoint."""
@@ -73,6 +76,7 @@ class Progress:
             "begun": np.array(self.begun),
             "none_is_close": np.array(self.none_is_close),
             "safe": np.array(self.safe),
+            "noise": np.array(self.noise),
         }
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
@@ -102,7 +106,16 @@ class Progress:
             begun=int(checked_array(state, "begun", "i", ())),
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
+            noise=_noise_of(state),
         )
+
+
+def _noise_of(state: Mapping[str, NDArray[np.generic]]) -> float:
+    """ValueError for a standard deviation that is negative."""
+    noise = float(checked_array(state, "noise", "f", ()))
+    if noise < 0.0:
+        raise ValueError(f"its noise is {noise:g}; expected 0 or more")
+    return noise
 
 
 def held_out(fraction: float, change: Estimate) -> Array:

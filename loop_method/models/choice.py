@@ -55,6 +55,7 @@ def fit_field_model(
     first: str | None = None,
     line: bool = True,
     shape: tuple[int, ...] = (),
+    knows_noise: bool = False,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -79,14 +80,18 @@ def fit_field_model(
         Whether the states are fields on one axis, or plain vectors.
     shape : tuple of int
         Points of each axis, where the states are fields on several; none: they are not.
+    knows_noise : bool
+        Try only the kinds that are fitted for noise.
     """
-    rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
+    rollouts = [limited(rollout, action_limit) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
         settings = replace(settings, reproduced=settings.reproduced_noisy)
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
+    if knows_noise:
+        kinds = [kind for kind in kinds if kind.fit_noisy is not None]
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load
@@ -163,7 +168,7 @@ def _fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> Fie
         return None
 
 
-def _limited(rollout: Measured, limit: float) -> Measured:
+def limited(rollout: Measured, limit: float) -> Measured:
     """With the actions that act where they saturate."""
     if not limit:
         return rollout

@@ -135,6 +135,25 @@ class FieldModelSettings(Settings):
         1,
         1e12,
     )
+    # Noise that was not declared, or not as it is.
+    noise_misjudged: float = setting(
+        2.0,
+        "ratio of the noise in the data to the declared one, or its inverse, that counts",
+        1.1,
+        100,
+    )
+    noise_excess: float = setting(
+        1.3,
+        "largest root mean square of the innovations of an equation, relative to the noise",
+        1,
+        10,
+    )
+    white_level: float = setting(
+        0.01, "rate at which the test for white innovations rejects independent noise", 1e-6, 0.5
+    )
+    white_tolerance: float = setting(
+        0.5, "root sum of squares of the correlations of innovations that counts as white", 0, 10
+    )
     # The field between few sensors. "Error" is the squared error of simulated readings over their sum
     # of squares, without the share of the noise.
     sensed_most: int = setting(

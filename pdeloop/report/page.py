@@ -33,7 +33,7 @@ from pdeloop.study.run import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
-from tuner_node.narration import differences, span
+from tuner_node.narration import differences, misjudged_noise, span
 from tuner_node.run_folder import RunFolderError
 
 PIXELS_PER_INCH = 115
@@ -258,7 +258,7 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
     if isfinite(none) and none > 0:
         said.append(f"{100 * cost / none:.3g} % of the cost without control remains")
     outcome = problem.runs[best].result.get("outcome", [])
-    said += differences(problem.runs[best].result)
+    said += differences(problem.runs[best].result) + misjudged_noise(problem.runs[best].result)
     for own in {own["verdict"]: own for own in outcome if own["verdict"] != "better"}.values():
         count = sum(other["verdict"] == own["verdict"] for other in outcome)
         which = f"{count} of {len(outcome)} seeds" if len(outcome) > 1 else "outcome"

@@ -1,0 +1,56 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The level that measurement noise would have, from differences of states in time.
+
+Of the coefficients X_k of any orthonormal wave at step k,
+
+    P_d = mean |D^d X_k|^2 / binom(2 d, d),        D: difference of successive states,
+
+is sigma^2 for white noise, whatever the order d, and what the field adds to it is never negative. So
+the least P_d over bands of short waves and orders is the largest sigma^2 that the states allow, and
+sigma^2 itself where a band has no waves of the field. That is no evidence of noise: the short waves of
+a front that moves over several points between two states are white in time as well. The evidence is a
+model (`undeclared_noise`); the orders tell only whether it is worth a fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import comb
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+
+ORDERS = (1, 2, 3, 4)
+BANDS = 4
+"""Of the wavenumbers from a quarter of the highest one on."""
+ALIKE = 1.5
+"""Largest ratio of the powers of a band of noise; that of a random walk is 1.75."""
+LEAST = 1e-3
+"""Smallest noise, relative to the root mean square of the states; below, it changes no fit."""
+FEWEST = 200
+"""Coefficients of a band below which its powers are too uncertain."""
+
+
+def noise_level(trajectories: Sequence[Array]) -> float:
+    """The standard deviation that white noise on states (L, n) would have; 0 if there is none."""
+    usable = [z for z in trajectories if len(z) > max(ORDERS) and np.isfinite(z).all()]
+    if not usable:
+        return 0.0
+    n = usable[0].shape[1]
+    edges = np.linspace(n // 8, n // 2, BANDS + 1).astype(int)
+    spectra = [np.fft.rfft(z, axis=1, norm="ortho") for z in usable]
+    steps = sum(len(z) - max(ORDERS) for z in usable)
+    if edges[0] < 1 or steps * int(np.diff(edges).min()) < FEWEST:
+        return 0.0
+    powers = np.zeros((BANDS, len(ORDERS)))
+    for i, order in enumerate(ORDERS):
+        found = np.concatenate([np.abs(np.diff(own, order, axis=0)) ** 2 for own in spectra])
+        for band in range(BANDS):
+            mean = float(found[:, edges[band] : edges[band + 1]].mean())
+            powers[band, i] = mean / comb(2 * order, order)
+    quietest = powers[int(powers.min(axis=1).argmin())]
+    alike = quietest.max() <= ALIKE * quietest.min()
+    sigma = float(np.sqrt(quietest.min()))
+    size = float(np.sqrt(np.mean([np.mean(z**2) for z in usable])))
+    return sigma if alike and sigma > LEAST * size else 0.0

@@ -1,0 +1,136 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Measurement noise that nobody declared, accepted only where a model says so.
+
+Where no model without noise predicts the rollouts, an equation is fitted for noise of the level that
+their differences allow (`noise_level`). The noise is there if that equation predicts rollouts that it
+was not fitted to better than any model without noise, and if what it does not predict of the short
+waves is measurement noise: its innovations there, along filtered states, have that level and are white
+in time and space (`whiteness`). Those of a front that is narrower than the grid are not: they gather
+around it. Long waves are judged by the prediction, as their innovations hold the equation's own errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
+from threadpoolctl import threadpool_limits
+
+from loop_interfaces.arrays import Array
+from loop_method.models.base import FieldModel, Measured
+from loop_method.models.choice import FittedModel, fit_field_model, limited, with_clean
+from loop_method.models.noise_level import noise_level
+from loop_method.models.settings import FieldModelSettings
+from loop_method.models.whiteness import is_white
+
+_BEGINNING = 8
+"""Innovations of a rollout that are left out, as those of its uncertain initial state."""
+_TURNS = 4
+"""Times that the filter's shares are computed from its innovations."""
+
+
+def fit_undeclared_noise(
+    rollouts: Sequence[Measured],
+    target: Array,
+    *,
+    settings: FieldModelSettings,
+    most: float,
+    better_than: float = np.inf,
+    declared: float = 0.0,
+    action_limit: float = 0.0,
+) -> tuple[FittedModel, float] | None:
+    """An equation fitted for measurement noise, and the noise; None where there is no such noise.
+
+    Parameters
+    ----------
+    rollouts : sequence of Measured
+        Of fields of one component on a periodic axis.
+    target : (n_z,) array
+        z_r.
+    settings : FieldModelSettings
+        Constants.
+    most : float
+        Largest error E of the equation.
+    better_than : float
+        E of the best model without noise.
+    declared : float
+        Noise that was declared; another one is looked for only if it is `noise_misjudged` times as
+        large, or as small.
+    action_limit : float
+        Magnitude at which actions saturate; 0 for none.
+    """
+    noise = noise_level([np.asarray(rollout.states) for rollout in rollouts])
+    misjudged = max(noise, declared) > settings.noise_misjudged * min(noise, declared)
+    if not noise or not misjudged:
+        return None
+    found = fit_field_model(
+        *(rollouts, target),
+        settings=settings,
+        noise=noise,
+        action_limit=action_limit,
+        knows_noise=True,
+    )
+    if found is None or found.error > most or not found.error < better_than:
+        return None
+    known = with_clean([limited(rollout, action_limit) for rollout in rollouts], noise)
+    with threadpool_limits(limits=1):
+        left = innovations(found.model, known, noise, settings)
+    if left is None:
+        return None
+    short = [short_waves(own) for own in left]
+    if not is_white(short, settings.white_level, settings.white_tolerance):
+        return None
+    size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
+    return (found, noise) if size <= settings.noise_excess * noise else None
+
+
+def short_waves(states: Array) -> Array:
+    """The upper half of the wavenumbers of states (L, n), as series of half as many points.
+
+    White noise remains white, of the same variance, and what is near to a point remains so.
+    """
+    n = states.shape[1]
+    spectra = scipy.fft.rfft(states)[:, n // 4 : n // 2 + 1] / np.sqrt(2.0)
+    spectra[:, 0] = np.sqrt(2.0) * spectra[:, 0].real  # the mean of the series, which is real
+    found: Array = scipy.fft.irfft(spectra, 2 * (spectra.shape[1] - 1))
+    return found
+
+
+def innovations(
+    model: FieldModel, rollouts: Sequence[Measured], noise: float, settings: FieldModelSettings
+) -> list[Array] | None:
+    """Measured minus predicted states (L, n_z) of each rollout, along its filtered states.
+
+    rollouts: with `clean`, where the filter begins; None where the model runs away.
+    """
+    power = noise**2 / model.n_z
+    shares = np.full(model.n_z // 2 + 1, 0.5)
+    for _ in range(_TURNS):
+        left = []
+        for rollout in rollouts:
+            if (own := _along(model, rollout, shares, settings.far)) is None:
+                return None
+            left.append(own)
+        spectra = np.concatenate([scipy.fft.rfft(own) / model.n_z for own in left])
+        error = np.maximum(np.mean(np.abs(spectra) ** 2, axis=0) - power, 0.0)
+        shares = np.clip(error / (error + power), settings.least_correction, 1.0)
+    return left
+
+
+def _along(model: FieldModel, rollout: Measured, shares: Array, far: float) -> Array | None:
+    """The innovations of one rollout, but for the first; None where the model runs away.
+
+    Until the share that is given is the best one, it is that of an unknown state that rests, 1/(k + 1).
+    """
+    z, most = rollout.known[:1], far * float(np.abs(rollout.states).max())
+    left = np.empty((len(rollout.actions), model.n_z))
+    for k, action in enumerate(rollout.actions):
+        with np.errstate(all="ignore"):
+            predicted = model.step(z, action[None])
+        if not np.abs(predicted).max() <= most:
+            return None
+        left[k] = rollout.states[k + 1] - predicted[0]
+        own = np.maximum(shares, 1.0 / (k + 2))
+        z = predicted + scipy.fft.irfft(own * scipy.fft.rfft(left[k : k + 1]), model.n_z)
+    return left[_BEGINNING:]

@@ -1,0 +1,166 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Measurement noise that nobody declared is found where a model says so, and nowhere else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+
+import pdeloop
+from loop_method.adapt import Context, Record, Trajectory, undeclared_noise
+from loop_method.adapt.belief import Belief
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.models import Measured
+from loop_method.models.linear import LinearModel
+from loop_method.models.noise_level import noise_level
+from loop_method.models.settings import DEFAULTS
+from loop_method.models.undeclared_noise import fit_undeclared_noise, short_waves
+from loop_method.models.whiteness import correlations, is_white
+from pde_sim_node.build import build_plant
+from pdeloop.in_process import LocalPair, train
+from tuner_node.build import build_training
+from tuner_node.narration import warnings
+from tuner_node.results import check_result, summarise
+from tuner_node.training_state import arrays_of, restore
+
+N, L = 64, 120
+Rollouts = list[tuple[np.ndarray, np.ndarray]]
+
+
+def waves(seed: int) -> np.ndarray:
+    """Waves of few periods that move: a field without noise."""
+    rng = np.random.default_rng(seed)
+    x, t = np.arange(N) / N, np.arange(L)[:, None] / 20.0
+    return sum(
+        rng.standard_normal() * np.cos(2 * np.pi * (k * x - 0.1 * k * t) + rng.uniform(0.0, 6.0))
+        for k in range(1, 6)
+    )
+
+
+def explored(name: str, **parameters: Any) -> tuple[Rollouts, np.ndarray]:
+    """The first two explorations of a problem, and its target."""
+    problem = pdeloop.problem(name, **parameters)
+    return [problem.explore(seed) for seed in range(2)], problem.plant().target
+
+
+def found_in(rollouts: Rollouts, target: np.ndarray, **given: Any) -> float:
+    """The noise that is found in rollouts; 0: none."""
+    known = [Measured(states, actions) for states, actions in rollouts]
+    found = fit_undeclared_noise(known, target, settings=DEFAULTS, most=0.3, **given)
+    return 0.0 if found is None else found[1]
+
+
+def test_white_residuals_are_rejected_at_the_level_of_the_test() -> None:
+    """Of 400 draws at the level 0.05 a binomial number, here within 3.5 standard deviations."""
+    rng, level, draws = np.random.default_rng(1), 0.05, 400
+    lost = sum(
+        not is_white([rng.standard_normal((40, 32)) for _ in range(2)], level) for _ in range(draws)
+    )
+    assert abs(lost - draws * level) <= 3.5 * np.sqrt(draws * level * (1.0 - level))
+
+
+def test_the_tolerance_admits_correlations_up_to_it_and_none_much_larger() -> None:
+    rng = np.random.default_rng(2)
+    white = rng.standard_normal((2000, 64))
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.3], white, axis=0)
+    # Correlations rho^l of the numbers and rho^2l of their squares, l = 1 .. 4, in time alone.
+    size = np.sqrt(sum(0.3 ** (2 * lag) + 0.3 ** (4 * lag) for lag in range(1, 5)))
+    rho, count = correlations([slow])
+    assert np.sqrt(np.sum(rho**2)) == pytest.approx(size, rel=0.05) and count == slow.size
+    assert is_white([slow], 0.01, size) and not is_white([slow], 0.01, size / 2.0)
+
+
+def test_residuals_of_wrong_models_are_not_white() -> None:
+    rng = np.random.default_rng(3)
+    white = rng.standard_normal((L, N))
+    smooth = white + np.roll(white, 1, axis=1)
+    distance = (np.arange(N) - 5 * np.arange(L)[:, None]) % N - N / 2
+    near_a_front = white / np.cosh(distance / 4.0)  # which moves by five points a step
+    for residuals in (smooth, near_a_front, np.cumsum(white, axis=0), np.full((L, N), np.nan)):
+        assert not is_white([residuals], 0.01, tolerance=0.3)
+    assert is_white([white], 0.01) and not is_white([white[:4]], 0.01) and not is_white([], 0.01)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.1, 1.0])
+def test_differences_have_the_level_of_white_noise(sigma: float) -> None:
+    rng = np.random.default_rng(4)
+    noisy = [waves(i) + sigma * rng.standard_normal((L, N)) for i in range(2)]
+    assert noise_level(noisy) == pytest.approx(sigma, rel=0.05)
+
+
+def test_short_waves_of_white_noise_are_white_noise_of_the_same_size() -> None:
+    white = np.random.default_rng(6).standard_normal((4000, N))
+    short = short_waves(white)
+    assert short.shape == (4000, N // 2) and is_white([short], 0.01)
+    assert np.std(short, axis=0) == pytest.approx(1.0, abs=0.05)
+    long = np.fft.irfft(np.fft.rfft(white)[:, : N // 4], N)  # of which nothing is left
+    assert np.abs(short_waves(long)).max() < 1e-12
+
+
+def test_a_random_walk_smooth_waves_and_too_few_numbers_have_no_level() -> None:
+    white = np.random.default_rng(5).standard_normal((L, N))
+    rough = np.cumsum(white, axis=0)
+    for states in (rough, waves(1), waves(1) + 1e-6 * white, np.zeros((L, N))):
+        assert noise_level([states]) == 0.0
+    assert noise_level([]) == noise_level([white[:8]]) == noise_level([white[:, :6]]) == 0.0
+    assert noise_level([white, np.full((9, N), np.inf)]) == pytest.approx(1.0, rel=0.1)
+
+
+def test_noise_is_found_within_a_tenth_on_a_known_plant() -> None:
+    sigma = 0.05
+    rollouts, target = explored("allen-cahn-modes", n_z=96, horizon=50, measurement_noise=sigma)
+    assert found_in(rollouts, target) == pytest.approx(sigma, rel=0.1)
+    # Declared nearly right, it is left as it was declared.
+    assert found_in(rollouts, target, declared=1.5 * sigma) == 0.0
+    assert found_in(rollouts, target, declared=3.0 * sigma) == pytest.approx(sigma, rel=0.1)
+
+
+def test_a_model_without_noise_that_is_believed_ends_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever the data look like: with noise that was not declared, nothing is even fitted."""
+    white = np.random.default_rng(7).standard_normal((L, N))
+    record = Record(np.zeros((1, 2)), np.inf, white, np.zeros((L - 1, 1)))
+    context = Context(np.eye(N)[:, :1], np.zeros(N), 1.0, 1.0, L - 1, Trajectory(white, white))
+    model = LinearModel("linear", np.eye(N), np.zeros((N, 1)), np.zeros(N))
+    settings, fits = ModelBasedSettings(), []
+    monkeypatch.setattr(undeclared_noise, "fit_undeclared_noise", lambda *_, **on: fits.append(on))
+    for error, tried in ((settings.believed, 0), (1.01 * settings.believed, 1)):
+        undeclared_noise.believe_in_noise(context, [record], Belief(model, error, 1), settings)
+        assert len(fits) == tried
+    assert fits[0]["better_than"] == 1.01 * settings.believed
+
+
+def test_a_front_that_looks_like_noise_in_its_short_waves_is_none() -> None:
+    """It is narrower than the grid, and moves over several points between two states."""
+    rollouts, target = explored("burgers", horizon=100)
+    assert noise_level([states for states, _ in rollouts]) > 0.005
+    assert found_in(rollouts, target) == 0.0
+
+
+def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> None:
+    sigma = 0.05
+    quick = {"field_model_settings.folds": 2, "field_model_settings.passes": 4}
+    problem = pdeloop.problem(
+        "allen-cahn-modes",
+        **{"n_z": 128, "horizon": 40, "rollouts": 6, "evaluation_fields": 1, **quick},
+        **{"measurement_noise": sigma, "exploration_variance": 1.0},
+        **{"identification": "regression", "field_model_settings.largest_degree": 3},
+    )
+    values = {**problem.values, "measurement_noise": 0.0}
+    training = build_training(values)
+    train(training, LocalPair(values, build_plant(problem.values)), lambda row: None)
+    summary = summarise(training)
+    (found,) = summary["noise"]["found"]
+    assert summary["noise"]["declared"] == 0.0 and found == pytest.approx(sigma, rel=0.1)
+    (said,) = (text for text in warnings(summary) if "noise" in text)
+    assert f"noise of about {found:.2g} was found" in said and "none was declared" in said
+    check_result(summary, 0, 1)
+    again = build_training(values)
+    restore(again, arrays_of(training))
+    for each in (training, again):
+        (optimizer,) = each.optimizers
+        assert optimizer._context.noise == found
