@@ -20,7 +20,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
-from loop_method.adapt.estimate import ZERO, Estimate, mean_of
+from loop_method.adapt.estimate import Estimate, mean_of
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
@@ -28,7 +28,7 @@ from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, b
 from loop_method.adapt.observer_design import compensators, whole_field_law
 from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of, evidence_of_pairs
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of_pairs
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -127,38 +127,52 @@ class ModelBasedSensed(ModelBasedReadings):
         own = self._records.all()
         return list(takewhile(lambda record: np.array_equal(record.policy, self._first), own))
 
-    def _not_worse_than_before(self) -> Array:
-        """The final law, or the one that measured best before it if that is better."""
-        final, own = self._progress.policy, self._records.all()
-        before = best_measured([r for r in own if not np.array_equal(r.policy, final)], self._first)
-        if np.array_equal(before, self._first):
-            return final
-        belief = self._progress.belief
-        assert belief is not None
-        loop, fields = belief.loop(self._context), self._fields()
-        # The names are those of a law to stay with and of another one.
-        evidence = evidence_of(loop, {FIRST: final, NONE: before}, FIRST, own, fields, ZERO)
-        if choose(evidence, FIRST, self._settings.confidence).chosen == FIRST:
-            return final
-        base = self._first if self._progress.safe else self._none
-        costs = (loop.costs(loop.theta(law), fields) for law in (before, base))
-        self._progress.change = gained(*costs)
-        return before.copy()
-
     def _judge(self, row: Row) -> None:
-        """As on a model of the whole field, where there is one, if measured pairs agree."""
+        """Judge the law after the last descent; if it is not chosen, the best one measured before.
+
+        Wherever the model is wrong, that one may be the better of the two.
+        """
         if self._sensed is None:
             super()._judge(row)
             return
-        self._progress.policy = final = self._not_worse_than_before()
+        final, own = self._progress.policy, self._records.all()
+        self._judge_law(row, final)
+        chosen, reported = self._progress.policy, dict(row)
+        before = best_measured(
+            [r for r in own if r.policy.any() and not np.array_equal(r.policy, final)], self._first
+        )
+        if row["chosen"] == ADAPTED or np.array_equal(before, self._first):
+            return
+        with np.errstate(invalid="ignore"):  # some may have diverged
+            costs, first, none = (
+                mean_of(
+                    np.array([r.cost for r in own if np.array_equal(r.policy, law)] or [np.inf])
+                )
+                for law in (before, self._first, self._none)
+            )
+        if first.error < np.inf and not (costs - first).is_negative(self._settings.confidence):
+            return
+        loop, fields = sensed_loop(self._context, self._sensed), self._fields()
+        base = self._first if self._progress.safe else self._none
+        self._progress.change = gained(
+            *(loop.costs(loop.theta(law), fields) for law in (before, base))
+        )
+        self._judge_law(row, before)
+        if row["chosen"] != ADAPTED or costs.value >= none.value:
+            self._progress.policy = chosen
+            row.update(reported)
+
+    def _judge_law(self, row: Row, law: Array) -> None:
+        """As on a model of the whole field, where measured pairs agree if there are any."""
         judged = self._records.all()[-self._judging :]
         pairs = [
             (own.cost, before.cost)
             for own, before in zip(judged, cycle(self._begun()))
-            if np.array_equal(own.policy, final)
+            if np.array_equal(own.policy, law)
         ]
+        self._progress.policy = law.copy()
         ModelBased._judge(self, row)
-        if len(pairs) < FEWEST or np.array_equal(final, self._first) or row["chosen"] == NONE:
+        if len(pairs) < FEWEST or np.array_equal(law, self._first) or row["chosen"] == NONE:
             return
         costs = dict(zip((ADAPTED, FIRST), np.array(pairs).T, strict=True))
         measured = choose(evidence_of_pairs(costs, FIRST), FIRST, self._settings.confidence)
@@ -166,7 +180,7 @@ class ModelBasedSensed(ModelBasedReadings):
         if not safe and (measured.chosen == ADAPTED or row["chosen"] == FIRST):
             return  # no control was the law to stay with
         kept = measured.chosen if safe else NONE
-        laws = {FIRST: self._first, ADAPTED: final, NONE: self._none}
+        laws = {FIRST: self._first, ADAPTED: law, NONE: self._none}
         self._progress.policy = laws[kept].copy()
         row["chosen"], row["reason"] = kept, measured.reason
         row["predicted_change"], row["deviation"] = measured.change, measured.deviation

@@ -280,18 +280,23 @@ def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
 
 
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
-    own = optimiser(rollouts=7, judging=3)
+    better = optimiser()
+    better.tell([measured(asked) for asked in better.ask()])
+    own = optimiser(rollouts=7, judging=3, first=better.policy)
     own.tell([measured(asked) for asked in own.ask()])
-    before = own.policy
-    final = own._progress.policy = before + 1e-6
+    before, final = own._first + 1e-6, own._first + 2e-6
+    own._progress.policy = final
     asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
     results = [measured(each) for each in asked]
-    for more, best in ((0.0, final), (50.0, before)):
-        again = copy.deepcopy(own)
+    for more, best in ((0.1, final), (10.0, before)):
+        again, row = copy.deepcopy(own), {}
         for each, result in zip(asked, results, strict=True):
-            cost = result.cost + more * np.array_equal(each.policy, final)
+            # That of the first law on the same field, or of one that runs away.
+            known = again._records.all()[int(each.field_seed) - 1].cost
+            cost = known * (more if np.array_equal(each.policy, final) else 0.1)
             again._records.add(each.policy, replace(result, cost=cost), set())
-        assert same_bits(again._not_worse_than_before(), best)
+        again._judge(row)
+        assert same_bits(again.policy, best) and row["chosen"] == "adapted"
 
 
 def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
