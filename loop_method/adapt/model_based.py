@@ -219,11 +219,8 @@ class ModelBased(Optimizer):
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
         """The costs of rollouts on the last model; none without one."""
-        return (
-            belief.predicted_costs(self._context, added)
-            if (belief := self._progress.belief)
-            else []
-        )
+        belief = self._progress.belief
+        return [] if belief is None else belief.predicted_costs(self._context, added)
 
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""
@@ -342,17 +339,14 @@ class ModelBased(Optimizer):
             return
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
         base = FIRST if self._progress.safe else NONE
-        known = self._data()[len(self._context.every_exploration) :]
-        evidence = evidence_of(
-            *(self._progress.belief.loop(self._context), laws, base),
-            *(known, self._fields(), self._progress.change),
-        )
+        known, fields = self._data()[len(self._context.every_exploration) :], self._fields()
+        loop = self._progress.belief.loop(self._context)
+        evidence = evidence_of(loop, laws, base, known, fields, self._progress.change)
         verdict = choose(evidence, base, self._settings.confidence)
         self._progress.policy = laws[verdict.chosen].copy()
         row["chosen"] = verdict.chosen
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
-        count = len(self._fields())
-        self._end(row, verdict.reason, f"more than {count} fields would not change the law")
+        self._end(row, verdict.reason, f"more than {len(fields)} fields would not change the law")
 
     def _end(self, row: Row, reason: str, early: str = "") -> None:
         row["reason"], self._progress.stage = reason, ENDED
