@@ -13,8 +13,6 @@ Where no equation reproduces the rollouts, it continues with a model of the read
 
 from __future__ import annotations
 
-from itertools import cycle, takewhile
-
 import numpy as np
 
 from loop_interfaces.arrays import Array
@@ -26,9 +24,17 @@ from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
 from loop_method.adapt.observer_design import compensators, whole_field_law
-from loop_method.adapt.progress import JUDGING
+from loop_method.adapt.progress import JUDGING, RENEWING
 from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of_pairs
+from loop_method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    Verdict,
+    choose,
+    evidence_of_pairs,
+    size_of,
+)
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -115,75 +121,69 @@ class ModelBasedSensed(ModelBasedReadings):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
     def ask(self) -> list[Rollout]:
-        """The final law is judged on the fields of the first one."""
+        """The final law is judged on the fields of the first one, and no control where it may stay."""
         asked = super().ask()
-        if self._progress.stage != JUDGING or self._sensed is None:
+        if self._sensed is None or self._progress.stage not in (RENEWING, JUDGING):
             return asked
-        begun = len(self._begun())
-        return [self._rollout(own.policy, i % begun) for i, own in enumerate(asked)]
+        begun = len(self._of(self._first))
+        if self._progress.stage == JUDGING:
+            return [self._rollout(own.policy, i % begun) for i, own in enumerate(asked)]
+        if self._progress.safe or self._of(self._none):
+            return asked
+        return [self._rollout(self._none, i) for i in range(min(begun, len(asked)))] + asked[begun:]
 
-    def _begun(self) -> list[Record]:
-        """The rollouts of the first law that the optimisation began with."""
-        own = self._records.all()
-        return list(takewhile(lambda record: np.array_equal(record.policy, self._first), own))
+    def _of(self, law: Array) -> list[Record]:
+        """The rollouts of a law in the order of its fields."""
+        return [own for own in self._records.all() if np.array_equal(own.policy, law)]
+
+    def _begin_judging(self) -> None:
+        super()._begin_judging()
+        self._progress.none_is_close &= self._sensed is None or not self._of(self._none)
 
     def _judge(self, row: Row) -> None:
-        """Judge the law after the last descent; if it is not chosen, the best one measured before.
-
-        Wherever the model is wrong, that one may be the better of the two.
-        """
+        """As on a model of the whole field, where there is one, if measured costs agree."""
         if self._sensed is None:
             super()._judge(row)
             return
-        final, own = self._progress.policy, self._records.all()
-        self._judge_law(row, final)
-        chosen, reported = self._progress.policy, dict(row)
-        before = best_measured(
-            [r for r in own if r.policy.any() and not np.array_equal(r.policy, final)], self._first
-        )
-        if row["chosen"] == ADAPTED or np.array_equal(before, self._first):
-            return
-        with np.errstate(invalid="ignore"):  # some may have diverged
-            costs, first, none = (
-                mean_of(
-                    np.array([r.cost for r in own if np.array_equal(r.policy, law)] or [np.inf])
-                )
-                for law in (before, self._first, self._none)
-            )
-        if first.error < np.inf and not (costs - first).is_negative(self._settings.confidence):
-            return
-        loop, fields = sensed_loop(self._context, self._sensed), self._fields()
-        base = self._first if self._progress.safe else self._none
-        self._progress.change = gained(
-            *(loop.costs(loop.theta(law), fields) for law in (before, base))
-        )
-        self._judge_law(row, before)
-        if row["chosen"] != ADAPTED or costs.value >= none.value:
-            self._progress.policy = chosen
-            row.update(reported)
-
-    def _judge_law(self, row: Row, law: Array) -> None:
-        """As on a model of the whole field, where measured pairs agree if there are any."""
-        judged = self._records.all()[-self._judging :]
-        pairs = [
-            (own.cost, before.cost)
-            for own, before in zip(judged, cycle(self._begun()))
-            if np.array_equal(own.policy, law)
-        ]
-        self._progress.policy = law.copy()
+        final = self._progress.policy
         ModelBased._judge(self, row)
-        if len(pairs) < FEWEST or np.array_equal(law, self._first) or row["chosen"] == NONE:
+        base, stays = (FIRST, self._first) if self._progress.safe else (NONE, self._none)
+        if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
+            self._compare_pairs(row, base, stays, final)
+        if row["chosen"] != ADAPTED:
+            self._look_back(row, base, stays, final)
+
+    def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
+        """Decide between the final law and the one to stay with on the same fields."""
+        judged = self._records.all()[-self._judging :]
+        own = [record.cost for record in judged if np.array_equal(record.policy, final)]
+        pairs = list(zip(own, (record.cost for record in self._of(stays)), strict=False))
+        if len(pairs) < FEWEST:
             return
-        costs = dict(zip((ADAPTED, FIRST), np.array(pairs).T, strict=True))
-        measured = choose(evidence_of_pairs(costs, FIRST), FIRST, self._settings.confidence)
-        safe = self._progress.safe
-        if not safe and (measured.chosen == ADAPTED or row["chosen"] == FIRST):
-            return  # no control was the law to stay with
-        kept = measured.chosen if safe else NONE
-        laws = {FIRST: self._first, ADAPTED: law, NONE: self._none}
-        self._progress.policy = laws[kept].copy()
-        row["chosen"], row["reason"] = kept, measured.reason
-        row["predicted_change"], row["deviation"] = measured.change, measured.deviation
+        costs = dict(zip((ADAPTED, base), np.array(pairs).T, strict=True))
+        measured = choose(evidence_of_pairs(costs, base), base, self._settings.confidence)
+        self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
+        self._report(row, measured)
+
+    def _look_back(self, row: Row, base: str, stays: Array, final: Array) -> None:
+        """Return the law that measured best before the final one, if it is better than what stays."""
+        others = [own for own in self._records.all() if not np.array_equal(own.policy, final)]
+        before = best_measured(others, stays)
+        own, known = ([record.cost for record in self._of(law)] for law in (before, stays))
+        if len(known) < FEWEST or not np.isfinite(known).all():
+            return
+        change = mean_of(np.array(own)) - mean_of(np.array(known))
+        if change.is_negative(self._settings.confidence):
+            names = ((FIRST, self._first), (NONE, self._none), (ADAPTED, before))
+            name = next(name for name, law in names if np.array_equal(law, before))
+            size = change.value, change.error
+            self._progress.policy = before.copy()
+            self._report(row, Verdict(name, *size, size_of(name, base, *size)))
+
+    @staticmethod
+    def _report(row: Row, verdict: Verdict) -> None:
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
 
 
 def gained(costs: Array, base: Array) -> Estimate:
