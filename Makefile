@@ -41,7 +41,7 @@ install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt 
 # The digests of all archives of the pinned versions; a version is changed in constraints.txt. With its extras,
 # since pip holds name[extra], which a package asks for, to the pin of name[extra] alone.
 lock: .venv/supply
-	@for part in run:ros test:ros,dev; do \
+	@for part in run:ros,report test:ros,dev; do \
 		echo setuptools | .venv/supply/bin/python -m uv pip compile --quiet --universal --generate-hashes --no-strip-extras \
 			--no-annotate --no-header --constraint constraints.txt $$(echo $${part#*:} | tr , '\n' | sed 's/^/--extra /') \
 			--output-file requirements/$${part%:*}.txt pyproject.toml - || exit 1; \

@@ -26,6 +26,18 @@ from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
 from tests.support.small import RECORDED, REPRODUCED, SMALL
 
+LONG = (
+    *("test_soak", "test_launch", "test_beyond", "test_working_directory", "test_foreign"),
+    *(
+        "test_readme_commands",
+        "test_pairs",
+        "test_introspection",
+        "test_actuators",
+        "test_operator",
+    ),
+)
+"""Files with the longest tests over topics. One of them at the end leaves the other workers idle."""
+
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Processes inherit what is ignored: SIGINT in a shell's background, SIGHUP under nohup.
@@ -119,7 +131,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     topics = [item for item in items if item.get_closest_marker("topics")]
-    topics.sort(key=lambda item: "test_soak" not in item.nodeid)
+    topics.sort(key=lambda item: item.path.stem not in LONG)
     others = [item for item in items if not item.get_closest_marker("topics")]
     parts = [len(others) * i // workers for i in range(workers + 1)]
     items[:] = [

@@ -153,7 +153,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
     if not order and values["seeds"] > 1:
         raise ParameterError(
             f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, as "
-            "the models of a batch have one order; give --reduced-order N (one seed says which)"
+            "the models of a batch have one order; give --reduced-order N (a training of one seed "
+            "says which), or train each seed on its own with pdeloop study"
         )
     kind = kind_of(values)
     chosen = settings_of(kind, values)

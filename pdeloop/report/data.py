@@ -13,7 +13,7 @@ import numpy as np
 from controller_node.law_batch import LawBatch
 from loop_interfaces.array_files import checked_array, read_arrays
 from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows, unpack
+from loop_interfaces.model_rows import ModelRows
 from loop_method.laws import Affine
 from loop_method.laws.calls import laws_of
 from loop_method.laws.registry import law_kind
@@ -220,21 +220,18 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
-    """The orders that the exploratory episode supports from which a seed's model was identified."""
+    """The orders that the exploratory episodes support from which a seed's model was identified."""
     if run.values["model"] or not run.rollouts:
         return None
     training = build_training({**run.values, "seed": run.seeds[shown], "seeds": 1})
-    training.attempts = [run.rollouts[shown]["exploration"] - 1]
+    attempts = run.rollouts[shown]["exploration"] // training.settings.explorations
+    training.attempts = [attempts - 1]
     batch = training.next_batch()
     assert batch is not None
-    again = LocalPair(run.values, plant).run(replace(batch, trajectories=True))
-    assert again.models is not None and again.trajectories is not None
-    found = unpack(again.models[0], run.values["n_a"], training.settings.law.filtered)
-    if found.U.shape != run.models[shown].U.shape or not np.allclose(found.U, run.models[shown].U):
-        return None
-    (explored,) = again.trajectories
+    explored = LocalPair(run.values, plant).roll_out(batch)
+    pairs = zip(explored.states.swapaxes(0, 1), explored.actions.swapaxes(0, 1), strict=True)
     try:
-        return study_orders([(explored.states, explored.actions)])
+        return study_orders(list(pairs))
     except ValueError:  # too few steps to hold some out
         return None
 

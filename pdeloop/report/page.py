@@ -192,8 +192,8 @@ def _of_problem(problem: ProblemData) -> Drawn:
         yield (
             f"{name}-orders",
             "Order of the reduced model",
-            f"Exploratory episode of seed {seed}: singular values of its states, and errors of models "
-            "on steps that they were not fitted to, relative to a model in which nothing changes. "
+            f"Exploration of seed {seed}: singular values of its states, and errors of models on steps "
+            "that they were not fitted to, relative to a model in which nothing changes. "
             f"Line: the order of this run, {used}; dotted: the one that these errors suggest, "
             f"{problem.orders.suggested}.",
             figures.orders(problem.orders, used),

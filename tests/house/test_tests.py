@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import LONG
 from tests.support.interpreter import ROOT
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -136,3 +137,8 @@ def test_only_what_cannot_be_had_everywhere_is_a_reason_to_skip() -> None:
 def test_what_tests_need_of_these_is_installed_with_them(name: str) -> None:
     locked = Path(ROOT / "requirements" / "test.txt").read_text()
     assert re.search(rf"^{re.escape(name)}==", locked, re.MULTILINE)
+
+
+def test_files_that_come_first_are_there() -> None:
+    missing = [name for name in LONG if not (ROOT / "tests" / "topics" / f"{name}.py").is_file()]
+    assert missing == []

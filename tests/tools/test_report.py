@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -19,6 +20,8 @@ from matplotlib.image import imread
 
 from loop_interfaces.colour_scale import DARK
 from loop_interfaces.controllers import CONTROLLERS
+from loop_method.reduce.order import study_orders
+from pdeloop.in_process import LocalPair
 from pdeloop.report.dark import BACK, INK, darken
 from pdeloop.report.data import gather
 from pdeloop.report.learning import EDGE, bars, steps
@@ -26,7 +29,8 @@ from pdeloop.report.style import FIELD_MAP, STYLE
 from tests.support.browser import browser
 from tests.support.loop_harness import processes
 from tests.support.made_once import made_once
-from tests.support.small import SMALL
+from tests.support.small import SMALL, parameters
+from tuner_node.build import build_training
 
 LIMIT = 300.0
 FIGURES = (
@@ -360,3 +364,18 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
     # A map and a profile of each field under every controller, and a target and a colour bar of each.
     maps = re.findall(r'<g id="axes_\d+">', svg)
     assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2
+
+
+def test_the_orders_shown_are_those_of_the_explorations_that_the_model_is_from(tmp_path):
+    from pdeloop.cli import main
+
+    words = ["train", str(SMALL), "--in-process", "--rollouts", "10", "--optimizer", "model_based"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    values = parameters(rollouts=10, optimizer="model_based")
+    batch = build_training(values).next_batch()
+    explored = LocalPair(values).run(replace(batch, trajectories=True)).trajectories
+    assert len(explored) == 2
+    expected = study_orders([(one.states, one.actions) for one in explored])
+    found = gather(tmp_path / "run").problems[0].orders
+    np.testing.assert_array_equal(found.singular_values, expected.singular_values)
+    np.testing.assert_array_equal(found.rollout, expected.rollout)
