@@ -89,7 +89,12 @@ class Comparison:
         return "\n".join(lines)
 
     def _differences(self) -> list[list[str]]:
-        named = list(self.differing.items())
+        named = [
+            (name, values)
+            for name, values in self.differing.items()
+            # Of two methods that differ each has its own settings.
+            if None not in values or name.partition("_settings.")[0] not in self.differing
+        ]
         rows = [[name, *map(_short, values)] for name, values in named[:SHOWN]]
         if len(named) > SHOWN:
             rows.append([f"{len(named) - SHOWN} more", *("" for _ in self.runs)])

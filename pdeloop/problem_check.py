@@ -139,7 +139,11 @@ def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
             "a step depends on the other states of its batch, if only by rounding: set batched = "
         )
         return Finding(name, False, f"{told}False, or avoid matrix products over a batch")
-    return Finding(name, True, f"{len(some)} steps have the same bits again, alone and in a batch")
+    return Finding(
+        name,
+        True,
+        f"{len(some)} steps are the same to the bit when computed again, alone and in a batch",
+    )
 
 
 @dataclass(frozen=True)

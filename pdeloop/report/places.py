@@ -60,7 +60,7 @@ def beside(ax: Axes, target: Array, limits: tuple[float, float], length: float) 
         vmax=limits[1],
     )
     strip.set(xticks=[], yticks=[])
-    strip.set_title("target", fontsize=7, pad=3)
+    strip.set_xlabel("target", fontsize=7, labelpad=3)  # above, the title of `ax` may be wide
 
 
 def _on_a_plane(ax: Axes, grid: Grid, supports: Array | None, points: NDArray[np.int64]) -> None:

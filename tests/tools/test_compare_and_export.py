@@ -8,6 +8,7 @@ import ctypes
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -60,6 +61,16 @@ def test_runs_are_compared_on_the_same_fields(
     assert low <= second["above_first"]["percent"] <= high
     assert main(["compare", str(plain.folder), str(other.folder)]) == 0
     assert "learning_rate" in capsys.readouterr().out
+
+
+def test_settings_that_only_one_of_two_methods_has_are_not_listed(runs: dict[str, Path]) -> None:
+    plain = load_run(runs["plain"])
+    own = {"optimizer_settings.radius": 0.1, "optimizer": "other"}
+    text = compare([plain, replace(plain, values={**plain.values, **own})]).text()
+    assert "optimizer " in text and "optimizer_settings.radius" not in text
+    del own["optimizer"]
+    text = compare([plain, replace(plain, values={**plain.values, **own})]).text()
+    assert "optimizer_settings.radius" in text
 
 
 def test_a_run_against_itself_is_no_percent_above(runs: dict[str, Path]) -> None:
@@ -142,7 +153,7 @@ def test_the_former_name_of_a_flag_is_understood(
     for flag in ("--controller", "--law"):
         files[flag] = tmp_path / f"{flag[2:]}.npz"
         assert main(["export", str(runs["plain"]), "--out", str(files[flag]), flag, "lqt"]) == 0
-        assert ("called --controller now" in capsys.readouterr().err) == (flag == "--law")
+        assert ("now called --controller" in capsys.readouterr().err) == (flag == "--law")
     old, new = (np.load(path) for path in files.values())
     assert np.array_equal(old["K_a"], new["K_a"])
 
