@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,11 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.adapt.sensed_loop import sensed_loop
+from loop_method.adapt.settings import ImprovementSettings
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.files import model_of
-from loop_method.models.prediction import pieces
+from loop_method.models.prediction import errors, pieces
 from loop_method.models.readings import ReadingsModel, fit_readings
 from loop_method.models.sensed import SensedModel
 
@@ -28,16 +29,30 @@ _MODEL = "model."
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A model, its error E on rollouts that it was not fitted to, and its components."""
+    """A model of the plant.
+
+    Attributes
+    ----------
+    model : FieldModel
+    error : float
+        E on rollouts that it was not fitted to.
+    components : int
+        Fields in a state.
+    whole : bool
+        False: it predicts pieces of rollouts, of a chaotic plant, to E.
+    """
 
     model: FieldModel
     error: float
     components: int
+    whole: bool = True
 
     def state(self) -> State:
         """The model, its error and its components, as the arrays of a checkpoint."""
         arrays = {_MODEL + name: value for name, value in self.model.arrays().items()}
         numbers = {"error": np.array(self.error), "components": np.array(self.components)}
+        if not self.whole:
+            numbers["whole"] = np.array(self.whole)
         return numbers | arrays
 
     @classmethod
@@ -47,7 +62,9 @@ class Belief:
             return None
         model = model_of(part_of(state, _MODEL))
         error = float(checked_array(state, "error", "f", ()))
-        return cls(model, error, int(checked_array(state, "components", "i", ())))
+        components = int(checked_array(state, "components", "i", ()))
+        whole = "whole" not in state or bool(checked_array(state, "whole", "b", ()))
+        return cls(model, error, components, whole)
 
     def check(self, context: Context) -> None:
         """ValueError if the model has another plant's size, which compiled code does not check."""
@@ -122,6 +139,35 @@ def believe(
     if found is None:
         return None
     return Belief(found.model, found.error, 2 if found.model.kind.startswith("two-") else 1)
+
+
+def largest_error(context: Context, settings: ImprovementSettings) -> float:
+    """The largest E of a model that laws are improved on."""
+    return settings.believed_noisy if context.noise else settings.believed
+
+
+def also_in_pieces(
+    context: Context, records: Sequence[Record], whole: Belief, settings: ImprovementSettings
+) -> Belief:
+    """A model that predicts pieces of rollouts where the best one of whole rollouts, `whole`, does not.
+
+    Else `whole` itself. Of a chaotic plant small errors grow, so that those of pieces are far smaller;
+    those of a plant that is described badly add up.
+    """
+    most = largest_error(context, settings)
+    of_readings = bool(context.sensors) and isinstance(context.law, Observer)
+    if whole.error <= most or of_readings:
+        return whole
+    most = min(most, whole.error / settings.chaotic_growth)
+    rollouts = [_measured(context, record) for record in records if len(record.actions)]
+    parts = [part for rollout in rollouts for part in pieces(rollout, settings.pieces)]
+    # What it was fitted to is predicted better than what it was not, and takes no other fit.
+    worst = context.field_models.worst
+    known = errors(whole.model, parts, context.target, worst, context.noise)
+    if not (len(known) and known.mean() <= most):
+        return whole
+    found = believe(context, records, whole.model.kind, settings.pieces)
+    return replace(found, whole=False) if found and found.error <= most else whole
 
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:

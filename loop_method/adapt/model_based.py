@@ -35,12 +35,12 @@ from loop_method.adapt.base import (
     require_positive,
     require_results,
 )
-from loop_method.adapt.belief import Belief, believe
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.belief import Belief, also_in_pieces, believe, largest_error
+from loop_method.adapt.initial_fields import initial_fields, is_chaotic
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch
 from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
-from loop_method.adapt.renewal import renew
+from loop_method.adapt.renewal import renew, renew_from_states
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
@@ -248,10 +248,13 @@ class ModelBased(Optimizer):
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._last_renewal()
         before, belief = self._progress.belief, self._believe()
-        other = believe_in_noise(self._context, self._measurements(), belief, self._settings)
+        known = self._measurements()
+        other = believe_in_noise(self._context, known, belief, self._settings)
         if other is not None:
             belief, row["noise"] = other
             self._take_noise(other[1])
+        elif belief is not None and not self._is_believed(belief):
+            belief = also_in_pieces(self._context, known, belief, self._settings)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
@@ -281,9 +284,7 @@ class ModelBased(Optimizer):
 
     def _is_believed(self, belief: Belief) -> bool:
         """True if the law is improved on this model."""
-        settings = self._settings
-        most = settings.believed_noisy if self._context.noise else settings.believed
-        return belief.error <= most
+        return belief.error <= largest_error(self._context, self._settings)
 
     def _without_model(self, row: Row, final: bool) -> None:
         """The continuation where no model was ever accepted: local steps, if possible."""
@@ -303,25 +304,20 @@ class ModelBased(Optimizer):
         safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
         base, near = (first, self._first) if safe else (none, self._none)
         self._progress.safe = safe
-        settings, parts = self._settings, self._progress.parts
-        if is_chaotic(loop, fields):
-            row["chaotic"] = True
-            fields = measured_states(self._data(), settings.chaotic_fields)
-            # Others than last time, so that the laws of the parts may know those of their own part.
-            settings, parts = replace(settings, mixtures=0), []
+        improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
-        found = renew(
-            loop,
-            base,
-            base if self._progress.improved is None else self._progress.improved,
-            parts,
-            fields,
-            rng,
-            settings,
-            components=belief.components,
-            periodic=self._context.periodic,
-            final=final,
-        )
+        if not belief.whole or is_chaotic(loop, fields):
+            row["chaotic"] = True
+            found = renew_from_states(
+                *(loop, base, improved, self._data(), rng, self._settings), final=final
+            )
+        else:
+            found = renew(
+                *(loop, base, improved, self._progress.parts, fields, rng, self._settings),
+                components=belief.components,
+                periodic=self._context.periodic,
+                final=final,
+            )
         if found is None:
             row["reason"] = "no law is finite on the model; the law stays"
             return

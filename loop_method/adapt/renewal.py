@@ -18,16 +18,17 @@ Cochran, "Sampling Techniques", 3rd ed., Wiley 1977, chapter 6 (ratio estimators
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO, Estimate, mean_change
 from loop_method.adapt.improve import cheapest, curvature_of, improve
-from loop_method.adapt.initial_fields import mixtures, weighted
+from loop_method.adapt.initial_fields import measured_states, mixtures, weighted
 from loop_method.adapt.settings import ImprovementSettings
 
 _Descent: TypeAlias = Callable[[Sequence[Array], Array, int], tuple[Array, int] | None]
@@ -120,6 +121,33 @@ def renew(
     fraction, change = held_out_fraction(loop, first, made, fields, settings)
     theta = first + fraction * (found[0] - first)
     return Renewal(theta, found[0], made, fraction, change, steps + found[1])
+
+
+def renew_from_states(
+    loop: ClosedLoop,
+    first: Array,
+    improved: Array,
+    records: Sequence[Record],
+    rng: np.random.Generator,
+    settings: ImprovementSettings,
+    *,
+    final: bool = True,
+) -> Renewal | None:
+    """As `renew`, of a chaotic plant, from measured states: more where few leave the gain in doubt.
+
+    Costs differ so much from state to state that a law made from a few is hardly better from others.
+
+    records: all rollouts, denoised.
+    """
+    settings, found = replace(settings, mixtures=0), None
+    for count in (settings.chaotic_fields, settings.chaotic_most):
+        fields = measured_states(records, count)
+        # Others than last time, so that the laws of the parts may know those of their own part.
+        found = renew(*(loop, first, improved, [], fields, rng, settings), final=final)
+        if found is None or found.change.is_negative(settings.confidence, settings.chaotic_clear):
+            break
+        improved = found.improved
+    return found
 
 
 def confirmed_fraction(

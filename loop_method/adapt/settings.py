@@ -43,6 +43,21 @@ class ImprovementSettings(Settings):
         4,
         1000,
     )
+    chaotic_most: int = setting(
+        96,
+        "the same where the gain of a law from fewer states is not clear from the others",
+        4,
+        1000,
+    )
+    chaotic_clear: float = setting(
+        5.0, "multiple of the standard errors of the verdict at which it is clear", 0.0, 100.0
+    )
+    pieces: int = setting(
+        8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
+    )
+    chaotic_growth: float = setting(
+        20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
+    )
     measured_share: float = setting(
         0.5, "weight of the measured fields against the drawn ones", 0.0, 1.0
     )
@@ -174,12 +189,6 @@ class GaussNewtonSettings(ImprovementSettings):
     newest: int = setting(8, "newest initial fields of a step on such a model", 1, 1000)
     extrapolation: float = setting(
         1.5, "ratio of the distances from their mean of further fields and of these", 0.0, 100.0
-    )
-    pieces: int = setting(
-        8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
-    )
-    chaotic_growth: float = setting(
-        20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
     )
     chaotic_share: int = setting(
         3,

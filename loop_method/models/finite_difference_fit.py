@@ -104,6 +104,14 @@ class Columns:
     square: float
     scale: Array
 
+    def unexplained(self, C: Array) -> float:
+        """The share of the sum of y^2 that coefficients (n_x, F, components) do not explain."""
+        if not self.square > 0.0:
+            return 0.0
+        c = C * self.scale[:, None]
+        rest = self.square - float(np.sum(c * (2.0 * self.moment - self.gram @ c)))
+        return max(rest, 0.0) / self.square
+
 
 @dataclass(frozen=True, eq=False)
 class Regression:
@@ -117,15 +125,14 @@ class Regression:
         The change to be explained.
     common : (N, n_a + 1) array
         The inputs and 1.
-    miss, change : float
-        Root of the mean square of what the steps of the model missed, and of what the plant's changed.
+    miss : float
+        Root of the mean square of what the steps of the model missed.
     """
 
     X: Array
     y: Array
     common: Array
     miss: float
-    change: float
 
     @classmethod
     def along(
@@ -153,7 +160,6 @@ class Regression:
             change.reshape(-1, components, n_x).transpose(2, 0, 1),
             np.hstack([actions, np.ones((len(actions), 1))]) * root[:, None],
             float(np.sqrt(np.mean((miss * root[:, None]) ** 2))),
-            float(np.sqrt(np.mean(((samples.after - samples.before)[ok] * root[:, None]) ** 2))),
         )
 
     def columns(self) -> Columns:

@@ -34,7 +34,7 @@ FORMS = (
     Form(name="free3", degree=3, free="all"),
 )
 POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
-NEAR_RIDGES = {"near-shared": None, "near1e-5": 1e-5, "near1e-9": 1e-9}
+NEAR_RIDGES = {"near-shared": None, "near1e-9": 1e-9}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
 LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
@@ -161,7 +161,7 @@ def _neighbours(
             settings=settings,
             ridge=ridge,
         )
-        own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-7 else 1.0)
+        own = 0.0 if ridge is None else count
         kinds.append(Kind(prefix + name, fit, (own, count), needed=settings.near_needed))
     return kinds
 

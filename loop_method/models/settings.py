@@ -73,13 +73,18 @@ class FieldModelSettings(Settings):
     near_needed: float = setting(
         0.05, "least E of the other kinds above which models of neighbours are tried", 0, 10
     )
+    near_screened: float = setting(
+        0.1,
+        "share of the change that may be unexplained along straight paths between samples",
+        0,
+        1,
+    )
+    near_hopeless: float = setting(0.05, "the same along the paths of that fit", 0, 1)
+    near_substeps: int = setting(8, "maximum number of internal steps of these paths", 2, 1000)
     near_passes: int = setting(
         8, "further passes of a model of neighbours, on what its steps miss", 1, 50
     )
     near_samples: int = setting(400, "as `samples`, for models of neighbours", 50, 1_000_000)
-    near_hopeless: float = setting(
-        0.1, "share of the change that its first passes may miss for others to follow", 0, 10
-    )
     near_settled: float = setting(
         0.1, "relative change of what its steps miss at which the passes end", 0, 1
     )

@@ -52,7 +52,7 @@ def neighbours(components, n_x=7):
     C = 0.03 * rng.normal(size=(len(features), components, n_x))
     n_z = components * n_x
     B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
-    return FiniteDifferenceModel("near1e-5", features, C, B, c, 3)
+    return FiniteDifferenceModel("near1e-9", features, C, B, c, 3)
 
 
 def linear(n_z=10):

@@ -1,0 +1,131 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Chaotic plants: a model is believed on pieces of rollouts, and laws are made from measured states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_method.adapt import Context, Trajectory, belief, model_based, renewal
+from loop_method.adapt.base import Record
+from loop_method.adapt.belief import Belief, also_in_pieces
+from loop_method.adapt.estimate import Estimate
+from loop_method.adapt.renewal import Renewal, renew_from_states
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.models import FieldModel
+from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
+from loop_method.models.linear import LinearModel
+from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
+from tests.support.small import same_bits
+
+SETTINGS = ModelBasedSettings()
+
+
+def lorenz(forcing: float, n_z: int = 12) -> FiniteDifferenceModel:
+    """Lorenz-96, chaotic at a forcing of 8, sampled every 0.1."""
+    terms = {
+        Feature((0, 0), 0, (-1, 1)): 1.0,
+        Feature((0, 0), 0, (-2, -1)): -1.0,
+        Feature((0,), 0, (0,)): -1.0,
+    }
+    C = np.tile(0.1 * np.array(list(terms.values()))[:, None, None], (1, 1, n_z))
+    B, c = np.eye(n_z)[:, :1], np.full(n_z, 0.1 * forcing)
+    return FiniteDifferenceModel("near-shared", tuple(terms), C, B, c, 8)
+
+
+def drifting(rate: float, n_z: int = 12) -> LinearModel:
+    """Every coordinate grows by a constant: the error of a wrong constant adds up, no faster."""
+    return LinearModel("linear", np.eye(n_z), np.eye(n_z)[:, :1], np.full(n_z, rate))
+
+
+def explored(plant: FieldModel, steps: int = 80) -> list[Record]:
+    found = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        states, actions = [3.0 + rng.normal(size=plant.n_z)], rng.normal(size=(steps, 1))
+        for a in actions:
+            states.append(plant.step(states[-1][None], a[None])[0])
+        found.append(Record(np.zeros((1, 2)), np.inf, np.array(states), actions))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("plant", "model", "whole"),
+    [(lorenz(8.0), lorenz(8.001), False), (drifting(0.1), drifting(0.5), True)],
+)
+def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_they_add_up(
+    plant: FieldModel, model: FieldModel, whole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records = explored(plant)
+    trajectory = Trajectory(records[0].states, records[0].actions)
+    context = Context(np.eye(12)[:, :1], np.zeros(12), 1.0, 1.0, 80, trajectory)
+
+    def judged(known: Context, own: Any, first: str = "", parts: int = 1) -> Belief:
+        rollouts = [belief._measured(known, record) for record in own]
+        if parts > 1:
+            rollouts = [part for rollout in rollouts for part in belief.pieces(rollout, parts)]
+        return Belief(model, belief.errors(model, rollouts, known.target, 2.0).mean(), 1)
+
+    monkeypatch.setattr(belief, "believe", judged)
+    assert judged(context, records).error > SETTINGS.believed
+    found = also_in_pieces(context, records, judged(context, records), SETTINGS)
+    assert found.whole == whole
+    assert (found.error <= SETTINGS.believed) == (not whole)
+    again = Belief.of(found.state())
+    assert again is not None and (again.whole, again.error) == (found.whole, found.error)
+
+
+def in_pieces(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant itself is believed, on pieces alone."""
+    model = LinearModel("k", plant.U @ plant.A @ plant.U.T, plant.U @ plant.B, np.zeros(N_Z))
+    monkeypatch.setattr(model_based, "believe", lambda *_: Belief(model, 0.01, 1, whole=False))
+
+
+def test_a_law_is_improved_on_a_model_of_pieces_from_measured_states(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plant = Plant()
+    in_pieces(plant, monkeypatch)
+    optimizer = make(plant)
+    rows = finished(plant, optimizer)
+    # Of a linear-quadratic problem the law is best from every state.
+    assert plant.cost(optimizer.policy) <= 1.01 * plant.cost(plant.best)
+    assert all(row["chaotic"] for row in rows[:-1]) and rows[-1]["chosen"] == "adapted"
+
+
+def test_it_goes_on_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = Plant()
+    in_pieces(plant, monkeypatch)
+    optimizer, again = make(plant), make(plant)
+    optimizer.tell(measured(plant, optimizer))
+    again.restore(optimizer.state())
+    rows = [finished(plant, own) for own in (optimizer, again)]
+    assert rows[0] == rows[1] and same_bits(optimizer.policy, again.policy)
+
+
+@pytest.mark.parametrize(
+    ("gains", "counts"),
+    [([20.0], [32]), ([2.0, 20.0], [32, 96]), ([0.0, 0.0], [32, 96])],
+    ids=["clear", "in doubt", "none"],
+)
+def test_more_states_are_taken_where_the_gain_from_few_is_in_doubt(
+    gains: list[float], counts: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+
+    def renewed(*known: Any, final: bool) -> Renewal:
+        _, first, improved, _, fields, *_ = known
+        assert improved == float(len(seen))  # where the descent from fewer states ended
+        seen.append(len(fields))
+        gain = gains[len(seen) - 1]
+        change = Estimate(-gain, 1.0, 31.0)  # one standard error
+        return Renewal(first, improved + 1.0, [], float(gain > 1.0), change, 1)
+
+    monkeypatch.setattr(renewal, "renew", renewed)
+    rollout = Record(np.zeros((N_A, 2)), 1.0, np.zeros((200, N_Z)), np.zeros((199, N_A)))
+    known: Any = (None, 0.0, 0.0, [rollout], np.random.default_rng(0), SETTINGS)
+    found = renew_from_states(*known)
+    assert seen == counts
+    assert found is not None and found.change.value == -gains[-1]
