@@ -99,7 +99,7 @@ def fit_sensed(
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
         few = SensedProblem(
             *(y[pair], a[pair], actuators, noise, target, distances[pair], settings),
-            settings.sensed_held_ridge if noise else settings.sensed_place_ridge,
+            settings.sensed_held_ridge if problem.holds else settings.sensed_place_ridge,
         )
         error, shared, fields[pair] = _first_guess(few, settings)
         if not np.isfinite(error):
@@ -126,12 +126,12 @@ def fit_sensed(
 def part_by_part(
     problem: SensedProblem, shared: Array, fields: Array, settings: FieldModelSettings
 ) -> tuple[float, Array, Array]:
-    """The fit over longer and longer parts, with noise of actuators as they are declared.
+    """The fit over longer and longer parts; with noise, declared actuators stay where they are.
 
     The beginning of noisy rollouts does not determine where and how strong each of them is: what the
     equation does would be taken for that, and no descent leads back.
     """
-    if not problem.noise:
+    if not problem.holds:
         return problem.fit(shared, fields)
     problem.place_ridge = settings.sensed_held_ridge
     _, shared, fields = problem.fit(shared, fields)

@@ -403,9 +403,12 @@ def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> No
         np.testing.assert_allclose(supports.mean(axis=0), width)
 
 
+DECLARED = Actuators((np.arange(3) + 0.5) / 3, 0.5 / 3)
+
+
 def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
     """What an equation does would be taken for it; over whole rollouts each may be where it is."""
-    rng, actuators, sigma = np.random.default_rng(5), _equally_spaced(3), 0.1
+    rng, actuators, sigma = np.random.default_rng(5), DECLARED, 0.1
     shared = np.zeros(unknowns(3))
     shared[[TERMS.index((1, 0)), COEFFICIENTS]] = 1.0, 5.0
     shared[SHARED:] = 0.0, 3.0, -3.0
@@ -432,7 +435,7 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
 
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     """What they suggest is fitted to all rollouts from their beginning."""
-    rng, actuators = np.random.default_rng(6), _equally_spaced(3)
+    rng, actuators = np.random.default_rng(6), DECLARED
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
     asked, worse = [], 0.0
 
@@ -461,3 +464,6 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     assert error < DEFAULTS.sensed_reproduced and len(asked) == 2
     # What two of them have to say of each actuator is noise.
     assert ridges == [DEFAULTS.sensed_held_ridge] * 2
+    # Nobody says where those of a plant of one's own are.
+    free = SensedProblem(readings, actions, _equally_spaced(3), 1.0, readings[0, 0], np.ones(3))
+    assert not free.holds
