@@ -13,6 +13,8 @@ Where no equation reproduces the rollouts, it continues with a model of the read
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from loop_interfaces.arrays import Array
@@ -121,16 +123,27 @@ class ModelBasedSensed(ModelBasedReadings):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
     def ask(self) -> list[Rollout]:
-        """The final law is judged on the fields of the first one, and no control where it may stay."""
+        """No control where it may stay, and the final law on the fields of the one that may stay."""
         asked = super().ask()
         if self._sensed is None or self._progress.stage not in (RENEWING, JUDGING):
             return asked
-        begun = len(self._of(self._first))
+        first = self._of(self._first)
         if self._progress.stage == JUDGING:
-            return [self._rollout(own.policy, i % begun) for i, own in enumerate(asked)]
+            known = self._of(self._base[1]) or first
+            numbers = [record.stamp for record in known]
+            return [
+                self._rollout(own.policy, numbers[i % len(numbers)]) for i, own in enumerate(asked)
+            ]
         if self._progress.safe or self._of(self._none):
             return asked
-        return [self._rollout(self._none, i) for i in range(min(begun, len(asked)))] + asked[begun:]
+        return [replace(own, policy=self._none) for own in asked[: len(first)]] + asked[
+            len(first) :
+        ]
+
+    @property
+    def _base(self) -> tuple[str, Array]:
+        """The law to stay with on the model."""
+        return (FIRST, self._first) if self._progress.safe else (NONE, self._none)
 
     def _of(self, law: Array) -> list[Record]:
         """The rollouts of a law in the order of its fields."""
@@ -147,7 +160,7 @@ class ModelBasedSensed(ModelBasedReadings):
             return
         final = self._progress.policy
         ModelBased._judge(self, row)
-        base, stays = (FIRST, self._first) if self._progress.safe else (NONE, self._none)
+        base, stays = self._base
         if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
             self._compare_pairs(row, base, stays, final)
         if row["chosen"] != ADAPTED:

@@ -279,16 +279,16 @@ def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
     assert row["chosen"] == "first" and same_bits(own.policy, own._first)
 
 
-def test_no_control_is_measured_where_it_may_stay() -> None:
+def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields() -> None:
     """The first law does nothing either."""
     own = optimiser(rollouts=7, judging=3)
-    first = own.ask()
-    own.tell([measured(each) for each in first])
+    own.tell([measured(each) for each in own.ask()])
     asked = own.ask()
     assert not own._progress.safe and asked and not any(each.policy.any() for each in asked)
-    assert [each.field_seed for each in asked] == [each.field_seed for each in first][: len(asked)]
     own.tell([measured(each) for each in asked])
-    assert all(each.policy.any() for each in own.ask())
+    judged = own.ask()
+    assert own._progress.stage == JUDGING and all(each.policy.any() for each in judged)
+    assert {each.field_seed for each in judged} == {each.field_seed for each in asked}
 
 
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
