@@ -16,9 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.special import stdtrit
+
 import pdeloop
 from benchmarks.general import number
 from loop_interfaces.files import make_folder, read_json, write_atomically
+from loop_method.adapt.estimate import mean_of
 from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]
@@ -102,12 +106,25 @@ def line(rows: Sequence[Mapping[str, Any]]) -> str:
     cells.append(number(known[0]["none"]) if known else "-")
     for key in ("lqt", "adapted"):
         cells.append(", ".join(number(row.get(key)) for row in rows))
+    cells.append(interval([row["adapted"] for row in known]))
     return f"| {' | '.join(cells)} |"
+
+
+def interval(costs: Sequence[float]) -> str:
+    """The mean of some trainings, with the 95 % interval of Student's t if there are several.
+
+    >>> interval([1.0, 2.0, 3.0])
+    '2 ± 2.484'
+    """
+    if len(costs) < 2:
+        return "-"
+    known = mean_of(np.array(costs))
+    return f"{number(known.value)} ± {number(float(stdtrit(known.degrees, 0.975)) * known.error)}"
 
 
 def text(rows: Sequence[Mapping[str, Any]]) -> str:
     """A Markdown table with a row for each case, and the errors."""
-    head = ["problem", "sensors", "noise", "law", "no control", "first law", "adapted"]
+    head = ["problem", "sensors", "noise", "law", "no control", "first law", "adapted", "mean"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     cases: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
