@@ -142,7 +142,7 @@ def pins(text: str) -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in found}
 
 
-@pytest.mark.parametrize(("part", "extras"), [("run", ["ros"]), ("test", ["ros", "dev"])])
+@pytest.mark.parametrize(("part", "extras"), [("run", ["ros", "report"]), ("test", ["ros", "dev"])])
 def test_what_is_installed_is_pinned_and_has_digests(part: str, extras: list[str]) -> None:
     text = (ROOT / "requirements" / f"{part}.txt").read_text()
     constrained = pins((ROOT / "constraints.txt").read_text())
