@@ -159,8 +159,14 @@ def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> No
     (said,) = (text for text in warnings(summary) if "noise" in text)
     assert f"noise of about {found:.2g} was found" in said and "none was declared" in said
     check_result(summary, 0, 1)
+    for wrong in ({"declared": 0.0, "found": ["0.05"]}, {"declared": None, "found": []}, [0.05]):
+        with pytest.raises(ValueError, match="noise"):
+            check_result({**summary, "noise": wrong}, 0, 1)
     again = build_training(values)
     restore(again, arrays_of(training))
     for each in (training, again):
         (optimizer,) = each.optimizers
         assert optimizer._context.noise == found
+        negative = {**optimizer.state(), "noise": np.array(-found)}
+        with pytest.raises(ValueError, match="noise"):
+            optimizer.restore(negative)

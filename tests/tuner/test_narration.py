@@ -15,7 +15,14 @@ from pdeloop.display import Display
 from pdeloop.in_process import LocalPair, train
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training
-from tuner_node.narration import Narration, closing_lines, exit_code, failed, warnings
+from tuner_node.narration import (
+    Narration,
+    closing_lines,
+    exit_code,
+    failed,
+    misjudged_noise,
+    warnings,
+)
 from tuner_node.results import difference, summarise
 from tuner_node.rollouts import CHECK
 
@@ -303,3 +310,25 @@ def test_the_interval_of_a_difference_has_the_mean_as_often_as_it_says() -> None
         inside += found["low"] <= -0.3 <= found["high"]
     assert 0.95 - 3 * 0.007 < inside / 1000 < 0.95 + 3 * 0.007
     assert difference([1.0], [2.0]) is None
+
+
+@pytest.mark.parametrize(
+    ("declared", "found", "said"),
+    [
+        (0.0, [0.0498], "noise of about 0.05 was found, and none was declared"),
+        (0.15, [0.05], "noise of about 0.05 was found, and 0.15 was declared"),
+        (
+            0.0,
+            [0.05, 0.0, 0.06],
+            "noise of about 0.05 to 0.06 was found for 2 of 3 seeds, and none",
+        ),
+    ],
+)
+def test_noise_that_was_not_declared_so_is_a_warning(
+    declared: float, found: list[float], said: str
+) -> None:
+    noise = {"declared": declared, "found": found}
+    (text,) = misjudged_noise({"noise": noise, "seeds": len(found)})
+    assert said in text
+    assert misjudged_noise({"noise": {"declared": declared, "found": [0.0]}, "seeds": 1}) == []
+    assert misjudged_noise({"seeds": 1}) == []  # a result of an older version
