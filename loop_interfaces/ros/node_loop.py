@@ -299,7 +299,7 @@ class NodeLoop(EventLoop):
         """Handle the message that has waited longest; how many there were."""
         channel = fast.path.channel
         if dropped := channel.newly_dropped():
-            reason = "arrived while too many others were waiting"
+            reason = "arrived while too many others were waiting; it is sent again if needed"
             self.introspection.refuse(fast.receiver.name, reason, dropped)
         raw = channel.next_message()
         return 0 if raw is None else self._handle(fast.receiver, raw)
