@@ -53,26 +53,43 @@ def propose(
 ) -> Proposal | None:
     """The best law on the model near to a policy, or None where that gains nothing."""
     loop = belief.loop(context)
-    fields, others = initial_fields(data), None
+    fields, first = initial_fields(data), loop.theta(policy)
     if whole and not is_chaotic(loop, fields):
         chosen = extrapolated_fields(fields[-settings.newest :], settings.extrapolation)
+        found = improved(loop, first, chosen, damping, settings)
     else:
-        every = measured_states(data, settings.chaotic_fields * settings.chaotic_share)
-        held_out = np.arange(len(every)) % settings.chaotic_share > 0
-        chosen, others = every[~held_out], every[held_out]
-    first = loop.theta(policy)
-    found = improved(loop, first, chosen, damping, settings)
+        found = improved_from_states(loop, first, data, damping, settings)
     if found is None:
         return None
     theta, fall = found
-    if others is not None:
-        with np.errstate(invalid="ignore"):
-            before, after = (loop.costs(law, others).mean() for law in (first, theta))
-            fall = before - after
-        if not fall > settings.least_fall * before:  # also where it is not finite
-            return None
     kind = belief.model.kind
     return Proposal(loop.policy(theta, policy), fall, 1, 0.0, belief.error, kind, kind, whole)
+
+
+def improved_from_states(
+    loop: ClosedLoop,
+    theta: Array,
+    data: Sequence[Record],
+    damping: float,
+    settings: GaussNewtonSettings = DEFAULTS,
+) -> tuple[Array, float] | None:
+    """As `improved`, of a chaotic plant, from measured states; the fall is that from others.
+
+    More states are taken where a law from few gains nothing from the others, or else the search would
+    end for want of a step.
+    """
+    for count in (settings.chaotic_fields, settings.chaotic_most):
+        every = measured_states(data, count * settings.chaotic_share)
+        held_out = np.arange(len(every)) % settings.chaotic_share > 0
+        found = improved(loop, theta, every[~held_out], damping, settings)
+        if found is None:
+            return None
+        with np.errstate(invalid="ignore"):
+            before, after = (loop.costs(law, every[held_out]).mean() for law in (theta, found[0]))
+            fall = float(before - after)
+        if fall > settings.least_fall * before:  # not where it is not finite
+            return found[0], fall
+    return None
 
 
 def improved(

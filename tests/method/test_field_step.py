@@ -64,3 +64,27 @@ def test_a_law_is_improved_on_the_model_until_that_gains_nothing(whole: bool) ->
     # Of a linear-quadratic problem the law is best from every field.
     cost, best = (plant.run(law, 99).cost for law in (policy, plant.best))
     assert cost < 1.05 * best < plant.run(first, 99).cost
+
+
+@pytest.mark.parametrize(("gains", "counts"), [([True], [32]), ([False, True], [32, 96])])
+def test_a_step_of_a_chaotic_plant_takes_more_states_before_the_search_ends(
+    gains: list[bool], counts: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is better from the states that made it need not be from others."""
+    plant = Plant()
+    first = 0.6 * plant.best
+    data = [record for seed in range(8) for record in records(plant, first * (1 + seed)).all()]
+    assert sum(len(record.states) for record in data) > 3 * 96
+    seen: list[int] = []
+
+    def step(_: object, theta: np.ndarray, fields: np.ndarray, *__: object) -> object:
+        seen.append(len(fields))
+        return (theta / 0.6 if gains[len(seen) - 1] else 0.5 * theta), 1.0
+
+    monkeypatch.setattr(field_step, "improved", step)
+    belief = Belief(model(plant), 0.0, 1, whole=False)
+    proposal = field_step.propose(plant.context(), belief, False, data, first, 1.0)
+    assert seen == counts
+    assert proposal is not None and proposal.fall > 0.0
+    theta = belief.loop(plant.context()).theta
+    np.testing.assert_allclose(theta(proposal.policy), theta(plant.best), atol=1e-12)
