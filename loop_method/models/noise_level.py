@@ -7,9 +7,11 @@ Of the coefficients X_k of any orthonormal wave at step k,
 
 is sigma^2 for white noise, whatever the order d, and what the field adds to it is never negative. So
 the least P_d over bands of short waves and orders is the largest sigma^2 that the states allow, and
-sigma^2 itself where a band has no waves of the field. That is no evidence of noise: the short waves of
-a front that moves over several points between two states are white in time as well. The evidence is a
-model (`undeclared_noise`); the orders tell only whether it is worth a fit.
+sigma^2 itself where a band has no waves of the field.
+
+That alone is no evidence of noise: the short waves of a front that moves over several points between
+two states are white in time as well. But they are not white in space, as they gather around the front
+(`whiteness`). Whether there is noise is then decided by a model (`undeclared_noise`).
 """
 
 from __future__ import annotations
@@ -18,8 +20,10 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from loop_interfaces.arrays import Array
+from loop_method.models.whiteness import correlations
 
 ORDERS = (1, 2, 3, 4)
 BANDS = 4
@@ -28,6 +32,8 @@ ALIKE = 1.5
 """Largest ratio of the powers of a band of noise; that of a random walk is 1.75."""
 LEAST = 1e-3
 """Smallest noise, relative to the root mean square of the states; below, it changes no fit."""
+LOCAL = 0.3
+"""Root sum of squares of the correlations in space with which differences count as white."""
 FEWEST = 200
 """Coefficients of a band below which its powers are too uncertain."""
 
@@ -53,4 +59,23 @@ def noise_level(trajectories: Sequence[Array]) -> float:
     alike = quietest.max() <= ALIKE * quietest.min()
     sigma = float(np.sqrt(quietest.min()))
     size = float(np.sqrt(np.mean([np.mean(z**2) for z in usable])))
-    return sigma if alike and sigma > LEAST * size else 0.0
+    return sigma if alike and sigma > LEAST * size and not _is_local(usable) else 0.0
+
+
+def _is_local(trajectories: Sequence[Array]) -> bool:
+    """True if short waves of differences in time, or their squares, are correlated in space."""
+    short = [short_waves(np.diff(states, axis=0)) for states in trajectories]
+    _, in_space, _, squares_in_space = np.split(correlations(short)[0], 4)
+    return bool(np.sum(in_space**2) + np.sum(squares_in_space**2) > LOCAL**2)
+
+
+def short_waves(states: Array) -> Array:
+    """The upper half of the wavenumbers of states (L, n), as series of half as many points.
+
+    White noise remains white, of the same variance, and what is near to a point remains so.
+    """
+    n = states.shape[1]
+    spectra = scipy.fft.rfft(states)[:, n // 4 : n // 2 + 1] / np.sqrt(2.0)
+    spectra[:, 0] = np.sqrt(2.0) * spectra[:, 0].real  # the mean of the series, which is real
+    found: Array = scipy.fft.irfft(spectra, 2 * (spectra.shape[1] - 1))
+    return found

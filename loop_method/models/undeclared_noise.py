@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured
 from loop_method.models.choice import FittedModel, fit_field_model, limited, with_clean
-from loop_method.models.noise_level import noise_level
+from loop_method.models.noise_level import noise_level, short_waves
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.whiteness import is_white
 
@@ -83,18 +83,6 @@ def fit_undeclared_noise(
         return None
     size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
     return (found, noise) if size <= settings.noise_excess * noise else None
-
-
-def short_waves(states: Array) -> Array:
-    """The upper half of the wavenumbers of states (L, n), as series of half as many points.
-
-    White noise remains white, of the same variance, and what is near to a point remains so.
-    """
-    n = states.shape[1]
-    spectra = scipy.fft.rfft(states)[:, n // 4 : n // 2 + 1] / np.sqrt(2.0)
-    spectra[:, 0] = np.sqrt(2.0) * spectra[:, 0].real  # the mean of the series, which is real
-    found: Array = scipy.fft.irfft(spectra, 2 * (spectra.shape[1] - 1))
-    return found
 
 
 def innovations(
