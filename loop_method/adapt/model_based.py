@@ -41,6 +41,7 @@ from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch
 from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
 from loop_method.adapt.renewal import renew, renew_from_states
+from loop_method.adapt.schedule import Schedule
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
@@ -103,13 +104,12 @@ class ModelBased(Optimizer):
         observed = isinstance(context.law, Observer)
         self._first = checked_theta(policy0) if observed else checked_policy(policy0)
         self._none = np.zeros_like(self._first)
-        self._before = [
-            *(
-                Record(self._none, np.inf, known.states, known.actions)
-                for known in context.every_exploration
-            ),
-            *context.measured,
+        explored = [
+            Record(self._none, np.inf, known.states, known.actions)
+            for known in context.every_exploration
         ]
+        self._before = [*explored, *context.measured]
+        self._schedule = Schedule(len(self._before), rollouts, self._settings)
         largest = max(float(np.abs(record.states).max()) for record in self._before)
         self._records = Records(_REMEMBERED, 3.0 * largest)
         self._progress = Progress(self._first.copy())
@@ -152,7 +152,7 @@ class ModelBased(Optimizer):
         if self._progress.stage == RENEWING:
             laws = [self._progress.policy] * (self._next_renewal() - own)
         elif self._progress.stage == JUDGING:
-            laws = [self._progress.policy] * (self._judging - self._progress.none_is_close)
+            laws = [self._progress.policy] * (self._schedule.judging - self._progress.none_is_close)
             laws += [self._none] * self._progress.none_is_close
         elif self._progress.stage == SEARCHING:
             assert self._local is not None
@@ -185,24 +185,9 @@ class ModelBased(Optimizer):
         diverged = sum(not result.usable for result in results)
         return row | {"rollouts": self._records.count, "diverged": diverged}
 
-    @property
-    def _judging(self) -> int:
-        """Rollouts that judge the final law."""
-        return max(1, min(self._settings.judging, self._budget // 2))
-
     def _next_renewal(self) -> int:
         """Own rollouts after which the law is renewed next."""
-        known, last = len(self._before), self._last_renewal()
-        at = self._settings.first_renewal
-        while at - known <= self._records.count:
-            at *= 2
-        # One is only worth it if as many rollouts again come before the last one.
-        return at - known if 2 * at - known <= last else last
-
-    def _last_renewal(self) -> int:
-        """Own rollouts after which the law is renewed for the last time."""
-        enough = max(self._settings.enough_fields - len(self._before), 1)
-        return min(self._budget - self._judging, enough)
+        return self._schedule.doubled(self._records.count)
 
     def _rollout(self, policy: Array, number: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, number))
@@ -235,7 +220,7 @@ class ModelBased(Optimizer):
         """Also without control, if that may be as good as the law."""
         self._progress.stage = JUDGING
         belief, policy = self._progress.belief, self._progress.policy
-        if belief is not None and self._judging > 1 and policy.any():
+        if belief is not None and self._schedule.judging > 1 and policy.any():
             loop, fields = belief.loop(self._context), self._fields()
             none, own = (loop.costs(loop.theta(law), fields).mean() for law in (self._none, policy))
             self._progress.none_is_close = bool(none <= (1.0 + self._settings.close) * own)
@@ -246,7 +231,7 @@ class ModelBased(Optimizer):
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
-        final = self._records.count >= self._last_renewal()
+        final = self._records.count >= self._schedule.last
         before, belief = self._progress.belief, self._believe()
         known = self._measurements()
         other = believe_in_noise(self._context, known, belief, self._settings)
@@ -308,12 +293,17 @@ class ModelBased(Optimizer):
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
         if not belief.whole or is_chaotic(loop, fields):
             row["chaotic"] = True
-            found = renew_from_states(
-                *(loop, base, improved, self._data(), rng, self._settings), final=final
-            )
+            data = self._data()
+            found = renew_from_states(loop, base, improved, data, rng, self._settings, final=final)
         else:
             found = renew(
-                *(loop, base, improved, self._progress.parts, fields, rng, self._settings),
+                loop,
+                base,
+                improved,
+                self._progress.parts,
+                fields,
+                rng,
+                self._settings,
                 components=belief.components,
                 periodic=self._context.periodic,
                 final=final,
@@ -359,7 +349,9 @@ class ModelBased(Optimizer):
     def _search_from(self, begun: int) -> LocalSearch:
         """Local steps after this many rollouts of its own."""
         return LocalSearch(
-            *(self._context, self._first, self._records.all()[:begun]),
+            self._context,
+            self._first,
+            self._records.all()[:begun],
             seed=self._seed,
             rollouts=self._budget - begun,
             settings=self._settings,

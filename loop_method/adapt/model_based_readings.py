@@ -32,10 +32,7 @@ class ModelBasedReadings(ModelBased):
 
     def _next_renewal(self) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
-        last = self._last_renewal()
-        own = max(self._settings.first_renewal - len(self._before), 1)
-        every = range(own, max(last, own) + 1, self._settings.judging)
-        return next((n for n in every if self._records.count < n <= last), last)
+        return self._schedule.often(self._records.count)
 
     def _data(self) -> list[Record]:
         """All rollouts as they were measured: the model's filter knows their noise."""

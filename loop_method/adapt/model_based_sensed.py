@@ -54,7 +54,7 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _next_renewal(self) -> int:
         """After as many rollouts as judge a law; on a model of the field later after twice as many."""
-        own, last = self._records.count, self._last_renewal()
+        own, last = self._records.count, self._schedule.last
         if self._sensed is None:
             return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last
@@ -168,7 +168,7 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Decide between the final law and the one to stay with on the same fields."""
-        judged = self._records.all()[-self._judging :]
+        judged = self._records.all()[-self._schedule.judging :]
         own = [record.cost for record in judged if np.array_equal(record.policy, final)]
         pairs = list(zip(own, (record.cost for record in self._of(stays)), strict=False))
         if len(pairs) < FEWEST:
