@@ -146,7 +146,6 @@ def renew_from_states(
         found = renew(*(loop, first, improved, [], fields, rng, settings), final=final)
         if found is None or found.change.is_negative(settings.confidence, settings.chaotic_clear):
             break
-        improved = found.improved
     return found
 
 

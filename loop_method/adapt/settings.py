@@ -50,7 +50,7 @@ class ImprovementSettings(Settings):
         1000,
     )
     chaotic_clear: float = setting(
-        5.0, "multiple of the standard errors of the verdict at which it is clear", 0.0, 100.0
+        10.0, "multiple of the standard errors of the verdict at which it is clear", 0.0, 100.0
     )
     pieces: int = setting(
         8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
