@@ -112,7 +112,7 @@ class RecordedRun:
                 f"the tuner's {', '.join(unknown)} not known, so its policies cannot be followed"
             )
             return False
-        training = build_training({**self._values, "plant": self._fingerprint})
+        training = build_training({**self._values, "plant_fingerprint": self._fingerprint})
         pair = LocalPair(self._values, self._pair.plant)
         pair.follow(training)
         unseen = dict(self._rollouts)

@@ -19,7 +19,7 @@ _NOT_SOURCES = (".*", "__pycache__", "*.egg-info", "build", "install", "log", "r
 
 @dataclass(frozen=True)
 class Workspace:
-    """prefix: where the package was installed; environment: after `. install/setup.sh`."""
+    """prefix: where the package was installed; environment: what `. install/setup.sh` changes."""
 
     prefix: Path
     environment: dict[str, str]
@@ -29,7 +29,7 @@ class Workspace:
         """A command in the workspace's environment; an executable is named as `ros2 run` does."""
         return subprocess.run(
             [str(self.executable(command[0])), *command[1:]],
-            env=self.environment,
+            env=os.environ | self.environment,
             cwd=cwd,
             capture_output=True,
             text=True,
@@ -89,6 +89,8 @@ def build(folder: Path, *options: str) -> Workspace:
         check=True,
         timeout=600,
     )
-    environment = dict(item.split("=", 1) for item in shown.stdout.split("\0") if item)
+    after = dict(item.split("=", 1) for item in shown.stdout.split("\0") if item)
+    # The workers share it, and each has a temporary folder of its own.
+    environment = {name: value for name, value in after.items() if os.environ.get(name) != value}
     prefix = Path(environment["AMENT_PREFIX_PATH"].split(os.pathsep)[0])
     return Workspace(prefix, environment, done.stdout)

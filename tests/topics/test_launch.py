@@ -47,9 +47,8 @@ def installed(loop: Processes, workspace: Workspace) -> Processes:
     """Processes that run the installed code, not the sources."""
     path = workspace.environment["PYTHONPATH"]
     given = os.environ.get("PYTHONPATH", "") if LAUNCH else str(STAND_IN)  # where launch comes from
-    own = {"ROS_LOG_DIR": loop.environment["ROS_LOG_DIR"]}  # whose processes these are
     loop.forks = False
-    loop.environment |= workspace.environment | own | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
+    loop.environment |= workspace.environment | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
     return loop
 
 
