@@ -35,10 +35,12 @@ def multiply(z: Array, row: Array, without: int, value: Array) -> None:
     for factor in range(row[0]):
         if factor != without:
             c, ahead = row[1 + factor], row[1 + MOST_FACTORS + factor]
-            for i in range(n_x - ahead):
-                value[i] *= z[c, i + ahead]
-            for i in range(n_x - ahead, n_x):
-                value[i] *= z[c, i + ahead - n_x]
+            # Slices: a computed index might be negative, and such loops are not vectorised.
+            front, back, end = z[c, ahead:], z[c, :ahead], value[n_x - ahead :]
+            for i in range(front.size):
+                value[i] *= front[i]
+            for i in range(back.size):
+                end[i] *= back[i]
 
 
 @jit
@@ -46,11 +48,9 @@ def monomial(z: Array, row: Array, ring: Array) -> None:
     """A monomial at the points 1 .. n_x of a ring, whose ends are repeated."""
     n_x = z.shape[1]
     c, ahead = row[1], row[1 + MOST_FACTORS]
-    for i in range(n_x - ahead):
-        ring[1 + i] = z[c, i + ahead]
-    for i in range(n_x - ahead, n_x):
-        ring[1 + i] = z[c, i + ahead - n_x]
-    multiply(z, row, 0, ring[1:])
+    ring[1 : 1 + n_x - ahead] = z[c, ahead:]
+    ring[1 + n_x - ahead : 1 + n_x] = z[c, :ahead]
+    multiply(z, row, 0, ring[1 : 1 + n_x])
     ring[0], ring[n_x + 1] = ring[n_x], ring[1]
 
 
@@ -140,10 +140,11 @@ def transposed_rate(
                 value[i] = on_m[i]
             multiply(z, table[f], own, value)
             c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
-            for i in range(n_x - ahead):
-                out[c, i + ahead] += value[i]
-            for i in range(n_x - ahead, n_x):
-                out[c, i + ahead - n_x] += value[i]
+            front, back, end = out[c, ahead:], out[c, :ahead], value[n_x - ahead :]
+            for i in range(front.size):
+                front[i] += value[i]
+            for i in range(back.size):
+                back[i] += end[i]
         on_m[:] = 0.0
 
 
