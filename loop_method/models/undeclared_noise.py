@@ -65,7 +65,8 @@ def fit_undeclared_noise(
     if not noise or not misjudged:
         return None
     found = fit_field_model(
-        *(rollouts, target),
+        rollouts,
+        target,
         settings=settings,
         noise=noise,
         action_limit=action_limit,
