@@ -22,8 +22,8 @@ from loop_interfaces.grid import Grid
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
-from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
-from pdeloop.episode import EpisodeRecord, mean_field_cost, projected_law, rollout
+from pde_sim_node.plant import MEAN_FIELD, Plant
+from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from tuner_node.build import build_training
 
 __all__ = ["Finding", "Reach", "check", "draw", "linearisation", "reach"]
@@ -46,7 +46,7 @@ SMALL = 1e-6
 REPEATED = 5
 """Steps that are computed again."""
 DRAWN = 5
-"""Number of initial fields drawn around their mean."""
+"""Number of initial fields drawn: those that are explored and controlled, and those in the picture."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,14 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
         yield _repeatable(plant, explored)
     yield _halving(plant, values, explored)
     yield _actuators(plant)
-    if explored.costs.diverged_step.max() >= 0:
+    diverged = explored.costs.diverged_step[explored.costs.diverged_step >= 0]
+    if len(diverged):
         yield Finding(
             "exploration",
             False,
-            f"the plant diverges at step {explored.costs.diverged_step.max()} under inputs of variance "
-            f"{_variance(values):.3g}: lower exploration_variance, or take a smaller integration_time",
+            f"{len(diverged)} of {len(explored.costs.mean)} explorations under inputs of variance "
+            f"{_variance(values):.3g} diverge, the first at step {diverged.min()}: lower "
+            "exploration_variance" + ("" if values["plant"] else " or integration_time"),
         )
         return
     yield from _identification(values)
@@ -92,11 +94,23 @@ def _variance(values: Mapping[str, Any]) -> float:
 
 
 def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
-    """From the mean field and from a drawn one, under white inputs."""
+    """From the mean field and from drawn ones, under white inputs."""
+    seeds = [MEAN_FIELD, *range(DRAWN)]
     inputs = np.random.default_rng(0).normal(
-        scale=np.sqrt(_variance(values)), size=(plant.horizon, 2, plant.n_a)
+        scale=np.sqrt(_variance(values)), size=(len(seeds), plant.horizon, plant.n_a)
     )
-    return rollout(plant, lambda k, states: inputs[k], [MEAN_FIELD, 0], np.arange(2))
+    return rollout(plant, lambda k, states: inputs[:, k], seeds, np.arange(len(seeds)))
+
+
+def _drawn_fields_cost(plant: Plant, law: Law | None = None) -> float:
+    """Mean stage cost over the drawn fields, under a law or without control; inf: one diverges.
+
+    Not from the mean field: where fields are drawn around the target, it costs next to nothing.
+    """
+    none = np.zeros((DRAWN, plant.n_a))
+    seeds = np.arange(DRAWN)
+    costs = rollout(plant, law or (lambda k, z: none), seeds, seeds, keep=False).costs
+    return float(np.inf if (costs.diverged_step >= 0).any() else costs.mean.mean())
 
 
 def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -> Finding:
@@ -304,8 +318,9 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     yield Finding(
         "exploration",
         True,
-        f"inputs of variance {_variance(values):.3g} keep the plant within its bound "
-        f"(largest {np.abs(explored.fields).max():.3g} of {plant.divergence_bound:g})",
+        f"inputs of variance {_variance(values):.3g} keep the plant within its bound on "
+        f"{DRAWN + 1} initial fields (largest {np.abs(explored.fields).max():.3g} of "
+        f"{plant.divergence_bound:g})",
     )
     settings = DesignSettings.of(values)
     try:
@@ -320,7 +335,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"reduced_order {n_s}; one episode suggests {suggested}, and dmdc a rank of "
         f"{suggested + plant.n_a} or more",
     )
-    costs = {"no control": mean_field_cost(plant)}
+    costs = {"no control": _drawn_fields_cost(plant)}
     for order in dict.fromkeys((n_s, suggested)):
         try:
             law = design(trajectories, plant.target, replace(settings, reduced_order=order))
@@ -328,14 +343,16 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding("first law", False, f"of order {order}: {error}")
             return
         own = projected_law(plant, law.U, law.policy)
-        costs[f"order {order}"] = mean_field_cost(plant, own)
+        costs[f"order {order}"] = _drawn_fields_cost(plant, own)
     told = ", ".join(
-        f"{'diverges' if cost >= DIVERGED_COST else format(cost, '.4g')} with {name}"
+        f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()
     )
     good = costs[f"order {n_s}"] < costs["no control"]
-    hint = "" if good else ": a training would begin with no control; try another reduced_order"
-    yield Finding("first law", good, f"mean stage cost from the mean field {told}{hint}")
+    hint = (
+        "" if good else ": the adaptation begins with a law that does not help; try another order"
+    )
+    yield Finding("first law", good, f"mean stage cost of {DRAWN} drawn fields {told}{hint}")
 
 
 def draw(values: Mapping[str, Any], path: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -129,8 +130,51 @@ def test_the_small_problem_is_good_and_a_coarse_step_is_not() -> None:
 
 def test_an_exploration_that_diverges_is_told() -> None:
     found = named(divergence_bound=0.5)
-    assert found["exploration"][0] is False and "diverges at step" in found["exploration"][1]
+    assert found["exploration"][0] is False
+    assert "6 of 6 explorations" in found["exploration"][1]
     assert "order" not in found
+
+
+class Around(pdeloop.Dynamics):
+    """States z+ = z + 0.02 z + a/10, drawn around the target, which is where they are on average."""
+
+    n_z, n_a, horizon, sample_time = 4, 4, 40, 0.1
+    spread = 1.0
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        half = self.spread * rng.standard_normal((1, 2))
+        return np.vstack([half, -half]).ravel()
+
+    def mean_state(self) -> np.ndarray:
+        return np.zeros(4)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return 1.02 * z + 0.1 * a
+
+
+class SometimesFar(Around):
+    """The same; from one of the drawn states it leaves the bound."""
+
+    divergence_bound = 5.0
+    spread = 1.5
+
+
+def findings_of(plant: pdeloop.Dynamics) -> dict[str, tuple[bool, str]]:
+    values = pdeloop.problem(plant=plant).values
+    return {found.name: (found.good, found.text) for found in check(values)}
+
+
+def test_a_law_is_judged_on_drawn_states_where_their_mean_is_the_target() -> None:
+    """From the mean, which is the target, no law costs less than no control, which costs nothing."""
+    good, text = findings_of(Around())["first law"]
+    none, law = (float(number) for number in re.findall(r"([\d.]+) with", text))
+    assert good and none > 2 * law > 0
+
+
+def test_one_drawn_state_whose_exploration_diverges_is_told() -> None:
+    good, text = findings_of(SometimesFar())["exploration"]
+    assert not good
+    assert "1 of 6 explorations" in text
 
 
 @pytest.mark.parametrize(
