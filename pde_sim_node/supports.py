@@ -6,14 +6,16 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.actuators import indicator_centres
+
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
     """Phi_j(x_i) of n_a actuators, n_z // n_a grid points apart, (n_z, n_a), entries 0 or 1.
 
-    With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices int(c - w/2) <= i <
-    int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention. Where n_a does not
-    divide n_z, the last n_z - n_a s points are beyond all of them. ValueError where
-    they would together be wider than the domain, one holds no grid point, or one leaves the grid.
+    With w = width n_z, support j is 1 on the grid indices int(c - w/2) <= i < int(c + w/2) around its
+    centre c (`indicator_centres`). Where n_a does not divide n_z, the last n_z % n_a points are beyond
+    all of them. ValueError where they would together be wider than the domain, one holds no grid point,
+    or one leaves the grid.
     """
     if not width > 0:
         raise ValueError(f"width must be positive, got {width!r}")
@@ -24,10 +26,9 @@ def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
             f"width * n_a must not exceed 1, got {width:g} * {n_a} = {width * n_a:g}: "
             f"take a width of at most {1 / n_a:g}"
         )
-    half, spacing = 0.5 * width * n_z, n_z // n_a
+    half = 0.5 * width * n_z
     supports = np.zeros((n_z, n_a))
-    for j in range(n_a):
-        centre = int((j + 0.5) * spacing)
+    for j, centre in enumerate(indicator_centres(n_z, n_a)):
         left, right = int(centre - half), int(centre + half)
         if not 0 <= left < right <= n_z:
             raise ValueError(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.actuators import indicator_centres
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
 from loop_interfaces.model_rows import unpack
@@ -124,16 +125,12 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
 
 
 def actuator_centres(values: Mapping[str, Any]) -> list[float]:
-    """Centres of the actuators as shares of the domain; none: equally spaced.
-
-    Indicators are whole numbers of grid points apart (`pde_sim_node.supports`), so that they do not
-    fill the domain if n_a does not divide n_z.
-    """
+    """Centres of the actuators as shares of the domain; none: equally spaced."""
     positions: list[float] = list(values["actuator_positions"])
     if positions or values["plant"] or values["actuator_shape"] == "gaussian":
         return positions
     n_z, n_a = values["n_z"], values["n_a"]
-    return [int((j + 0.5) * (n_z // n_a)) / n_z for j in range(n_a)]
+    return [centre / n_z for centre in indicator_centres(n_z, n_a)]
 
 
 def indicator_width(values: Mapping[str, Any]) -> float:
