@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from loop_interfaces.arrays import Array
+
 
 def indicator_centres(points: int, n_a: int) -> list[int]:
     """The grid indices of the centres of n_a indicators, points // n_a apart: controlgym's convention.
@@ -14,3 +18,35 @@ def indicator_centres(points: int, n_a: int) -> list[int]:
     """
     spacing = points // n_a
     return [int((j + 0.5) * spacing) for j in range(n_a)]
+
+
+def extents(supports: Array) -> tuple[Array, Array]:
+    """The centres and widths of actuators on a periodic axis, as shares of it.
+
+    A width is that of the indicator with the same second moment.
+
+    Parameters
+    ----------
+    supports : (points, n_a)
+        How each actuator acts on each point of the axis, the first one at 0.
+
+    Returns
+    -------
+    (n_a,), (n_a,)
+        None where one of them acts nowhere, and so has no place.
+
+    Examples
+    --------
+    >>> supports = np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 2.0], [0.0, 2.0], [0.0, 0.0]])
+    >>> [found.round(3).tolist() for found in extents(supports)]
+    [[0.167, 0.583], [0.5, 0.333]]
+    """
+    weights, points = np.abs(supports), np.arange(len(supports)) / len(supports)
+    total = weights.sum(axis=0)
+    if not (np.isfinite(total) & (total > 0.0)).all():
+        return np.zeros(0), np.zeros(0)
+    centres = np.angle(np.exp(2j * np.pi * points) @ weights) / (2.0 * np.pi) % 1.0
+    distance = (points[:, None] - centres + 0.5) % 1.0 - 0.5
+    # Each point stands for an interval around it.
+    second = np.sum(weights * distance**2, axis=0) / total + len(points) ** -2.0 / 12.0
+    return centres, np.minimum(np.sqrt(12.0 * second), 1.0)

@@ -56,8 +56,8 @@ INSTRUMENTS = _section(
 ACTUATORS = _section(
     "PT",
     Spec("actuator_positions", [], 0.0, 1.0, group="problem").means(
-        "centres of the n_a actuators as fractions of L; empty: n_x // n_a points apart, or where "
-        "the equation places them"
+        "centres of the actuators as fractions of L; empty: n_x // n_a points apart, or the "
+        "equation's"
     ),
     Spec(
         "actuator_shape",
@@ -120,6 +120,9 @@ PROBLEM = _section(
         "width of one actuator as a fraction of L"
     ),
     *ACTUATORS,
+    Spec("actuator_extents", [], 0.0, 1.0, nodes="T").means(
+        "centres, then widths, where an equation or plant has its own"
+    ),
     Spec("sample_time", 0.05, positive=True, unit="s").means(
         "sampling time; the action is held over it"
     ),
@@ -162,7 +165,8 @@ PROBLEM = _section(
 POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 """The size of the state of an equation."""
 OF_THE_PLANT = (
-    *("grid", "cost", "length", "n_z", "n_a", "sample_time", "horizon"),
+    *("grid", "cost", "length", "n_z", "n_a", "actuator_extents"),
+    *("sample_time", "horizon"),
     *("state_weight", "action_weight", "divergence_bound", "reduced_order"),
 )
 """Parameters that a user's own plant supplies where the problem does not."""

@@ -5,6 +5,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
+import numpy as np
+
+from loop_interfaces.actuators import extents
 from loop_interfaces.cost import Cost
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_interfaces.spec import ParameterError
@@ -27,6 +30,7 @@ _GRID = (
 )
 _FIXED = ("n_z", "n_a", "sample_time")
 """Parameters that a user's own plant supplies and a problem cannot change."""
+EXTENTS = "actuator_extents"
 
 
 def build_equation(values: Mapping[str, Any]) -> Equation:
@@ -62,11 +66,28 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     axes = plant.grid.axes
     own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
     own["cost"] = plant.cost.texts if values["plant"] else list(values.get("cost", ()))
+    own[EXTENTS] = _declared_actuators(plant, values)
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
         return plant, {**own, **given}
-    names = ("grid", "cost", "state_weight", "action_weight") if own["cost"] else ("grid", "cost")
+    names = [
+        name for name in ("grid", "cost", EXTENTS) if name != EXTENTS or not values.get(EXTENTS)
+    ]
+    names += ["state_weight", "action_weight"] if own["cost"] else []
     return plant, {**given, **{name: own[name] for name in names}}
+
+
+def _declared_actuators(plant: Plant, values: Mapping[str, Any]) -> list[float]:
+    """Centres and widths of the actuators that an equation or a plant places itself, else none."""
+    placed = values["plant"] or (
+        values["actuator_shape"] == "equation"
+        and not values["actuator_positions"]
+        and configured_equation(str(values["equation"])).supports is not Equation.supports
+    )
+    grid, supports = plant.grid, plant.supports
+    if not placed or supports is None or not grid.is_circle or len(grid.components) > 1:
+        return []
+    return [float(number) for number in np.concatenate(extents(supports))]
 
 
 def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:

@@ -121,8 +121,8 @@ class TrainingSettings:
     """Point sensors whose readings the states are; 0: the states are whole."""
     actuator_positions: Sequence[float] = ()
     """Centres of the actuators as shares of the domain; none: equally spaced."""
-    actuator_width: float = 0.0
-    """Width of each as a share of the domain; 0: not declared."""
+    actuator_widths: Sequence[float] = ()
+    """Width of each as a share of the domain; none: not declared."""
     cost: Sequence[str] = ()
     """The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it."""
     periodic: bool = True

@@ -124,24 +124,24 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     return law
 
 
-def actuator_centres(values: Mapping[str, Any]) -> list[float]:
-    """Centres of the actuators as shares of the domain; none: equally spaced."""
-    positions: list[float] = list(values["actuator_positions"])
-    if positions or values["plant"] or values["actuator_shape"] == "gaussian":
-        return positions
-    n_z, n_a = values["n_z"], values["n_a"]
-    return [centre / n_z for centre in indicator_centres(n_z, n_a)]
+def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+    """Centres and widths of the actuators as shares of the domain.
 
-
-def indicator_width(values: Mapping[str, Any]) -> float:
-    """Width of an indicator like the declared actuators; 0 where a plant of one's own declares none.
-
-    That of a Gaussian has the same second moment.
+    No centres: equally spaced; no widths: a plant of one's own declares none. A Gaussian has the width
+    of an indicator with the same second moment.
     """
-    if values["plant"]:
-        return 0.0
-    width = float(values["actuator_width"])
-    return math.sqrt(12.0) * width if values["actuator_shape"] == "gaussian" else width
+    n_z, n_a, extents = values["n_z"], values["n_a"], list(values["actuator_extents"])
+    if len(extents) not in (0, 2 * n_a):
+        raise ParameterError(
+            f"parameter 'actuator_extents' has {len(extents)} numbers; expected {n_a} centres and as "
+            "many widths, or none"
+        )
+    if extents or values["plant"]:
+        return extents[:n_a], extents[n_a:]
+    centres, width = list(values["actuator_positions"]), float(values["actuator_width"])
+    if values["actuator_shape"] == "gaussian":
+        return centres, n_a * [math.sqrt(12.0) * width]
+    return centres or [centre / n_z for centre in indicator_centres(n_z, n_a)], n_a * [width]
 
 
 def build_training(values: Mapping[str, Any]) -> Training:
@@ -199,12 +199,13 @@ def build_training(values: Mapping[str, Any]) -> Training:
     scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
     points = () if grid is None else tuple(axis.size for axis in grid.axes)
+    centres, widths = declared_actuators(values)
     given |= {
         "law": law,
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
-        "actuator_positions": actuator_centres(values),
-        "actuator_width": indicator_width(values),
+        "actuator_positions": centres,
+        "actuator_widths": widths,
         "periodic": grid is None or grid.is_circle,
         "line": grid is None or len(grid.axes) < 2,
         "shape": points if len(points) > 1 and not sensors else (),

@@ -38,7 +38,7 @@ def context_of(
         noise=settings.measurement_noise,
         sensors=settings.sensors,
         actuator_positions=settings.actuator_positions,
-        actuator_width=settings.actuator_width,
+        actuator_widths=settings.actuator_widths,
         periodic=settings.periodic,
         line=settings.line,
         shape=settings.shape,

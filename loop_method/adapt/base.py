@@ -147,8 +147,8 @@ class Context:
         consist; 0: the states are whole.
     actuator_positions : sequence of float
         Centres of the actuators as shares of the domain; none: equally spaced.
-    actuator_width : float
-        Width of each as a share of the domain; 0: not declared.
+    actuator_widths : sequence of float
+        Width of each as a share of the domain; none: not declared.
     periodic : bool
         Whether the states are fields on one periodic axis, which models of the whole field assume.
     line : bool
@@ -179,7 +179,7 @@ class Context:
     noise: float = 0.0
     sensors: int = 0
     actuator_positions: Sequence[float] = ()
-    actuator_width: float = 0.0
+    actuator_widths: Sequence[float] = ()
     periodic: bool = True
     line: bool = True
     shape: tuple[int, ...] = ()
@@ -197,7 +197,7 @@ class Context:
     def actuators(self, n_a: int) -> Actuators:
         """What is declared of the n_a actuators."""
         centres = np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)
-        return Actuators(centres, self.actuator_width)
+        return Actuators(centres, np.array(self.actuator_widths or np.zeros(n_a)))
 
 
 class Optimizer(Protocol):

@@ -2,11 +2,11 @@
 """A partial differential equation of a field of which a few points are measured.
 
     dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,    B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
-                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = p_w + w / n_a
+                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = q_i + w / n_a
 
-on a periodic domain of length 1, with time in sampling times and the declared centres p_i and width p_w
-of the actuators. Nothing else depends on where on the domain something happens, so that there are a
-dozen unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds
+on a periodic domain of length 1, with time in sampling times and the declared centres p_i and widths
+q_i of the actuators. Nothing else depends on where on the domain something happens, so that there are
+a dozen unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds
 them.
 
 A sampling time has internal steps, the more the larger the field: a front moves through several grid
@@ -85,18 +85,23 @@ class Actuators:
     ----------
     centres : (n_a,) array
         p_i, as shares of the domain.
-    width : float
-        p_w, as a share of the domain; 0: not declared, and half of the domain divided among them.
+    widths : (n_a,) array
+        q_i, as shares of the domain; 0: not declared, and half of the domain divided among them.
         Readings hardly tell it, as an actuator between two sensors looks weaker as well as narrower.
     """
 
     centres: Array
-    width: float = 0.0
+    widths: Array
 
     @property
-    def known_width(self) -> float:
-        """p_w, also where it is not declared."""
-        return self.width or 0.5 / len(self.centres)
+    def declared(self) -> bool:
+        """True if all widths are."""
+        return bool(self.widths.all())
+
+    @property
+    def known_widths(self) -> Array:
+        """q_i, also where it is not declared."""
+        return np.where(self.widths > 0.0, self.widths, 0.5 / len(self.centres))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ class SensedModel(SpectralModel):
             "form": np.array("sensed"),
             "shared": self.shared,
             "centres": self.actuators.centres,
-            "width": np.array(self.actuators.width),
+            "widths": self.actuators.widths,
             "sensors": np.array(self.sensors),
             "noise": np.array(self.noise),
             "spread": self.spread,
@@ -149,17 +154,30 @@ class SensedModel(SpectralModel):
         sensors = int(checked_array(arrays, "sensors", "i", ()))
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
-        width = float(checked_array(arrays, "width", "f", ())) if "width" in arrays else 0.0
-        if width < 0.0:
-            raise ValueError(f"a model has actuators of the width {width:g}; expected at least 0")
         return SensedModel(
             **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
             shared=_shared_of(arrays, whole.n_a),
-            actuators=Actuators(numbers_of(arrays, "centres", whole.n_a), width),
+            actuators=Actuators(
+                numbers_of(arrays, "centres", whole.n_a), _widths_of(arrays, whole.n_a)
+            ),
             sensors=sensors,
             noise=float(checked_array(arrays, "noise", "f", ())),
             spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
         )
+
+
+def _widths_of(arrays: Arrays, n_a: int) -> Array:
+    """The widths of `arrays`; older ones have one for all actuators, or none."""
+    if "widths" in arrays:
+        widths = numbers_of(arrays, "widths", n_a)
+    else:
+        width = float(checked_array(arrays, "width", "f", ())) if "width" in arrays else 0.0
+        widths = np.full(n_a, width)
+    if (widths < 0.0).any():
+        raise ValueError(
+            f"a model has actuators of the width {widths.min():g}; expected at least 0"
+        )
+    return widths
 
 
 def _shared_of(arrays: Arrays, n_a: int) -> Array:
@@ -241,7 +259,7 @@ class SensedEquation:
         n_a = len(actuators.centres)
         own = np.arange(n_a)
         places = actuators.centres + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
-        width = actuators.known_width + w / n_a
+        width = (actuators.known_widths + w / n_a)[:, None]
         # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
         shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
         shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])

@@ -55,7 +55,7 @@ class SensedProblem:
         self.noise: float = (noise / self._size) ** 2
         self.place_ridge = place_ridge
         """That of the shifts, widths and differences of actuators."""
-        self.holds = bool(noise and actuators.width)
+        self.holds = bool(noise and actuators.declared)
         """True if noise would move actuators from where they are declared."""
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)

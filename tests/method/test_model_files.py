@@ -78,7 +78,7 @@ MODELS: dict[str, FieldModel] = {
     "sensed": SensedModel(
         **spectral(grid_points(SENSORS)),  # type: ignore[arg-type]
         shared=numbers(unknowns(N_A)),
-        actuators=Actuators(numbers(N_A), 0.25),
+        actuators=Actuators(numbers(N_A), np.linspace(0.1, 0.2, N_A)),
         sensors=SENSORS,
     ),
 }
@@ -105,17 +105,19 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
 
 def test_an_older_model_between_sensors_has_equal_actuators_of_no_declared_width() -> None:
     arrays = MODELS["sensed"].arrays()
-    older = {name: own for name, own in arrays.items() if name != "width"}
+    older = {name: own for name, own in arrays.items() if name != "widths"}
     found = model_of({**older, "shared": arrays["shared"][:SHARED]}).arrays()
     shared = found["shared"]
     np.testing.assert_array_equal(shared[:SHARED], arrays["shared"][:SHARED])
     assert shared.shape == arrays["shared"].shape and not shared[SHARED:].any()
-    assert found["width"] == 0.0
+    np.testing.assert_array_equal(found["widths"], np.zeros(N_A))
+    declared = model_of({**older, "width": np.array(0.25)}).arrays()
+    np.testing.assert_array_equal(declared["widths"], np.full(N_A, 0.25))
 
 
 def test_a_model_has_no_actuators_of_negative_width() -> None:
     with pytest.raises(ValueError, match=r"width -0\.1"):
-        model_of({**MODELS["sensed"].arrays(), "width": np.array(-0.1)})
+        model_of({**MODELS["sensed"].arrays(), "widths": np.full(N_A, -0.1)})
 
 
 @pytest.mark.parametrize("form", [*FORMS, NEIGHBOURS])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -51,7 +52,11 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, 
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
     readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
     positions = problem.values["actuator_positions"]
-    actuators = Actuators(np.array(positions)) if positions else _equally_spaced(plant.n_a)
+    actuators = (
+        Actuators(np.array(positions), np.zeros(plant.n_a))
+        if positions
+        else _equally_spaced(plant.n_a)
+    )
     with threadpool_limits(1):
         shared, fields, error = fit_sensed(
             readings,
@@ -103,7 +108,7 @@ def _scale(problem: pdeloop.Problem) -> float:
 
 
 def _equally_spaced(n_a: int) -> Actuators:
-    return Actuators((np.arange(n_a) + 0.5) / n_a)
+    return Actuators((np.arange(n_a) + 0.5) / n_a, np.zeros(n_a))
 
 
 def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
@@ -208,7 +213,7 @@ def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() 
     """Burgers' equation, of which one internal step would be beyond the stability limit."""
     shared = np.zeros(unknowns(1))
     shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
-    n, actuators = grid_points(16), Actuators(np.array([0.5]))
+    n, actuators = grid_points(16), _equally_spaced(1)
     equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
     field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
     (substeps,) = equation.substeps(largest)
@@ -372,38 +377,85 @@ def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits
     assert same_bits(first.ask()[0].policy, later.ask()[0].policy)
 
 
-@pytest.mark.parametrize("shape", ["indicator", "gaussian"])
-@pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv", "fisher"])
-def test_actuators_are_declared_as_they_are(name: str, shape: str) -> None:
-    """Between two sensors nothing else tells where an actuator ends."""
-    problem = pdeloop.problem(name, sensors=SENSORS, actuator_shape=shape)
-    supports = problem.plant().supports
-    n, n_a = supports.shape
+class Unequal(pdeloop.Dynamics):
+    """A plant of one's own that says where its actuators are."""
+
+    n_a, grid = 2, pdeloop.Grid.interval(3.0, 60)
+    supports = np.zeros((60, 2))
+    supports[50:, 0] = supports[:6, 0] = 2.0
+    supports[20:24, 1] = -1.0
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return rng.standard_normal(60)
+
+    def step(self, z: Array, a: Array) -> Array:
+        return z + self.supports @ a
+
+
+def _declared(problem: pdeloop.Problem, n_a: int) -> Actuators:
+    """The actuators that a method is told of."""
     settings = build_training(problem.values).settings
     zero, explored = np.zeros((SENSORS, 1)), Trajectory(np.zeros((2, SENSORS)), np.zeros((1, n_a)))
-    context = Context(
+    return Context(
         *(zero, zero[:, 0], 1.0, 1.0, 1, explored),
         actuator_positions=settings.actuator_positions,
-        actuator_width=settings.actuator_width,
-    )
-    declared = context.actuators(n_a)
+        actuator_widths=settings.actuator_widths,
+    ).actuators(n_a)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        *itertools.product(["burgers", "allen-cahn", "kdv", "fisher"], ["indicator", "gaussian"]),
+        ("kuramoto-sivashinsky-22", "equation"),
+        ("", "equation"),
+    ],
+)
+def test_actuators_are_declared_as_they_are(name: str, shape: str) -> None:
+    """Between two sensors nothing else tells where an actuator ends."""
+    given = {"sensors": SENSORS, "actuator_shape": shape}
+    problem = pdeloop.problem(name, **given) if name else pdeloop.problem(plant=Unequal(), **given)
+    supports = np.abs(problem.plant().supports)
+    n, n_a = supports.shape
+    declared = _declared(problem, n_a)
     moments = np.exp(2j * np.pi * np.arange(n) / n) @ supports
     centres = np.angle(moments) / (2 * np.pi) % 1.0
     np.testing.assert_allclose(declared.centres, centres, atol=1.2 / n)
     distance = (np.arange(n)[:, None] / n - centres + 0.5) % 1.0 - 0.5
     second = np.sum(supports * distance**2, axis=0) / supports.sum(axis=0)
-    np.testing.assert_allclose(declared.width, np.sqrt(12.0 * second), atol=1.2 / n)
+    np.testing.assert_allclose(declared.widths, np.sqrt(12.0 * second), atol=1.2 / n)
+
+
+def test_actuators_that_a_plant_does_not_place_on_the_ring_are_declared_as_nothing() -> None:
+    """Neither one that acts nowhere nor those between walls have a place on a ring."""
+
+    class Idle(Unequal):
+        supports = np.zeros((60, 2))
+
+    class Walled(Unequal):
+        grid = pdeloop.Grid(pdeloop.Axis("x", 3.0, 60, periodic=False))
+
+    class Silent(Unequal):
+        supports = None
+
+    for kind in (Idle, Walled, Silent):
+        declared = _declared(pdeloop.problem(plant=kind(), sensors=SENSORS), 2)
+        np.testing.assert_array_equal(declared.centres, [0.25, 0.75])
+        assert not declared.declared
 
 
 def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> None:
     n, shared = grid_points(SENSORS), np.zeros(unknowns(3))
-    centres = _equally_spaced(3).centres
-    for actuators, width in ((Actuators(centres, 0.1), 0.1), (Actuators(centres), 0.5 / 3)):
+    centres, unequal = _equally_spaced(3).centres, np.array([0.1, 0.2, 0.05])
+    for actuators, widths in (
+        (Actuators(centres, unequal), unequal),
+        (_equally_spaced(3), 0.5 / 3),
+    ):
         supports = SensedEquation(shared, n, actuators).supports
-        np.testing.assert_allclose(supports.mean(axis=0), width)
+        np.testing.assert_allclose(supports.mean(axis=0), widths)
 
 
-DECLARED = Actuators((np.arange(3) + 0.5) / 3, 0.5 / 3)
+DECLARED = Actuators((np.arange(3) + 0.5) / 3, np.full(3, 0.5 / 3))
 
 
 def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:

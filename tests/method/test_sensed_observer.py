@@ -48,7 +48,7 @@ from tests.support.small import same_bits
 
 Array = np.ndarray
 SENSORS, N_A, T = 8, 3, 24
-ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A)
+ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.zeros(N_A))
 RNG = np.random.default_rng(17)
 
 
