@@ -121,6 +121,11 @@ class Problem:
         batch = training.next_batch()
         assert batch is not None
         episode = LocalPair(self.values).roll_out(batch)
+        if (lost := int(episode.costs.diverged_step[0])) >= 0:
+            raise ValueError(
+                f"the plant diverged under exploration at step {lost}; lower exploration_variance, or "
+                "measurement_noise, which raises it"
+            )
         return episode.states[:, 0], episode.actions[:, 0]
 
 

@@ -12,6 +12,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import digest_of
+from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import Trajectory
 from tuner_node.batch import Batch, BatchResult
 
@@ -25,6 +26,8 @@ class Chunk:
     costs: Array | None = None
     steps: int = 0
     models: Array | None = None
+    failure: str = ""
+    """Why an exploration gave no model, as the controller says."""
     trajectories: list[Trajectory] | None = None
 
     @property
@@ -36,13 +39,19 @@ class Chunk:
         """True once all results are there that the batch asks for."""
         return (
             self.costs is not None
-            and (self.models is not None or not batch.exploratory)
+            and (self.models is not None or bool(self.failure) or not batch.exploratory)
             and (self.trajectories is not None or not batch.trajectories)
         )
+
+    @property
+    def completed(self) -> bool:
+        """True once costs say that every environment came to its end."""
+        return self.costs is not None and bool((self.costs[:, CostColumn.ENDED] == COMPLETED).all())
 
     def clear(self) -> None:
         """Forget the results."""
         self.costs = self.models = self.trajectories = None
+        self.failure = ""
 
 
 def gathered(
@@ -50,6 +59,8 @@ def gathered(
 ) -> BatchResult:
     """The results of all chunks, in the batch's order; plant and target: of the run."""
     models = [chunk.models for chunk in chunks if chunk.models is not None]
+    if len(models) < len(chunks):  # which of them have one depends on how the batch was cut
+        models = []
     seen = [t for chunk in chunks for t in chunk.trajectories or ()]
     return BatchResult(
         np.concatenate([chunk.costs for chunk in chunks if chunk.costs is not None]),

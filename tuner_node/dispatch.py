@@ -32,16 +32,10 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
-from tuner_node.batch import (
-    UNKNOWN_PLANT,
-    Batch,
-    BatchResult,
-    less_often,
-    most_environments,
-)
+from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, less_often, most_environments
 from tuner_node.chunk import messages_of
 from tuner_node.chunk_queue import ChunkQueue
-from tuner_node.errors import ContradictionError, DispatchError
+from tuner_node.errors import ContradictionError
 from tuner_node.pair import Pair, PairPublication
 from tuner_node.targets import Targets
 
@@ -245,13 +239,15 @@ class Dispatcher:
         known, batch = self.pairs[pair], self._batch
         if failure.run != self.run:
             return []
-        if known.runs(failure.episode) and batch is not None:
-            if batch.exploratory and not failure.retry:
-                raise DispatchError(f"no reduced model: {failure.reason}")
+        if not known.runs(failure.episode) or batch is None:
+            known.check_failure(failure)
+            return []
+        if batch.exploratory and not failure.retry:
+            known.take_failure(failure)
+            known.release_if_done(batch)
+        else:
             self._retry(known, failure.reason)
-            return self._begin_episodes(now)
-        known.check_failure(failure)
-        return []
+        return self._begin_episodes(now)
 
     def tick(self, now: float) -> list[PairPublication]:
         """Ask again for missing answers; restart episodes that have been silent for too long.

@@ -67,6 +67,12 @@ class Narration:
             self._costs[seed] = row.get("cost")
         elif event == "excitation":
             lines.append(f"  seed {row['seed']}: {row['remark']}")
+        elif event == "diverged":
+            lines.append(
+                f"  seed {row['seed']}: the plant diverged under exploration at step {row['step']}; "
+                f"exploring again with variance {row['next_variance']:.3g} instead of "
+                f"{row['variance']:.3g}"
+            )
         elif event == "repeated":
             lines.append(f"  {row['reason']}")
         return lines

@@ -8,7 +8,7 @@ from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
-from loop_interfaces.topics import COST, VOID, CostColumn
+from loop_interfaces.topics import COST, MODEL_FAILED, VOID, CostColumn
 from tuner_node.batch import Batch, less_often
 from tuner_node.chunk import Chunk
 from tuner_node.errors import ContradictionError, DispatchError
@@ -72,8 +72,14 @@ class Pair:
         return chunk
 
     def release_if_done(self, batch: Batch) -> None:
-        """It is free if its chunk has all results."""
-        if self.chunk is not None and self.chunk.done(batch):
+        """It is free if its chunk has all results.
+
+        DispatchError if an exploration gave no model although the plant did not diverge.
+        """
+        chunk = self.chunk
+        if chunk is not None and chunk.failure and chunk.completed:
+            raise DispatchError(f"no reduced model: {chunk.failure}")
+        if chunk is not None and chunk.done(batch):
             self.chunk = None
 
     def started(self, start: Publication) -> None:
@@ -97,6 +103,12 @@ class Pair:
     def take_answer(self, topic: str, answer: Frame) -> None:
         """An answer is used: another one for its episode contradicts it."""
         self.answers[topic, answer.episode] = digest(answer.values), answer.step
+
+    def take_failure(self, failure: ModelFailure) -> None:
+        """The exploration under way gave no model; that is said again when it is asked for again."""
+        assert self.chunk is not None
+        self.chunk.failure = failure.reason
+        self.answers[MODEL_FAILED, failure.episode] = 0, 0
 
     def runs(self, episode: int) -> bool:
         """True while this episode is under way."""
@@ -133,7 +145,8 @@ class Pair:
     def check_failure(self, failure: ModelFailure) -> None:
         """Raise ContradictionError if an episode that was used is taken back."""
         # With `retry` the controller has only lost what it knew.
-        if not failure.retry and self.used(failure.episode):
+        repeated = (MODEL_FAILED, failure.episode) in self.answers
+        if not failure.retry and not repeated and self.used(failure.episode):
             raise ContradictionError(
                 f"the controller withdrew episode {episode_name(failure.episode)}, which this run "
                 f"has used, because {failure.reason}; stop the other publisher in this namespace "

@@ -14,6 +14,7 @@ from loop_interfaces.topics import StartColumn
 from loop_method.adapt import Rollout
 from loop_method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.batch import TrainingSettings
+from tuner_node.void_exploration import variance
 
 CHECK = 2
 """Rollouts of a check: no control and the warm start, on one sampled field."""
@@ -28,22 +29,23 @@ NOISE = {
 
 
 def explorations(
-    settings: TrainingSettings, pending: Sequence[int], attempts: Sequence[int]
+    settings: TrainingSettings, pending: Sequence[int], attempts: Sequence[int], void: Sequence[int]
 ) -> Array:
     """The rows of `episode/start` of the explorations of each of the m pending seeds, (m E, 4).
 
-    pending: their indices; attempts: how often each of all seeds has explored before.
+    pending: their indices; attempts, void: how often each of all seeds has explored before, with a
+    model and because the plant diverged.
     """
     E = settings.explorations
     rows = [
         (
             derive(settings.all_seeds[m], Purpose.EXPLORATORY_FIELD, number),
             derive(settings.all_seeds[m], Purpose.EXCITATION, number),
-            settings.exploration_variance,
+            variance(settings, void[m]),
             m,
         )
         for m in pending
-        for number in range(E * attempts[m], E * (attempts[m] + 1))
+        for number in range(E * (attempts[m] + void[m]), E * (attempts[m] + void[m] + 1))
     ]
     return np.array(rows, dtype=np.float64)
 

@@ -3,7 +3,8 @@
 
     phase     rollouts of each seed                     next phase
     identify  an exploration, from which the            check; adapt where only one attempt is
-              controller designs the warm start         allowed, or the model is given
+              controller designs the warm start         allowed, or the model is given; identify again,
+                                                        more weakly, where the plant diverged
     check     no control and the warm start on a field  identify again for seeds whose warm start is no
                                                         better, while they may; else adapt
     adapt     what the optimiser asks for               evaluate, once all optimisers are done
@@ -27,17 +28,16 @@ import numpy as np
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import digest
-from loop_interfaces.topics import COMPLETED, CostColumn
+from loop_interfaces.topics import CostColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
-from loop_method.reduce.identifiability import examine_excitation
-from tuner_node import rollouts
+from tuner_node import event_rows, rollouts, void_exploration
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
-from tuner_node.errors import ContradictionError
 from tuner_node.law_check import check_law
 from tuner_node.optimizer_context import context_of
+from tuner_node.result_checks import check_excitation, same_steps
 from tuner_node.rollouts import CHECK, EVALUATED
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
@@ -75,6 +75,8 @@ class Training:
     target: Array | None = None
     further: list[list[Trajectory]] = field(default_factory=list)
     """The others, where an exploration has several rollouts."""
+    void: list[int] = field(default_factory=list)
+    """How often the exploration of every seed was void because the plant diverged."""
     measured: list[list[Record]] = field(default_factory=list)
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
@@ -89,6 +91,7 @@ class Training:
         self.attempts = [0] * seeds
         self.explorations = [None] * seeds
         self.further = [[] for _ in range(seeds)]
+        self.void = [0] * seeds
         self.measured = [[] for _ in range(seeds)]
         self.worse = [False] * seeds
         self.budget = Budget(seeds, settings.rollouts, settings.adaptation)
@@ -98,7 +101,7 @@ class Training:
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
         if self.phase == "identify":
-            rows = rollouts.explorations(self.settings, self.pending, self.attempts)
+            rows = rollouts.explorations(self.settings, self.pending, self.attempts, self.void)
             together = self.settings.explorations
             batch = Batch(rows, None, self.settings.trajectories, together)
         elif self.phase == "check":
@@ -120,7 +123,7 @@ class Training:
         if not self.settings.noise:
             return batch
         adapts = self.phase == "adapt"
-        counts = [optimizer.tells for optimizer in self.optimizers] if adapts else self.attempts
+        counts = [optimizer.tells for optimizer in self.optimizers] if adapts else self.explored
         noise = rollouts.noise_seeds(self.settings, self.phase, batch.rows, counts)
         return replace(batch, rows=np.column_stack([batch.rows, noise]))
 
@@ -131,19 +134,22 @@ class Training:
                 f"the plant has other parameters (fingerprint {result.plant}) than the one this run "
                 f"began with ({self.plant}); continue it with that one, or start a new run"
             )
-        self.plant, self.steps = result.plant, self._same_steps(result)
+        self.plant, self.steps = result.plant, same_steps(result, self.steps)
         if self.phase == "identify":
+            together = self.settings.explorations
+            if lost := void_exploration.diverged_steps(result, self.pending, together):
+                return self._explored_in_vain(lost)
             assert result.models is not None
             remarks: list[dict[str, Any]] = []
             if result.trajectories is not None:
                 seen = iter(result.trajectories)
                 for m in self.pending:
-                    first, *further = islice(seen, self.settings.explorations)
-                    remarks += self._excitation(m, first)
+                    first, *further = islice(seen, together)
+                    remarks += check_excitation(first, self.settings.all_seeds[m])
                     self.explorations[m], self.further[m] = first, further
                 self.target = result.target
             # A controller that knows no common exploration gives a model of each: the first is taken.
-            models = result.models[:: self.settings.explorations]
+            models = result.models[::together]
             if self.settings.model is not None:  # explored for the optimiser's sake
                 return remarks + self._given(models)
             return remarks + self._identified(models)
@@ -152,16 +158,6 @@ class Training:
         if self.phase == "adapt":
             return self._tell(result)
         return self._evaluated(result)
-
-    def _same_steps(self, result: BatchResult) -> int:
-        """The steps of an episode. ContradictionError if not all of this run have as many."""
-        steps = sorted({*result.steps, *([self.steps] if self.steps else [])})
-        if len(steps) > 1:
-            raise ContradictionError(
-                f"episodes of this run ended after {' and '.join(map(str, steps))} steps, expected "
-                "one horizon: stop the other publisher of episode/cost and start a new run"
-            )
-        return next(iter(steps), 0)
 
     def laws(self) -> list[Law]:
         """The law of each seed's model."""
@@ -205,6 +201,11 @@ class Training:
         return 1 + sum(self.attempts)
 
     @property
+    def explored(self) -> list[int]:
+        """How often each seed has explored before, with a model or in vain."""
+        return [own + void for own, void in zip(self.attempts, self.void, strict=True)]
+
+    @property
     def computation(self) -> str:
         """The computation of `finish` in this phase, in words."""
         fits = self.phase == "adapt" and self.settings.trajectories
@@ -234,30 +235,32 @@ class Training:
             # What was kept ran without control, whose policy has the shape of the model's.
             zero = np.zeros_like(warm[m])
             self.measured[m] = [replace(kept, policy=zero) for kept in self.measured[m]]
-            rows.append(
-                {
-                    "event": "designed",
-                    "seed": self.settings.all_seeds[m],
-                    "attempt": self.attempts[m] + 1,
-                    "reduced_order": own.shape[1],
-                    "spectral_radius": float(np.abs(np.linalg.eigvals(model.A)).max()),
-                }
-            )
+            seed = self.settings.all_seeds[m]
+            rows.append(event_rows.designed(seed, self.attempts[m] + 1, own, model.A))
         self.phase = "check"
         if self.settings.identification_attempts == 1:
             self._start_adapting()
         return rows
 
-    def _excitation(self, m: int, explored: Trajectory) -> list[dict[str, Any]]:
-        """History rows about what an exploration hardly determines, whatever drew its actions.
+    def _explored_in_vain(self, lost: dict[int, int]) -> list[dict[str, Any]]:
+        """Explore again, more weakly for the seeds whose plant diverged, at these steps.
 
-        NotIdentifiableError if the effects of its inputs cannot be told apart.
+        The others run once more as they were: which of them have models depends on how the batch was
+        cut into episodes. ValueError where a seed has no other attempt.
         """
-        steps = len(explored.states) - 1
-        found = examine_excitation((explored.states, explored.actions[:steps]))
-        found.require()
-        seed = self.settings.all_seeds[m]
-        return [{"event": "excitation", "seed": seed, "remark": remark} for remark in found.remarks]
+        settings, rows = self.settings, []
+        for m, step in lost.items():
+            self.void[m] += 1
+            self.budget.count("identify", [m] * settings.explorations)
+            affordable = self._can_pay_for_exploration(m)
+            if self.void[m] > void_exploration.MOST or not affordable:
+                raise ValueError(
+                    void_exploration.no_model(settings, self.void[m], step, paid_up=not affordable)
+                )
+            paid = int(self.budget.paid[m])
+            rows.append(event_rows.diverged(settings, m, self.void[m], step, paid))
+        self.history += rows
+        return rows
 
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
@@ -292,17 +295,8 @@ class Training:
         for m, none, lqt in zip(self.pending, results[::CHECK], results[1::CHECK], strict=True):
             good = not lqt.diverged and lqt.cost < none.cost
             again = not good and self._can_explore_again(m)
-            rows.append(
-                {
-                    "event": "checked",
-                    "seed": self.settings.all_seeds[m],
-                    "none": none.cost,
-                    "lqt": lqt.cost,
-                    "diverged": {"none": int(none.diverged), "lqt": int(lqt.diverged)},
-                    "accepted": good,
-                    "again": again,
-                }
-            )
+            seed = self.settings.all_seeds[m]
+            rows.append(event_rows.checked(seed, none, lqt, good=good, again=again))
             self.worse[m] = not good
             if again:
                 self.attempts[m] += 1
@@ -318,10 +312,13 @@ class Training:
 
     def _can_explore_again(self, m: int) -> bool:
         """True if there are attempts left, and rollouts for another one and a step afterwards."""
+        more = self.attempts[m] + 1 < self.settings.identification_attempts
+        return more and self._can_pay_for_exploration(m)
+
+    def _can_pay_for_exploration(self, m: int) -> bool:
         settings = self.settings
-        return self.attempts[m] + 1 < settings.identification_attempts and self.budget.allows(
-            m, settings.explorations + CHECK + settings.step
-        )
+        check = CHECK * (settings.identification_attempts > 1)
+        return self.budget.allows(m, settings.explorations + check + settings.step)
 
     def _start_adapting(self) -> None:
         self.pending = []
@@ -385,14 +382,4 @@ class Training:
         self.ended = result.costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
         self.budget.count("evaluate", np.repeat(np.arange(settings.seeds), self.ended[0].size))
         self.phase = "done"
-        return [
-            {
-                "event": "evaluated",
-                "seed": seed,
-                **dict(zip(EVALUATED, costs.mean(axis=-1).tolist(), strict=True)),
-                "diverged": dict(zip(EVALUATED, lost.sum(axis=-1).tolist(), strict=True)),
-            }
-            for seed, costs, lost in zip(
-                self.settings.all_seeds, self.evaluation, self.ended != COMPLETED, strict=True
-            )
-        ]
+        return event_rows.evaluated(settings, self.evaluation, self.ended)

@@ -44,6 +44,7 @@ def arrays_of(training: Training) -> Arrays:
         "budget": training.budget.state(),
         "law_seen": np.array(training.law_seen),
         "worse": np.array(training.worse),
+        "void": np.array(training.void),
     }
     for m, rollouts in enumerate(training.measured):
         for i, rollout in enumerate(rollouts):
@@ -84,6 +85,8 @@ def _fill(training: Training, arrays: Arrays) -> None:
         raise ValueError("its number of steps is out of range")
     training.attempts = checked_array(arrays, "attempts", "i", (seeds,)).tolist()
     training.pending = checked_array(arrays, "pending", "i", (None,)).tolist()
+    if "void" in arrays:  # not in those of older versions
+        training.void = checked_array(arrays, "void", "i", (seeds,)).tolist()
     training.history = parse_json(str(checked_array(arrays, "history", "U", ())))
     training.worse = checked_array(arrays, "worse", "b", (seeds,)).tolist()
     n_z = None
@@ -119,7 +122,10 @@ def _check(training: Training) -> None:
     phase, pending, settings = training.phase, training.pending, training.settings
     if phase not in PHASES:
         raise ValueError(f"its phase is {shown(phase)}; expected one of {', '.join(PHASES)}")
-    if not set(pending) <= set(range(settings.seeds)) or min(training.attempts) < 0:
+    if (
+        not set(pending) <= set(range(settings.seeds))
+        or min([*training.attempts, *training.void]) < 0
+    ):
         raise ValueError("its seeds or attempts are out of range")
     check_history(training.history, settings.seed, settings.seeds)
     if training.models is None and phase != "identify":

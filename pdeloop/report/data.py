@@ -117,7 +117,7 @@ class ProblemData:
         return [
             {**row, "rollouts": row["rollouts"] - run.before[self.shown]}
             for row in run.result["history"]
-            if row["seed"] == run.seeds[self.shown]
+            if row["seed"] == run.seeds[self.shown] and row.get("event") != "diverged"
         ]
 
 
@@ -181,7 +181,8 @@ def _history(run: FinishedRun) -> list[Curve]:
     """The measured costs in the rows of the optimiser, whichever it is."""
     seeds = []
     for seed, before in zip(run.seeds, run.before, strict=True):
-        rows = [row for row in run.result["history"] if row["seed"] == seed]
+        own = [row for row in run.result["history"] if row["seed"] == seed]
+        rows = [row for row in own if row.get("event") != "diverged"]
         rows.sort(key=lambda row: int(row["rollouts"]))
         costs = np.array([row.get("cost", np.nan) for row in rows], dtype=np.float64)
         costs[~(np.abs(costs) < DIVERGED_COST)] = np.nan
@@ -224,12 +225,14 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
     if run.values["model"] or not run.rollouts:
         return None
     training = build_training({**run.values, "seed": run.seeds[shown], "seeds": 1})
-    attempts = run.rollouts[shown]["exploration"] // training.settings.explorations
-    training.attempts = [attempts - 1]
+    explored = run.rollouts[shown]["exploration"] // training.settings.explorations
+    seed, rows = run.seeds[shown], run.result["history"]
+    void = sum(row["seed"] == seed and row.get("event") == "diverged" for row in rows)
+    training.attempts, training.void = [explored - 1 - void], [void]
     batch = training.next_batch()
     assert batch is not None
-    explored = LocalPair(run.values, plant).roll_out(batch)
-    pairs = zip(explored.states.swapaxes(0, 1), explored.actions.swapaxes(0, 1), strict=True)
+    episode = LocalPair(run.values, plant).roll_out(batch)
+    pairs = zip(episode.states.swapaxes(0, 1), episode.actions.swapaxes(0, 1), strict=True)
     try:
         return study_orders(list(pairs))
     except ValueError:  # too few steps to hold some out

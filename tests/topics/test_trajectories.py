@@ -38,6 +38,17 @@ def test_a_law_from_two_explorations_and_fresh_fields_is_that_of_one_process(
     assert_same_training(out, train_here(parameters(**options)))
 
 
+def test_an_exploration_that_diverges_is_repeated_as_in_one_process(loop: Processes, tmp_path):
+    """One of two seeds diverges, in an episode of its own; here and there it is as strong."""
+    options = {"iterations": 2, "optimizer": "two_point", "seeds": 2, "exploration_variance": 100.0}
+    out = tmp_path / "run"
+    start_pair(loop, divergence_bound=3.2)
+    loop.wait(start_tuner(loop, out, **options, max_batch=1, divergence_bound=3.2), LIMIT)
+    there = train_here(parameters(**options, divergence_bound=3.2))
+    assert [row["seed"] for row in there.history if row["event"] == "diverged"] == [0]
+    assert_same_training(out, there)
+
+
 WRONG_SHAPES = """
 from dataclasses import replace
 import time

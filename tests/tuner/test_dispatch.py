@@ -308,6 +308,49 @@ def test_no_result_of_an_attempt_that_failed_is_used(first):
     assert result is not None and same_bits(result.models, model_of(again, 2.0).values)
 
 
+def diverged(frame: Frame) -> Frame:
+    """The cost of an episode whose first row diverged at step 7."""
+    cost = costs_of(frame)
+    cost.values[0, -1] = 7.0
+    return cost
+
+
+@pytest.mark.parametrize("first", ["cost", "failure"])
+def test_an_exploration_that_diverged_is_a_result_without_a_model(first):
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
+    failure = ModelFailure(RUN, start.episode, False, "the plant diverged")
+    if first == "cost":
+        served.cost(0, diverged(start), 0.0)
+        assert served.result() is None  # the reason is on its way
+        served.failure(0, failure, 0.0)
+    else:
+        served.failure(0, failure, 0.0)
+        assert served.result() is None
+        served.cost(0, diverged(start), 0.0)
+    result = served.result()
+    assert result.models is None and same_bits(result.costs, diverged(start).values)
+    ((_, again),) = starts(served.assign(EXPLORATION, 0.0))
+    assert served.failure(0, failure, 0.0) == []  # said once more, as its start was repeated
+    served.cost(0, costs_of(again), 0.0)
+    served.model(0, model_of(again), 0.0)
+    assert same_bits(served.result().models, model_of(again).values)
+
+
+def test_where_one_episode_diverged_no_model_of_the_others_is_given():
+    """Otherwise it would depend on the number of pairs which models there are."""
+    served = dispatcher(2)
+    rows = np.array([[3.0, 4.0, 0.1, 0.0], [5.0, 6.0, 0.1, 1.0]])
+    sent = starts(served.assign(Batch(rows, None), 0.0))
+    (bad, first), (good, second) = sent
+    served.cost(bad, diverged(first), 0.0)
+    served.failure(bad, ModelFailure(RUN, first.episode, False, "the plant diverged"), 0.0)
+    served.cost(good, costs_of(second), 0.0)
+    served.model(good, model_of(second), 0.0)
+    result = served.result()
+    assert result.models is None and result.costs[:, -1].tolist() == [7.0, COMPLETED]
+
+
 @pytest.mark.parametrize("retry", [True, False])
 def test_a_failed_model_of_another_run_neither_ends_nor_repeats_an_episode(retry):
     served = dispatcher()
@@ -448,8 +491,9 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     assert result is not None
     assert result.models is not None
     ((_, last),) = starts(served.assign(EXPLORATION, 0.0))
+    assert served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0) == []
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
-        served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
+        served.cost(0, costs_of(last), 0.0)
     with pytest.raises(
         DispatchError, match=f"withdrew episode {episode_name(again.episode)}.*two st"
     ):

@@ -1,0 +1,70 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Rows of progress.jsonl about what happened in a training. Pure."""
+
+from typing import Any
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.topics import COMPLETED
+from loop_method.adapt import RolloutResult
+from tuner_node.batch import TrainingSettings
+from tuner_node.rollouts import EVALUATED
+from tuner_node.void_exploration import variance
+
+Row = dict[str, Any]
+
+
+def diverged(settings: TrainingSettings, m: int, void: int, step: int, paid: int) -> Row:
+    """A void exploration of the m-th seed, also a row of the history.
+
+    void: how many the seed has had with this one; step: the one at which the plant diverged; paid:
+    rollouts of the seed so far.
+    """
+    return {
+        "event": "diverged",
+        "seed": settings.all_seeds[m],
+        "step": step,
+        "variance": variance(settings, void - 1),
+        "next_variance": variance(settings, void),
+        "rollouts": paid,
+    }
+
+
+def designed(seed: int, attempt: int, model: Array, A: Array) -> Row:
+    """A reduced model was identified, and a law designed for it."""
+    return {
+        "event": "designed",
+        "seed": seed,
+        "attempt": attempt,
+        "reduced_order": model.shape[1],
+        "spectral_radius": float(np.abs(np.linalg.eigvals(A)).max()),
+    }
+
+
+def checked(seed: int, none: RolloutResult, lqt: RolloutResult, *, good: bool, again: bool) -> Row:
+    """No control and the first law were compared on one field."""
+    return {
+        "event": "checked",
+        "seed": seed,
+        "none": none.cost,
+        "lqt": lqt.cost,
+        "diverged": {"none": int(none.diverged), "lqt": int(lqt.diverged)},
+        "accepted": good,
+        "again": again,
+    }
+
+
+def evaluated(settings: TrainingSettings, evaluation: Array, ended: Array) -> list[Row]:
+    """The closing evaluation of each seed; evaluation, ended: see Training."""
+    return [
+        {
+            "event": "evaluated",
+            "seed": seed,
+            **dict(zip(EVALUATED, costs.mean(axis=-1).tolist(), strict=True)),
+            "diverged": dict(zip(EVALUATED, lost.sum(axis=-1).tolist(), strict=True)),
+        }
+        for seed, costs, lost in zip(
+            settings.all_seeds, evaluation, ended != COMPLETED, strict=True
+        )
+    ]

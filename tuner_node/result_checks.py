@@ -1,0 +1,34 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Checks of what episodes gave that do not depend on the state of a training. Pure."""
+
+from typing import Any
+
+from loop_method.adapt import Trajectory
+from loop_method.reduce.identifiability import examine_excitation
+from tuner_node.batch import BatchResult
+from tuner_node.errors import ContradictionError
+
+
+def same_steps(result: BatchResult, known: int) -> int:
+    """The steps of an episode. ContradictionError if not all of this run have as many.
+
+    known: those of the episodes before; 0: there were none.
+    """
+    steps = sorted({*result.steps, *([known] if known else [])})
+    if len(steps) > 1:
+        raise ContradictionError(
+            f"episodes of this run ended after {' and '.join(map(str, steps))} steps, expected "
+            "one horizon: stop the other publisher of episode/cost and start a new run"
+        )
+    return next(iter(steps), 0)
+
+
+def check_excitation(explored: Trajectory, seed: int) -> list[dict[str, Any]]:
+    """History rows about what an exploration hardly determines, whatever drew its actions.
+
+    NotIdentifiableError if the effects of its inputs cannot be told apart.
+    """
+    steps = len(explored.states) - 1
+    found = examine_excitation((explored.states, explored.actions[:steps]))
+    found.require()
+    return [{"event": "excitation", "seed": seed, "remark": remark} for remark in found.remarks]
