@@ -276,7 +276,7 @@ def drawn_choice(
         if row < OF_FRACTIONS:
             differences = table.model[row, fields] - table.model[stays, fields]
             change = mean_of(differences)
-        return Evidence(change, np.where(np.isnan(excess), np.inf, excess))
+        return Evidence(change, np.where(np.isnan(excess), np.inf, excess), (change,))
 
     rows = {FIRST: 1, NONE: 0, ADAPTED: adapted}
     measured = {FIRST: known[-table.of_first :], NONE: on_none, ADAPTED: own}

@@ -35,6 +35,7 @@ from loop_method.adapt.verdict import (
     Evidence,
     Verdict,
     choose,
+    evidence_against_none,
     evidence_of,
     evidence_of_pairs,
     size_of,
@@ -147,11 +148,16 @@ class Comparison:
             )
             for name in dict.fromkeys(self.names)
         }
+        known = [r for r in known if r.usable or r.stamp >= 0]  # without the exploration
+        before = np.array([r.cost for r in known if np.array_equal(r.policy, laws[self.base])])
+        gain = gain_of_steps(known, laws, self.base)
+        also = {} if gain is None else {ADAPTED: [gain]}
+        if self.base in costs and self.base == NONE:
+            return evidence_against_none(costs, before, also)
         if self.base in costs:
             return evidence_of_pairs(costs, self.base)
-        before = [r.cost for r in known if np.array_equal(r.policy, laws[self.base])]
-        costs[self.base] = np.array(before)
-        return {name: Evidence(ZERO, own) for name, own in costs.items()}
+        costs[self.base] = before
+        return {name: Evidence(ZERO, own, also.get(name, ())) for name, own in costs.items()}
 
     def state(self) -> State:
         """The arrays of a checkpoint."""
@@ -279,7 +285,11 @@ def on_same_fields(
     if count < LEAST:
         names, count = [], 0
     every = [name for name in names for _ in range(count)]
-    return Comparison(laws[ADAPTED], base, every, list(numbers[:count]) * len(names))
+    fields = list(numbers[:count]) * len(names)
+    if base == NONE and NONE in names:  # all of its rollouts count, also one on a field of its own
+        rest = list(numbers[count:])[: len(numbers) % len(names)]
+        every, fields = every + [NONE] * len(rest), fields + rest
+    return Comparison(laws[ADAPTED], base, every, fields)
 
 
 def rollouts_to_keep(

@@ -34,6 +34,7 @@ from loop_method.adapt.verdict import (
     NONE,
     Verdict,
     choose,
+    evidence_against_none,
     evidence_of_pairs,
     size_of,
 )
@@ -169,12 +170,19 @@ class ModelBasedSensed(ModelBasedReadings):
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Decide between the final law and the one to stay with on the same fields."""
         judged = self._records.all()[-self._schedule.judging :]
-        own = [record.cost for record in judged if np.array_equal(record.policy, final)]
-        pairs = list(zip(own, (record.cost for record in self._of(stays)), strict=False))
-        if len(pairs) < FEWEST:
+        own = np.array([record.cost for record in judged if np.array_equal(record.policy, final)])
+        known = np.array([record.cost for record in self._of(stays)])
+        count = min(len(own), len(known))
+        if count < FEWEST:
             return
-        costs = dict(zip((ADAPTED, base), np.array(pairs).T, strict=True))
-        measured = choose(evidence_of_pairs(costs, base), base, self._settings.confidence)
+        costs, others = {ADAPTED: own[:count], base: known[:count]}, known[count:]
+        if base == NONE:
+            before = [r for r in self._context.measured if r.usable and not r.policy.any()]
+            others = np.concatenate([others, [record.cost for record in before]])
+            evidence = evidence_against_none(costs, others, {ADAPTED: [self._progress.change]})
+        else:
+            evidence = evidence_of_pairs(costs, base)
+        measured = choose(evidence, base, self._settings.confidence)
         self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
         self._report(row, measured)
 

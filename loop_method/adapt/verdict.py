@@ -12,6 +12,10 @@ difference of two laws has little variance; for the final law, which was compute
 the mean is over held-out fields.
 
 The rule accounts for how well the error of few rollouts is known (`estimate`).
+
+A first law was designed for the plant, and is given up only for one that is better by more than chance.
+No control was not: what chance may explain is settled there by the expected cost, if all that is known
+of it says the same.
 """
 
 from __future__ import annotations
@@ -24,11 +28,12 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.estimate import ZERO, Estimate, mean_of
+from loop_method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
 NAMES = {FIRST: "the first law", ADAPTED: "the adapted law", NONE: "no control"}
 NO_OTHER = "no other law is better by more than chance"
+ALL_AGREE = "which chance may explain, but every estimate says so"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +47,14 @@ class Evidence:
         not make it.
     excess : (k,) array
         Measured less model cost of its own rollouts; infinite where one diverged.
+    also : sequence of Estimate
+        What else is known of the same change, too uncertain or too much in favour of the law to decide
+        by itself.
     """
 
     change: Estimate
     excess: Array
+    also: Sequence[Estimate] = ()
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,8 @@ class Verdict:
 def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
     """The law with the least cost, and `base` where the difference may be chance.
 
+    Where `base` is no control, another law is taken in spite of that if every estimate favours it.
+
     confidence: standard errors by which another law has to be better, were they known exactly.
     """
     stays = Verdict(base, 0.0, 0.0, NO_OTHER)
@@ -68,6 +79,7 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
     lost = bool(np.isinf(evidence[base].excess).any())
     of_base = _correction(evidence[base])
     found: list[Verdict] = []
+    likely: list[Verdict] = []
     for name, own in evidence.items():
         if name == base or not np.isfinite(own.change.value):
             continue
@@ -84,9 +96,11 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
             found.append(Verdict(name, *size, size_of(name, base, *size)))
         else:
             missed.append(size_of(name, base, *size))
+            if base == NONE and own.also and all(e.value < 0.0 for e in (change, *own.also)):
+                likely.append(Verdict(name, *size, f"{missed[-1]}, {ALL_AGREE}"))
     if missed and stays.reason == NO_OTHER:
         stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
-    return min(found, key=lambda verdict: verdict.change, default=stays)
+    return min(found or likely, key=lambda verdict: verdict.change, default=stays)
 
 
 def size_of(name: str, base: str, change: float, deviation: float) -> str:
@@ -137,7 +151,7 @@ def evidence_of(
                 differences = loop.costs(loop.theta(law), fields) - stay
             known = bool(np.isfinite(differences).all())
             change = mean_of(differences) if known else Estimate(np.inf)
-        evidence[name] = Evidence(change, excess)
+        evidence[name] = Evidence(change, excess, (change,))
     return evidence
 
 
@@ -151,6 +165,33 @@ def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Eviden
         known = np.isfinite(own) & np.isfinite(costs[base])
         difference = mean_of((own - costs[base])[known]) if known.any() else ZERO
         evidence[name] = Evidence(difference, own[np.isinf(own)])
+    return evidence
+
+
+def evidence_against_none(
+    costs: Mapping[str, Array], others: Array, known: Mapping[str, Sequence[Estimate]]
+) -> dict[str, Evidence]:
+    """The evidence of rollouts alone against no control, all of whose rollouts count.
+
+    Its costs vary from field to field, and those of a law that controls the plant hardly do: the error
+    of a pair is that of a single rollout of no control, however many others there are.
+
+    costs: as of `evidence_of_pairs`, and after those of the other laws' fields further ones of no
+    control; others: its costs from before; known: what else is known of the change by a law.
+    """
+    none = np.concatenate([costs[NONE], others])
+    evidence = {NONE: Evidence(ZERO, none[np.isinf(none)])}
+    for name, own in costs.items():
+        if name == NONE:
+            continue
+        came = np.isfinite(own) & np.isfinite(none[: len(own)])
+        before, further = none[: len(own)][came], none[len(own) :]
+        change, pairs = ZERO, ZERO
+        if came.any():
+            change = mean_difference(own[came], before, further[np.isfinite(further)])
+            pairs = mean_of(own[came] - before)
+        also = known.get(name, ())
+        evidence[name] = Evidence(change, own[np.isinf(own)], (pairs, *also) if also else ())
     return evidence
 
 

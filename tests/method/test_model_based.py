@@ -12,11 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
+from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from loop_method.adapt.estimate import ZERO, Estimate, mean_of
 from loop_method.adapt.renewal import choose_fraction, held_out_fraction
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
+from loop_method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    Evidence,
+    choose,
+    evidence_of,
+)
 from loop_method.design.lqt import track
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits
@@ -207,8 +214,16 @@ def test_a_large_budget_ends_once_the_fields_are_known() -> None:
 class Costs:
     """A loop whose costs from field i under the law theta are given by a function."""
 
+    replays = False
+
     def __init__(self, cost: Callable[[float, int], float]) -> None:
         self._cost = cost
+
+    def theta(self, policy: np.ndarray) -> np.ndarray:
+        return policy
+
+    def beginnings(self, records: list[Record]) -> np.ndarray:
+        return np.stack([record.states[0] for record in records])
 
     def costs(self, theta: np.ndarray, fields: np.ndarray) -> np.ndarray:
         return np.array([self._cost(float(theta[0, 0]), int(field[0])) for field in fields])
@@ -285,6 +300,22 @@ def test_the_first_law_is_preferred_unless_the_evidence_says_otherwise(
     verdict = choose({FIRST: evidence(0.0, 0.0, 0.0, 0.0)} | known, FIRST, 1.0)
     assert verdict.chosen == chosen and verdict.reason
     assert np.isfinite([verdict.change, verdict.deviation]).all()
+
+
+@pytest.mark.parametrize("base", [FIRST, NONE])
+@pytest.mark.parametrize(("held_out", "excess"), [(-2.0, 1.0), (-2.0, 3.0), (0.5, -2.0)])
+def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, excess: float) -> None:
+    """A law takes its place where model and measurements favour it; the first law stays."""
+    loop: Any = Costs(lambda x, i: 10.0 + i)
+    laws = {base: np.zeros((1, 1)), ADAPTED: np.ones((1, 1))}
+    fields = np.arange(6.0)[:, None]
+    seen = [  # by chance much more or less than on the model
+        Record(laws[ADAPTED], 10.0 + i + excess + 9.0 * (-1.0) ** i, fields[i : i + 1], fields[:0])
+        for i in range(4)
+    ]
+    known = evidence_of(loop, laws, base, seen, fields, Estimate(held_out, 0.1, 20.0))
+    favoured = held_out < 0.0 and held_out + excess < 0.0
+    assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
 
 
 def test_the_reason_says_by_how_much() -> None:

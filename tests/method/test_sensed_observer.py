@@ -291,6 +291,27 @@ def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields
     assert {each.field_seed for each in judged} == {each.field_seed for each in asked}
 
 
+def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
+    """Of three pairs chance explains the difference, of all of its rollouts it does not."""
+    own, row = optimiser(rollouts=7, judging=3), {}
+    asked = own.ask()
+    result = measured(asked[0])
+    own.tell([result, *map(measured, asked[1:])])
+    assert not own._progress.safe
+    final, checked = own._progress.policy, [70.0, np.inf]  # before, and in an exploration
+    few = np.zeros((1, SENSORS)), np.zeros((0, N_A))
+    own._context = replace(
+        own._context, measured=[Record(own._none, cost, *few) for cost in checked]
+    )
+    known, costs = [34.0, 47.0, 103.0, 47.0, 93.0, 113.0], [55.0, 52.0, 48.0]
+    for law, every in ((own._none, known), (final, costs)):
+        for cost in every:
+            own._records.add(law, replace(result, cost=cost), set())
+    own._judge(row)
+    assert row["chosen"] == "adapted"
+    assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
+
+
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
     better = optimiser()
     better.tell([measured(asked) for asked in better.ask()])
