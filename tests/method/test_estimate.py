@@ -95,7 +95,7 @@ def test_fields_that_cost_one_law_more_and_the_other_less_add_to_the_error() -> 
     """By as much as in pairs, where there are no others."""
     own, before, none = np.array([3.0, 1.0, 2.0]), np.array([5.0, 9.0, 7.0]), np.zeros(0)
     assert mean_difference(own, before, none).error == pytest.approx(mean_of(own - before).error)
-    alike = mean_difference(own, before[::-1], none)
+    alike = mean_difference(own, 14.0 - before, none)
     assert alike.error == pytest.approx((mean_of(own) - mean_of(before)).error)
 
 
