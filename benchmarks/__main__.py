@@ -40,6 +40,7 @@ PROGRAMS = {
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
     "estimator": "cost of an estimator with the true plant, few sensors and noise",
     "few_sensors": "trainings with few sensors and noise, seed by seed",
+    "hidden_noise": "trainings whose noise is not declared, or wrongly, seed by seed",
     "linearised": "cost of the LQR law of the exact linearisation at the target",
     "environments": "steps per second of the Gymnasium environments",
     "participants": "memory and processor time of many idle nodes",

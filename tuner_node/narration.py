@@ -244,17 +244,30 @@ def warnings(summary: Row) -> list[str]:
 
 
 def misjudged_noise(summary: Row) -> list[str]:
-    """The measurement noise that was found where another, or none, was declared."""
+    """The measurement noise that was found, or is suspected, where another, or none, was declared."""
     noise = summary.get("noise", {})
-    if not (found := [one for one in noise.get("found", []) if one]):
+    if not noise:  # a result of an older version
         return []
     declared = f"{noise['declared']:.2g}" if noise["declared"] else "none"
-    seeds = summary["seeds"]
-    of_seeds = f" for {len(found)} of {seeds} seeds" if seeds > 1 else ""
-    return [
-        f"measurement noise of about {span(found, '.2g')} was found{of_seeds}, and {declared} was "
-        "declared (measurement_noise): the optimiser accounted for it, the first law did not"
-    ]
+    said = []
+    if found := [one for one in noise["found"] if one]:
+        said.append(
+            f"measurement noise of about {span(found, '.2g')} was found{_share(found, summary)}, and "
+            f"{declared} was declared (measurement_noise): the optimiser accounted for it"
+        )
+    if seeming := [one for one in noise.get("seeming", []) if one]:
+        about = "at most" if max(seeming) < noise["declared"] else "about"
+        said.append(
+            f"the readings seem to have measurement noise of {about} {span(seeming, '.2g')}"
+            f"{_share(seeming, summary)}, and {declared} was declared: the optimiser did not account "
+            "for it; if the sensors are as noisy, set measurement_noise and train again"
+        )
+    return said
+
+
+def _share(found: Sequence[float], summary: Row) -> str:
+    """For how many seeds, in words; empty for one alone."""
+    return f" for {len(found)} of {summary['seeds']} seeds" if summary["seeds"] > 1 else ""
 
 
 def costlier_than_none(summary: Row) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Affine
 from tuner_node.budget import PURPOSES
+from tuner_node.readings import found_noise, seeming_noise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
@@ -53,9 +54,9 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError("its 'versions' or 'environment' are not a table of texts")
     noise = content.get("noise", {"declared": 0.0, "found": []})
     if not isinstance(noise, dict) or not _numbers(
-        [noise.get("declared"), *noise.get("found", [])]
+        [noise.get("declared")], *(noise.get(name, []) for name in ("found", "seeming"))
     ):
-        raise ValueError("its 'noise' has other entries than numbers 'declared' and 'found'")
+        raise ValueError("its 'noise' has other entries than numbers")
     outcome = content.get("outcome", [])
     if not isinstance(outcome, list) or not all(
         isinstance(own, dict) and _outcome(own) for own in outcome
@@ -125,9 +126,9 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
-    one it began with; noise: the measurement noise that was declared, and what each optimiser found in
-    its place, 0 where nothing else; outcome: what came of each seed, and why, as its optimiser says,
-    also why it left rollouts over.
+    one it began with; noise: the measurement noise that was declared, what each optimiser found in its
+    place, 0 where nothing else, and what readings seem to have where it found none; outcome: what came
+    of each seed, and why, as its optimiser says, also why it left rollouts over.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
@@ -156,6 +157,7 @@ def summarise(training: Training) -> dict[str, Any]:
         "noise": {
             "declared": training.settings.measurement_noise,
             "found": [found_noise(training.history, seed) for seed in training.settings.all_seeds],
+            "seeming": [seeming_noise(training, m) for m in range(training.settings.seeds)],
         },
         "outcome": [
             {
@@ -213,12 +215,6 @@ def last_reason(history: Sequence[Mapping[str, Any]], seed: int) -> str:
     """The last reason that the optimiser of a seed gave; empty: none."""
     given = [str(row["reason"]) for row in history if row["seed"] == seed and row.get("reason")]
     return given[-1] if given else ""
-
-
-def found_noise(history: Sequence[Mapping[str, Any]], seed: int) -> float:
-    """The measurement noise that the optimiser of a seed found, and was not declared; 0: none."""
-    found = [float(row["noise"]) for row in history if row["seed"] == seed and "noise" in row]
-    return found[-1] if found else 0.0
 
 
 def early_end(training: Training, m: int) -> str:

@@ -19,6 +19,7 @@ from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.settings import GaussNewtonSettings
+from loop_method.adapt.undeclared_noise import believe_in_noise
 
 DEFAULTS = GaussNewtonSettings()
 
@@ -28,18 +29,22 @@ def field_model(
     data: Sequence[Record],
     first: str,
     settings: GaussNewtonSettings = DEFAULTS,
-) -> tuple[Belief | None, bool]:
-    """The model of the whole field that predicts the rollouts, and whether it does as a whole.
+) -> tuple[Belief | None, bool, float]:
+    """The model of the whole field that predicts the rollouts, whether it does as a whole, and noise.
 
-    first: the kind to try first.
+    first: the kind to try first. The noise is that for which the model was fitted where another one, or
+    none, was declared; 0: as declared. It is looked for before models of pieces, which are short enough
+    to be predicted even where noise was taken for the field.
     """
     most = settings.believed_noisy if context.noise else settings.believed
     whole = believe(context, data, first)
+    if (found := believe_in_noise(context, data, whole, settings)) is not None:
+        return found[0], True, found[1]
     if whole is None or whole.error <= most:
-        return whole, True
+        return whole, True, 0.0
     parts = believe(context, data, first, settings.pieces)
     chaotic = parts is not None and parts.error <= min(most, whole.error / settings.chaotic_growth)
-    return (parts if chaotic else None), False
+    return (parts if chaotic else None), False, 0.0
 
 
 def propose(

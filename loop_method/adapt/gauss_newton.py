@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
@@ -215,30 +214,29 @@ class GaussNewton(Optimizer):
             self._propose(row)
         if self._verdict and self.done:
             self._finish(row)
+        if self._proposer.found:
+            row["noise"] = self._proposer.found
         return row
 
     def state(self) -> State:
         """The policies, the decisions that are pending, and the remembered trajectories."""
-        sensed = self._proposer.sensed
-        equation = {"equation": sensed.equation.copy()} if sensed else {}
         last = self._comparison.state() if self._comparison is not None else {}
         return {
             **self._now.arrays(),
-            **equation,
+            **self._proposer.state(),
             **self._records.state(),
             **{_LAST + name: array for name, array in last.items()},
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
-        now, sensed = self._now.later(state), self._proposer.sensed
+        now = self._now.later(state)
         last = Comparison.of(part_of(state, _LAST), self._first.shape, self._context)
         self._records.restore(state, len(self._proposer.loop.U), self._now.policy.shape)
         if missing := now.referred - {record.stamp for record in self._records.all()}:
             raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
+        self._proposer.restore(state)
         self._now, self._comparison = now, last
-        if sensed:
-            sensed.equation = checked_array(state, "equation", "f", sensed.equation.shape).copy()
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, int(self._now.fields[slot])))

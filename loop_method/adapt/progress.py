@@ -106,12 +106,12 @@ class Progress:
             begun=int(checked_array(state, "begun", "i", ())),
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
-            noise=_noise_of(state),
+            noise=noise_of(state),
         )
 
 
-def _noise_of(state: Mapping[str, NDArray[np.generic]]) -> float:
-    """ValueError for a standard deviation that is negative."""
+def noise_of(state: Mapping[str, NDArray[np.generic]]) -> float:
+    """The noise that was found, 0: none; ValueError for a standard deviation that is negative."""
     noise = float(checked_array(state, "noise", "f", ()))
     if noise < 0.0:
         raise ValueError(f"its noise is {noise:g}; expected 0 or more")

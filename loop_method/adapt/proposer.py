@@ -12,17 +12,21 @@ A proposal is of the first of three kinds that applies:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
+from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt import field_step, local_step
-from loop_method.adapt.base import Context, Record
+from loop_method.adapt.base import Context, Record, State
+from loop_method.adapt.belief import Belief
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.final_comparison import Comparison, Laws, on_model
+from loop_method.adapt.progress import noise_of
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.sensed_step import SensedProposals
@@ -49,7 +53,11 @@ class Proposer:
         The closed loop and its cost.
     sensed : SensedProposals or None
         None where the states are not one reading of each of a few sensors.
+    found : float
+        Measurement noise that a model showed, and was not declared; 0: none.
     """
+
+    found = 0.0
 
     def __init__(
         self, context: Context, policy: Array, settings: GaussNewtonSettings | None = None
@@ -77,6 +85,7 @@ class Proposer:
         # Few readings cannot be denoised; the fits to them account for the noise.
         self._noise = 0.0 if context.sensors else context.noise
         self._context = replace(context, noise=self._noise)
+        self._declared = self._noise
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
         self._measured = [exploration, *context.measured]
@@ -90,6 +99,28 @@ class Proposer:
             self.sensed = SensedProposals(
                 *(self.loop, actuators, context.noise, largest_cost, context.field_models), settings
             )
+
+    def state(self) -> State:
+        """What proposals depend on besides rollouts: the noise, and the equation between sensors."""
+        noise = {"noise": np.array(self.found)} if self.found else {}
+        return noise | ({"equation": self.sensed.equation.copy()} if self.sensed else {})
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint; ValueError if it is not one."""
+        found = noise_of(state) if "noise" in state else 0.0
+        if self.sensed:
+            shape = self.sensed.equation.shape
+            self.sensed.equation = checked_array(state, "equation", "f", shape).copy()
+        self._take_noise(found)
+
+    def _take_noise(self, noise: float) -> None:
+        """Go on as if this measurement noise had been declared; 0: it was as declared."""
+        if noise == self.found:
+            return
+        self.found, self._noise = noise, noise or self._declared
+        self._context = replace(self._context, noise=self._noise)
+        self._cleaned.clear()
+        self._before = [self._clean(record) for record in self._measured]
 
     def propose(
         self,
@@ -118,28 +149,18 @@ class Proposer:
         first : str or None
             Kind of the model of the whole field to try first; None: try none.
         """
-        loop = self.loop
-        measured = self._measurements(records)
-        records = [self._clean(record) for record in records]
-        incumbents = [self._clean(record) for record in incumbents]
-        compared = [other and self._clean(other) for other in compared]
-        data = [record for record in (*self._before, *records) if len(record.states) > 1]
-        rejected = (
-            [] if accepted else [(i, o) for i, o in zip(incumbents, compared, strict=True) if o]
-        )
-        policy = incumbents[0].policy
+        measured, policy = self._measurements(records), incumbents[0].policy
         if self.sensed is not None:
-            proposal = self.sensed.propose(data, policy, damping)
+            proposal = self.sensed.propose(self._data(records), policy, damping)
             if proposal is not None:
                 return proposal
-        # A rollout counts less in a fit, the more it costs above the incumbent's.
-        level = loop.mean_cost_of(incumbents)
-        shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         believed, whole = "", False
         if first is not None:
-            belief, whole = field_step.field_model(self._context, measured, first, self._settings)
+            belief, whole = self._field_model(measured, first)
             if belief is not None:
                 believed = belief.model.kind
+                pairs = [] if accepted else zip(incumbents, compared, strict=True)
+                rejected = [(self._clean(i), self._clean(o)) for i, o in pairs if o]
                 if (
                     not rejected
                     or not whole
@@ -149,6 +170,13 @@ class Proposer:
                     return field_step.propose(
                         *(self._context, belief, whole, known, policy, damping, self._settings),
                     )
+        # What was measured is denoised once it is known how noisy it is.
+        data, loop = self._data(records), self.loop
+        incumbents = [self._clean(record) for record in incumbents]
+        compared = [other and self._clean(other) for other in compared]
+        # A rollout counts less in a fit, the more it costs above the incumbent's.
+        level = loop.mean_cost_of(incumbents)
+        shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         proposal = local_step.propose(
             *(loop, data, shares, incumbents, compared),
             damping=damping,
@@ -170,7 +198,7 @@ class Proposer:
         records : as of `propose`; believed : kind of the model to try first.
         """
         measured = self._measurements(records)
-        belief, whole = field_step.field_model(self._context, measured, believed, self._settings)
+        belief, whole = self._field_model(measured, believed)
         if belief is None or not whole:
             return None
         known = self._without_noise(measured)
@@ -186,6 +214,19 @@ class Proposer:
         every = self._without_noise([*(measured := self._measurements(before)), *fresh])
         known, new = every[: len(measured)], every[len(measured) :]
         return last.verdict(self._context, laws, known, new, self._settings.confidence)
+
+    def _field_model(self, measured: Sequence[Record], first: str) -> tuple[Belief | None, bool]:
+        """As `field_step.field_model`, whose noise counts from now on."""
+        known = self._context, measured, first, self._settings
+        belief, whole, noise = field_step.field_model(*known)
+        if noise:
+            self._take_noise(noise)
+        return belief, whole
+
+    def _data(self, records: Sequence[Record]) -> list[Record]:
+        """All rollouts of more than a state, denoised."""
+        every = (*self._before, *map(self._clean, records))
+        return [record for record in every if len(record.states) > 1]
 
     def _measurements(self, records: Sequence[Record]) -> list[Record]:
         """All rollouts of more than a state, as they were measured."""

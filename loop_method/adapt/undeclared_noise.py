@@ -22,14 +22,11 @@ def believe_in_noise(
 ) -> tuple[Belief, float] | None:
     """A model and the noise that it shows, or None to go on with the declared noise.
 
-    belief: with the declared noise. Without any, a model that is believed ends the search, whatever the
-    data look like.
+    belief: with the declared noise.
     """
     if context.sensors or context.shape or not context.line:
         return None
     declared, error = context.noise, np.inf if belief is None else belief.error
-    if not declared and error <= settings.believed:
-        return None
     found = fit_undeclared_noise(
         [Measured(record.states, record.actions) for record in records if len(record.actions)],
         context.target,

@@ -42,6 +42,7 @@ from loop_method.models.base import Law, saturated
 from loop_method.models.denoising import smoothed
 from loop_method.models.prediction import predicted
 from loop_method.models.settings import DEFAULTS as MODEL_DEFAULTS
+from loop_method.models.undeclared_noise import fit_undeclared_noise
 from loop_method.reduce.reduced_model import Trajectory, pieces
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
@@ -59,12 +60,16 @@ class FieldLaw:
     cost, other_cost : float
         Mean stage costs that the model predicts from the initial fields of the trajectories, of its
         law and of the law to compare with; infinite where there is none, or it diverges.
+    noise : float
+        Measurement noise that the model was fitted for where another one, or none, was declared; 0:
+        what was declared.
     """
 
     fitted: FittedModel | None
     rows: ModelRows | None = None
     cost: float = np.inf
     other_cost: float = np.inf
+    noise: float = 0.0
 
     @property
     def better(self) -> bool:
@@ -79,6 +84,7 @@ class FieldLaw:
             "error": fitted and fitted.error,
             "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
             "believed": self.rows is not None,
+            "noise": self.noise,
             "predicted_cost": _number(self.cost),
             "predicted_cost_of_regression": _number(self.other_cost),
             "law": "field" if self.better else "regression",
@@ -94,6 +100,11 @@ class FieldLaw:
             "predicting the data",
             f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
         ]
+        if self.noise:
+            lines.append(
+                f"  measurement noise of about {self.noise:.2g} was found, which was not declared "
+                "(measurement_noise): the model was fitted for it"
+            )
         if self.rows is None:
             return [*lines, "  it is not accurate enough: the law is that of the regression"]
         taken = "its law is used" if self.better else "the law of the regression is used"
@@ -118,25 +129,37 @@ def best_model(
     settings: IdentificationSettings = DEFAULTS,
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
-) -> FittedModel | None:
-    """The model of the whole field that predicts the trajectories best, or pieces of them.
+) -> tuple[FittedModel | None, float]:
+    """The model of the whole field that predicts trajectories best, or pieces of them, and the noise.
 
-    Pieces, because the state of a chaotic plant soon becomes independent of its initial field. The work
-    grows with the third power of the size of the state, so there is a largest one.
+    Pieces, because the state of a chaotic plant soon becomes independent of its initial field. They are
+    predicted even by models that take noise for the field, so noise that was not declared is
+    looked for before. The work grows with the third power of the size of the state, so there is a
+    largest one.
     """
     if len(target) > settings.field_largest:
-        return None
-    best: FittedModel | None = None
-    for parts in (trajectories, pieces(trajectories, settings.field_pieces)):
-        rollouts = [Measured(z, a) for z, a in parts if len(a)]
-        found = fit_field_model(
-            rollouts, target, action_limit=action_limit, noise=noise, settings=models
-        )
-        if found is not None and (best is None or found.error < best.error):
-            best = found
-        if best is not None and best.error <= settings.field_error:
-            break
-    return best
+        return None, noise
+    rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
+    whole = fit_field_model(
+        rollouts, target, action_limit=action_limit, noise=noise, settings=models
+    )
+    error = np.inf if whole is None else whole.error
+    misjudged = fit_undeclared_noise(
+        rollouts,
+        target,
+        settings=models,
+        most=settings.field_error,
+        better_than=np.inf if noise else error,
+        declared=noise,
+        action_limit=action_limit,
+    )
+    if misjudged is not None:
+        return misjudged
+    if error <= settings.field_error:
+        return whole, noise
+    parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
+    found = fit_field_model(parts, target, action_limit=action_limit, noise=noise, settings=models)
+    return (found if found is not None and found.error < error else whole), noise
 
 
 def field_law(
@@ -175,14 +198,16 @@ def field_law(
     models : FieldModelSettings
         How models are fitted and one is chosen.
     """
-    fitted = best_model(trajectories, target, action_limit, settings, noise, models)
+    declared = noise
+    fitted, noise = best_model(trajectories, target, action_limit, settings, declared, models)
+    found = 0.0 if noise == declared else noise
     if fitted is None or fitted.error > settings.field_error:
         return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]
     A, B = model.linearise(target, np.zeros(model.n_a))
     drift = model.step(target[None], np.zeros((1, model.n_a)))[0] - target
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
-        return FieldLaw(fitted)
+        return FieldLaw(fitted, noise=found)
     horizon = max(len(actions) for _, actions in trajectories)
     try:
         if cost is None:
@@ -190,9 +215,9 @@ def field_law(
         else:
             K, b = finite_horizon_of(A, B, drift, cost, target)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
-        return FieldLaw(fitted)
+        return FieldLaw(fitted, noise=found)
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
-        return FieldLaw(fitted)
+        return FieldLaw(fitted, noise=found)
     fields = [states[0] for states, _ in trajectories]
     if noise:
         fields = list(smoothed(np.stack(fields), noise))
@@ -223,7 +248,7 @@ def field_law(
             total += action_weight * float(np.sum(actions**2))
         return total / (horizon * len(fields))
 
-    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other))
+    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other), found)
 
 
 def sum_of(cost: Cost, states: Array, actions: Array) -> float:

@@ -40,26 +40,67 @@ FEWEST = 200
 
 def noise_level(trajectories: Sequence[Array]) -> float:
     """The standard deviation that white noise on states (L, n) would have; 0 if there is none."""
-    usable = [z for z in trajectories if len(z) > max(ORDERS) and np.isfinite(z).all()]
-    if not usable:
+    usable = _usable(trajectories)
+    powers = _powers(usable)
+    if powers is None:
         return 0.0
-    n = usable[0].shape[1]
-    edges = np.linspace(n // 8, n // 2, BANDS + 1).astype(int)
-    spectra = [np.fft.rfft(z, axis=1, norm="ortho") for z in usable]
-    steps = sum(len(z) - max(ORDERS) for z in usable)
-    if edges[0] < 1 or steps * int(np.diff(edges).min()) < FEWEST:
-        return 0.0
-    powers = np.zeros((BANDS, len(ORDERS)))
-    for i, order in enumerate(ORDERS):
-        found = np.concatenate([np.abs(np.diff(own, order, axis=0)) ** 2 for own in spectra])
-        for band in range(BANDS):
-            mean = float(found[:, edges[band] : edges[band + 1]].mean())
-            powers[band, i] = mean / comb(2 * order, order)
     quietest = powers[int(powers.min(axis=1).argmin())]
     alike = quietest.max() <= ALIKE * quietest.min()
     sigma = float(np.sqrt(quietest.min()))
     size = float(np.sqrt(np.mean([np.mean(z**2) for z in usable])))
     return sigma if alike and sigma > LEAST * size and not _is_local(usable) else 0.0
+
+
+def contradicting_noise(trajectories: Sequence[Array], declared: float, misjudged: float) -> float:
+    """The noise that states (L, n) seem to have, or at most have; 0 if it contradicts none declared.
+
+    misjudged: ratio of the two that is a contradiction.
+    """
+    level = noise_level(trajectories)
+    if level > misjudged * declared:
+        return level
+    powers = _powers(_usable(trajectories)) if declared else None
+    most = np.inf if powers is None else float(np.sqrt(powers.min()))
+    return most if declared > misjudged * most else 0.0
+
+
+def share_of_noise(noise: float, trajectories: Sequence[Array], target: Array) -> float:
+    """The part of sum |z - z_r|^2 over measured states that noise of this size is.
+
+    Nothing predicts it, so that a model without noise that has a smaller E says that there is none.
+    """
+    size = np.mean([np.mean((z - target) ** 2) for z in trajectories if np.isfinite(z).all()])
+    return float(noise**2 / max(size, 1e-300))
+
+
+def rows_of(states: Array, shape: Sequence[int]) -> list[Array]:
+    """The fields of states (L, n) along the last of several axes, each a trajectory of its own."""
+    if len(shape) < 2 or states.shape[1] % shape[-1]:
+        return [states]
+    return list(np.moveaxis(states.reshape(len(states), -1, shape[-1]), 1, 0))
+
+
+def _usable(trajectories: Sequence[Array]) -> list[Array]:
+    return [z for z in trajectories if len(z) > max(ORDERS) and np.isfinite(z).all()]
+
+
+def _powers(usable: Sequence[Array]) -> Array | None:
+    """P_d in each band and of each order (bands, orders); None where they are too uncertain."""
+    if not usable:
+        return None
+    n = usable[0].shape[1]
+    edges = np.unique(np.linspace(n // 8, n // 2, BANDS + 1).astype(int))
+    steps = sum(len(z) - max(ORDERS) for z in usable)
+    if edges[0] < 1 or steps * int(np.diff(edges).min()) < FEWEST:
+        return None
+    powers = np.zeros((len(edges) - 1, len(ORDERS)))
+    for z in usable:  # one by one, as many states of many numbers take memory
+        spectrum = np.fft.rfft(z, axis=1, norm="ortho")
+        for i, order in enumerate(ORDERS):
+            power = np.sum(np.abs(np.diff(spectrum, order, axis=0)) ** 2, axis=0)
+            powers[:, i] += np.add.reduceat(power[: edges[-1]], edges[:-1])
+    counts = [sum(len(z) - order for z in usable) * comb(2 * order, order) for order in ORDERS]
+    return powers / np.outer(np.diff(edges), counts)
 
 
 def _is_local(trajectories: Sequence[Array]) -> bool:

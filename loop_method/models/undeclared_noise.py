@@ -1,12 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Measurement noise that nobody declared, accepted only where a model says so.
 
-Where no model without noise predicts the rollouts, an equation is fitted for noise of the level that
-their differences allow (`noise_level`). The noise is there if that equation predicts rollouts that it
-was not fitted to better than any model without noise, and if what it does not predict of the short
-waves is measurement noise: its innovations there, along filtered states, have that level and are white
-in time and space (`whiteness`). Those of a front that is narrower than the grid are not: they gather
-around it. Long waves are judged by the prediction, as their innovations hold the equation's own errors.
+Noise cannot be predicted. So unless a model without noise predicts the rollouts better than noise of
+the level that their differences allow (`noise_level`) would let it, an equation is fitted for that
+noise. The noise is there if this equation predicts rollouts that it was not fitted to better than any
+model without noise, and if what it does not predict of the short waves is measurement noise: its
+innovations there, along filtered states, have that level and are white in time and space (`whiteness`).
+Those of a front that is narrower than the grid are not: they gather around it. Long waves are judged by
+the prediction, as their innovations hold the equation's own errors.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured
 from loop_method.models.choice import FittedModel, fit_field_model, limited, with_clean
-from loop_method.models.noise_level import noise_level, short_waves
+from loop_method.models.noise_level import noise_level, share_of_noise, short_waves
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.whiteness import is_white
 
+PREDICTED = 0.5
+"""E of a model without noise, relative to the share of the noise, below which there is no noise."""
 _BEGINNING = 8
 """Innovations of a rollout that are left out, as those of its uncertain initial state."""
 _TURNS = 4
@@ -60,9 +63,14 @@ def fit_undeclared_noise(
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
     """
-    noise = noise_level([np.asarray(rollout.states) for rollout in rollouts])
+    states = [np.asarray(rollout.states) for rollout in rollouts]
+    noise = noise_level(states)
     misjudged = max(noise, declared) > settings.noise_misjudged * min(noise, declared)
-    if not noise or not misjudged:
+    if (
+        not noise
+        or not misjudged
+        or better_than < PREDICTED * share_of_noise(noise, states, target)
+    ):
         return None
     found = fit_field_model(
         rollouts,

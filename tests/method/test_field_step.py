@@ -39,7 +39,8 @@ def test_a_plant_that_forgets_is_told_from_one_that_is_disturbed(
     monkeypatch.setattr(
         field_step, "believe", lambda _, __, ___, pieces=1: Belief(model(plant), errors[pieces], 1)
     )
-    found, as_a_whole = field_step.field_model(plant.context(), [], "")
+    found, as_a_whole, noise = field_step.field_model(plant.context(), [], "")
+    assert noise == 0.0
     assert as_a_whole == (believed == "whole")
     assert (found and found.error) == (None if believed is None else errors[8 - 7 * as_a_whole])
 

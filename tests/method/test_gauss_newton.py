@@ -178,7 +178,7 @@ def finished(
 
 def without_field_models(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that all steps are local."""
-    monkeypatch.setattr(field_step, "field_model", lambda *_, **__: (None, False))
+    monkeypatch.setattr(field_step, "field_model", lambda *_, **__: (None, False, 0.0))
 
 
 @pytest.mark.parametrize("helped", [True, False])
@@ -424,9 +424,9 @@ def test_all_kinds_of_steps_are_given_the_settings(monkeypatch: pytest.MonkeyPat
     given = []
     settings = GaussNewtonSettings(modes=5, pieces=4)
 
-    def field_model(*known: Any) -> tuple[None, bool]:
+    def field_model(*known: Any) -> tuple[None, bool, float]:
         given.append(known[-1])
-        return None, False
+        return None, False, 0.0
 
     def propose(*_: Any, **named: Any) -> None:
         given.append(named["settings"])
@@ -445,9 +445,9 @@ def test_models_of_the_field_are_fitted_to_states_as_measured_and_noise_is_remov
     """Their fit knows of the noise; only on a line are initial fields known best by their spectra."""
     fitted: list[Record] = []
 
-    def field_model(_: Context, data: list[Record], *__: Any) -> tuple[None, bool]:
+    def field_model(_: Context, data: list[Record], *__: Any) -> tuple[None, bool, float]:
         fitted.extend(data)
-        return None, False
+        return None, False, 0.0
 
     monkeypatch.setattr(field_step, "field_model", field_model)
     plant = Plant()

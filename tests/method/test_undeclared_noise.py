@@ -10,7 +10,9 @@ import pytest
 import scipy
 
 import pdeloop
-from loop_method.adapt import Context, Record, Trajectory, undeclared_noise
+from controller_node.identification import Designed, DesignSettings, designed
+from loop_interfaces.model_rows import pack
+from loop_method.adapt import Context, Record, Trajectory, field_step, undeclared_noise
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.models import Measured
@@ -22,6 +24,8 @@ from loop_method.models.undeclared_noise import fit_undeclared_noise
 from loop_method.models.whiteness import correlations, is_white
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
+from tests.method.test_gauss_newton import N_Z, Plant, make, measure
+from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import warnings
 from tuner_node.results import check_result, summarise
@@ -119,7 +123,7 @@ def test_noise_is_found_within_a_tenth_on_a_known_plant() -> None:
     assert found_in(rollouts, target, declared=3.0 * sigma) == pytest.approx(sigma, rel=0.1)
 
 
-def test_a_model_without_noise_that_is_believed_ends_the_search(
+def test_a_model_that_predicts_what_noise_would_not_allow_ends_the_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Whatever the data look like: with noise that was not declared, nothing is even fitted."""
@@ -128,11 +132,12 @@ def test_a_model_without_noise_that_is_believed_ends_the_search(
     context = Context(np.eye(N)[:, :1], np.zeros(N), 1.0, 1.0, L - 1, Trajectory(white, white))
     model = LinearModel("linear", np.eye(N), np.zeros((N, 1)), np.zeros(N))
     settings, fits = ModelBasedSettings(), []
-    monkeypatch.setattr(undeclared_noise, "fit_undeclared_noise", lambda *_, **on: fits.append(on))
-    for error, tried in ((settings.believed, 0), (1.01 * settings.believed, 1)):
+    monkeypatch.setattr(of_models, "fit_field_model", lambda *_, **on: fits.append(on))
+    # All of these states is noise, of which a share of 1 cannot be predicted.
+    for error, tried in ((0.45, 0), (0.55, 1)):
         undeclared_noise.believe_in_noise(context, [record], Belief(model, error, 1), settings)
         assert len(fits) == tried
-    assert fits[0]["better_than"] == 1.01 * settings.believed
+    assert fits[0]["noise"] == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_front_that_looks_like_noise_in_its_short_waves_is_none(
@@ -146,32 +151,105 @@ def test_a_front_that_looks_like_noise_in_its_short_waves_is_none(
     assert found_in(rollouts, target) == 0.0
 
 
-def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> None:
+def test_the_first_law_is_made_for_the_noise_that_is_found_and_says_so() -> None:
+    """It is the law of a rightly declared noise; models of short pieces would take it for the field."""
     sigma = 0.05
-    quick = {"field_model_settings.folds": 2, "field_model_settings.passes": 4}
-    problem = pdeloop.problem(
-        "allen-cahn-modes",
-        **{"n_z": 128, "horizon": 40, "rollouts": 6, "evaluation_fields": 1, **quick},
-        **{"measurement_noise": sigma, "exploration_variance": 1.0},
-        **{"identification": "regression", "field_model_settings.largest_degree": 3},
-    )
+    plant = {"n_z": 96, "horizon": 80}
+    rollouts, target = explored("allen-cahn-modes", measurement_noise=sigma, **plant)
+    values = pdeloop.problem("allen-cahn-modes", identification="field", **plant).values
+
+    def law(declared: float) -> Designed:
+        settings = DesignSettings.of({**values, "measurement_noise": declared})
+        return designed(rollouts[:1], target, settings, further=rollouts[1:])
+
+    found = law(0.0)
+    assert found.field is not None and found.field.rows is not None
+    assert found.field.noise == found.field.summary()["noise"] == pytest.approx(sigma, rel=0.1)
+    (said,) = (line for line in found.field.text() if "noise" in line)
+    assert f"noise of about {found.field.noise:.2g} was found" in said
+    right = law(found.field.noise)
+    assert right.field is not None and right.field.noise == 0.0
+    assert found.field.cost == right.field.cost and same_bits(pack(found.rows), pack(right.rows))
+
+
+def test_gauss_newton_goes_on_with_the_noise_that_a_model_shows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From a checkpoint, too; until then a rollout counts as it was measured."""
+    plant, sigma = Plant(), 0.3
+    linear = LinearModel("linear", plant.U @ plant.A @ plant.U.T, plant.U @ plant.B, np.zeros(N_Z))
+    seen: list[float] = []
+
+    def believed(context: Context, *_: Any) -> tuple[Belief, float] | None:
+        seen.append(context.noise)
+        return None if context.noise else (Belief(linear, 0.1, 1), sigma)
+
+    monkeypatch.setattr(field_step, "believe", lambda *_: Belief(linear, 0.4, 1))
+    monkeypatch.setattr(field_step, "believe_in_noise", believed)
+    optimizer = make(plant, 0.6 * plant.best)
+    row = optimizer.tell(measure(plant, optimizer.ask()))
+    assert row["noise"] == optimizer.state()["noise"] == sigma
+    again = make(plant, 0.6 * plant.best)
+    again.restore(optimizer.state())
+    while not optimizer.done:
+        for each in (optimizer, again):
+            row = each.tell(measure(plant, each.ask()))
+            assert row["role"] == "judging" or row["noise"] == sigma
+        assert same_bits(optimizer.policy, again.policy)
+    assert again.done and seen[0] == 0.0 and set(seen[1:]) == {sigma}
+    with pytest.raises(ValueError, match="noise"):
+        again.restore({**optimizer.state(), "noise": np.array(-sigma)})
+
+
+QUICK = {
+    **{"n_z": 128, "horizon": 40, "rollouts": 6, "evaluation_fields": 1},
+    **{"field_model_settings.folds": 2, "field_model_settings.passes": 4},
+    **{"exploration_variance": 1.0, "identification": "regression"},
+    **{"field_model_settings.largest_degree": 3},
+}
+
+
+def with_noise(sigma: float, **given: Any) -> tuple[dict[str, Any], LocalPair]:
+    """The parameters of a training that is not told of noise, and a pair whose plant has it."""
+    problem = pdeloop.problem("allen-cahn-modes", **{**QUICK, "measurement_noise": sigma, **given})
     values = {**problem.values, "measurement_noise": 0.0}
-    training = build_training(values)
-    train(training, LocalPair(values, build_plant(problem.values)), lambda row: None)
+    return values, LocalPair(values, build_plant(problem.values))
+
+
+def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> None:
+    """So does one that continues from a checkpoint after the find, to the same bits."""
+    sigma = 0.05
+    values, pair = with_noise(sigma)
+    training, states = build_training(values), []
+
+    def keep() -> None:
+        if training.history and training.phase == "adapt":
+            states.append({name: array.copy() for name, array in arrays_of(training).items()})
+
+    train(training, pair, lambda row: None, after_batch=keep)
     summary = summarise(training)
     (found,) = summary["noise"]["found"]
     assert summary["noise"]["declared"] == 0.0 and found == pytest.approx(sigma, rel=0.1)
+    assert summary["noise"]["seeming"] == [0.0]  # as it was found
     (said,) = (text for text in warnings(summary) if "noise" in text)
     assert f"noise of about {found:.2g} was found" in said and "none was declared" in said
     check_result(summary, 0, 1)
-    for wrong in ({"declared": 0.0, "found": ["0.05"]}, {"declared": None, "found": []}, [0.05]):
+    for wrong in (
+        {"declared": 0.0, "found": ["0.05"]},
+        {"declared": None, "found": []},
+        {"declared": 0.0, "found": [], "seeming": [None]},
+        [0.05],
+    ):
         with pytest.raises(ValueError, match="noise"):
             check_result({**summary, "noise": wrong}, 0, 1)
-    again = build_training(values)
-    restore(again, arrays_of(training))
-    for each in (training, again):
-        (optimizer,) = each.optimizers
-        assert optimizer._context.noise == found
-        negative = {**optimizer.state(), "noise": np.array(-found)}
+    later = build_training(values)
+    restore(later, states[0])
+    train(later, LocalPair(values, pair.plant), lambda row: None)
+    assert later.history == training.history and "noise" in training.history[0]
+    assert same_bits(later.policies(), training.policies())
+    assert same_bits(later.evaluation, training.evaluation)
+    for each in (training, later):
+        (made,) = each.optimizers
+        assert made.state()["noise"] == found
         with pytest.raises(ValueError, match="noise"):
-            optimizer.restore(negative)
+            made.restore({**made.state(), "noise": np.array(-found)})

@@ -332,3 +332,19 @@ def test_noise_that_was_not_declared_so_is_a_warning(
     assert said in text
     assert misjudged_noise({"noise": {"declared": declared, "found": [0.0]}, "seeds": 1}) == []
     assert misjudged_noise({"seeds": 1}) == []  # a result of an older version
+
+
+@pytest.mark.parametrize(
+    ("declared", "seeming", "said"),
+    [
+        (0.0, [0.0498], "noise of about 0.05, and none was declared"),
+        (0.15, [0.05], "noise of at most 0.05, and 0.15 was declared"),
+        (0.01, [0.0, 0.05], "noise of about 0.05 for 1 of 2 seeds, and 0.01 was declared"),
+    ],
+)
+def test_readings_that_seem_noisy_are_a_warning_with_a_remedy(
+    declared: float, seeming: list[float], said: str
+) -> None:
+    noise = {"declared": declared, "found": [0.0] * len(seeming), "seeming": seeming}
+    (text,) = misjudged_noise({"noise": noise, "seeds": len(seeming)})
+    assert said in text and "set measurement_noise" in text

@@ -1,0 +1,152 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks hidden_noise`: trainings that are told less or more noise than there is.
+
+The plant's readings are noisy, and the training gets another `measurement_noise`: none, a third of the
+noise, three times as much, or, for comparison, the right one. Costs are those of the true field in the
+closing evaluation. Finished trainings are kept in a folder, so that an interrupted run continues where
+it stood.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pdeloop
+from benchmarks.general import number
+from loop_interfaces.files import make_folder, read_json, write_atomically
+from pde_sim_node.build import build_plant
+from pdeloop.in_process import LocalPair
+from pdeloop.in_process import train as train_here
+from pdeloop.study.executors import processes
+from tuner_node.build import build_training
+from tuner_node.results import summarise
+
+__all__ = ["run", "text"]
+
+Task = tuple[str, str, float, float, int]
+"""Problem, optimizer, noise, its declared multiple and seed."""
+CASE = ("problem", "optimizer", "noise", "told")
+"""Entries of a row that seeds of one case have in common."""
+RIGHT = 1.0
+"""The multiple of the noise that is a right declaration."""
+
+
+def run(
+    problems: Sequence[str] = ("allen-cahn-modes", "kdv-modes", "burgers"),
+    *,
+    noise: Sequence[float] = (0.02, 0.05),
+    told: Sequence[float] = (0.0, 1.0 / 3.0, RIGHT, 3.0),
+    optimizers: Sequence[str] = ("model_based",),
+    first: int = 2000,
+    seeds: int = 2,
+    rollouts: int = 20,
+    jobs: int | None = None,
+    folder: Path = Path("runs/hidden-noise"),
+) -> list[dict[str, Any]]:
+    """Train with noise that is not, or not rightly, declared.
+
+    Parameters
+    ----------
+    problems
+        Names, or files.
+    noise
+        Standard deviations of a reading.
+    told
+        Multiples of them that are declared; 0: none.
+    optimizers
+        Names.
+    first
+        The first seed.
+    seeds
+        Trainings of each case.
+    rollouts
+        Of each, explorations and checks among them.
+    jobs
+        Processes; one a core if not given.
+    folder
+        Where finished trainings are kept.
+    """
+    own = range(first, first + seeds)
+    tasks = list(itertools.product(problems, optimizers, noise, told, own))
+    make_folder(folder)
+    rows = []
+    with processes(jobs) as pool:
+        work = partial(train, rollouts=rollouts, folder=folder.resolve())
+        for row in pool.map(work, tasks):
+            rows.append(row)
+            print(f"{line([row])} ({len(rows)} of {len(tasks)})", file=sys.stderr, flush=True)
+    return rows
+
+
+def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
+    """One training; its costs, the noise that it found, or the error that ended it."""
+    problem, optimizer, noise, told, seed = task
+    label = f"{Path(problem).stem}-{optimizer}-{noise:g}-{told:.3g}-{seed}-{rollouts}"
+    path = folder / f"{label}.json"
+    if path.exists():
+        found: dict[str, Any] = read_json(path)
+        return found
+    row: dict[str, Any] = {"problem": problem, "optimizer": optimizer, "noise": noise}
+    row |= {"told": told, "seed": seed}
+    given: dict[str, Any] = {"optimizer": optimizer, "rollouts": rollouts, "seed": seed}
+    try:
+        summary = trained(problem, noise, told * noise, given)
+        row |= {key: costs[0] for key, costs in summary["costs"].items()}
+        row["found"] = summary["noise"]["found"][0]
+    except (ValueError, RuntimeError) as error:
+        row["error"] = " ".join(str(error).split())
+    write_atomically(path, json.dumps(row).encode())
+    return row
+
+
+def trained(
+    problem: str, noise: float, declared: float, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The result of a training whose plant has this noise, while it is told another."""
+    plant = build_plant(pdeloop.problem(problem, measurement_noise=noise, **given).values)
+    values = pdeloop.problem(problem, measurement_noise=declared, **given).values
+    training = build_training(values)
+    train_here(training, LocalPair(values, plant), lambda row: None)
+    return summarise(training)
+
+
+def line(rows: Sequence[Mapping[str, Any]], right: Sequence[Mapping[str, Any]] = ()) -> str:
+    """A row of the table from the trainings of one case, the seeds in their order.
+
+    right: those with the right declaration.
+    """
+    one = rows[0]
+    declared = f"{one['told'] * one['noise']:.2g}" if one["told"] else "none"
+    cells = [one["problem"], one["optimizer"], f"{one['noise']:g}", declared]
+    known = [row for row in rows if "error" not in row]
+    cells.append(number(known[0]["none"]) if known else "-")
+    for key in ("lqt", "adapted"):
+        cells.append(", ".join(number(row.get(key)) for row in rows))
+    cells.append(", ".join(number(row.get("adapted")) for row in right) or "-")
+    found = (f"{row['found']:.2g}" if row.get("found") else "-" for row in rows)
+    cells.append(", ".join(found))
+    return f"| {' | '.join(cells)} |"
+
+
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A Markdown table with a row for each wrong declaration, and the errors.
+
+    Right ones are a column of it, and rows where there is nothing to compare them with.
+    """
+    head = ["problem", "optimizer", "noise", "declared", "no control", "first law", "adapted"]
+    head += ["adapted, rightly declared", "noise found"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    cases: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        cases.setdefault(tuple(row[key] for key in CASE), []).append(row)
+    lines += [line(own, cases.get((*case[:-1], RIGHT), ())) for case, own in cases.items()]
+    lines += [
+        f"{row['problem']}, seed {row['seed']}: {row['error']}" for row in rows if "error" in row
+    ]
+    return "\n".join(lines)
