@@ -67,14 +67,10 @@ def features_of(components: int, degree: int = 3, axes: int = 1) -> tuple[Featur
     return tuple(Feature(m, j) for m in monomials for j in orders.get(len(m), [0]))
 
 
-def neighbour_features(components: int) -> tuple[Feature, ...]:
-    """Monomials of a point and its neighbours: up to degree 2 of two at each side, cubic ones of one.
-
-    Of several components all of them are of one neighbour at each side.
-    """
-    reach = {1: 2, 2: 2, 3: 1} if components == 1 else {1: 1, 2: 1, 3: 1}
+def neighbour_features(components: int, reach: int = 2) -> tuple[Feature, ...]:
+    """Monomials of a point and `reach` neighbours at each side, up to degree 2; cubic ones of one."""
     found = []
-    for degree, most in reach.items():
+    for degree, most in {1: reach, 2: reach, 3: 1}.items():
         places = [(c, s) for s in range(-most, most + 1) for c in range(components)]
         for chosen in combinations_with_replacement(places, degree):
             found.append(Feature(tuple(c for c, _ in chosen), 0, tuple(s for _, s in chosen)))

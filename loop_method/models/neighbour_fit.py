@@ -51,10 +51,28 @@ def fit_neighbours(
 ) -> FiniteDifferenceModel | None:
     """The equation, or None where the plant is of another kind.
 
+    Of several components second neighbours, with half as many terms again, are tried where the first
+    ones do not describe the plant.
+
     ridge: of the points' own parts in normalised columns; None: all points share their coefficients.
     """
     samples = samples.thinned(settings.near_samples)
-    model = replace(nothing(kind, neighbour_features(components), samples, components), substeps=1)
+    for reach in (1, 2) if components > 1 else (2,):
+        features = neighbour_features(components, reach)
+        empty = replace(nothing(kind, features, samples, components), substeps=1)
+        found = _fitted(empty, samples, ridge, settings)
+        if found is not None:
+            return found
+    return None
+
+
+def _fitted(
+    model: FiniteDifferenceModel,
+    samples: Samples,
+    ridge: float | None,
+    settings: FieldModelSettings,
+) -> FiniteDifferenceModel | None:
+    """The equation of the terms of an empty one, which has substeps of its own then, or None."""
     size = largest_of(samples)
     for most in (settings.near_screened, settings.near_hopeless):
         data = Regression.along(model, samples)

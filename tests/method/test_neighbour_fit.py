@@ -98,20 +98,31 @@ def oscillators(z):
     return np.concatenate([p, force - neighbour(force, -1) - 0.1 * p], axis=-1)
 
 
+def layers(z):
+    """Lorenz-96 in two layers, with products of second neighbours in each of them."""
+    x, y = np.split(z, 2, axis=-1)
+    dx = (neighbour(x, 1) - neighbour(x, -2)) * neighbour(x, -1) - x - 0.5 * y + 4.0
+    dy = 2.0 * (neighbour(y, -1) - neighbour(y, 2)) * neighbour(y, 1) - 2.0 * y + 0.5 * x
+    return np.concatenate([dx, dy], axis=-1)
+
+
 @pytest.mark.parametrize(
     ("rate", "components", "ridge", "variance", "terms"),
-    [(species, 1, 1e-9, 0.05, 4), (oscillators, 2, None, 0.3, 11)],
+    [(species, 1, 1e-9, 0.05, 4), (oscillators, 2, None, 0.3, 11), (layers, 2, None, 1.0, 6)],
 )
 def test_cells_of_their_own_and_pairs_of_components_are_described(
     rate, components, ridge, variance, terms
 ):
-    """The oscillators': the speed, three displacements, and the seven cubes of (q_i, q_{i+1})."""
+    """The oscillators': the speed, three displacements, and the seven cubes of (q_i, q_{i+1}).
+
+    The layers': both values, and two products in each.
+    """
     n_z, start = components * N_X, 1.0 if rate is species else 0.0
     rollouts = rolled_out(rate, 4, n_z, variance=variance, start=start)
     model = fit_neighbours(
         Samples.of(rollouts[:3]),
         kind="k",
-        settings=FieldModelSettings(near_samples=90),
+        settings=FieldModelSettings(near_samples=50),
         components=components,
         ridge=ridge,
     )
