@@ -110,7 +110,8 @@ def training(context: LaunchContext) -> list[Any]:
             namespace=node.namespace_in(given["namespace"]),
             # Not as `parameters`: launch_ros leaves a file for each dictionary in the temporary folder.
             ros_arguments=[
-                *("--log-level", given["log_level"]),
+                "--log-level",
+                given["log_level"],
                 *node.parameter_arguments(folder / "parameters.yaml"),
             ],
             output="screen",

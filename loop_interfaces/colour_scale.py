@@ -13,13 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 LIGHT = (
-    *("#053061", "#2166ac", "#4393c3", "#92c5de", "#d1e5f0", "#f7f7f7"),
-    *("#fddbc7", "#f4a582", "#d6604d", "#b2182b", "#67001f"),
+    "#053061",
+    "#2166ac",
+    "#4393c3",
+    "#92c5de",
+    "#d1e5f0",
+    "#f7f7f7",
+    "#fddbc7",
+    "#f4a582",
+    "#d6604d",
+    "#b2182b",
+    "#67001f",
 )
 """From far below the middle to far above it, on a light background."""
 DARK = (
-    *("#a6d8ff", "#6fb3e8", "#3f86c0", "#285c88", "#1d3a55", "#1b1f26"),
-    *("#4a2419", "#7d3520", "#b85a3a", "#e58a66", "#ffc9b0"),
+    "#a6d8ff",
+    "#6fb3e8",
+    "#3f86c0",
+    "#285c88",
+    "#1d3a55",
+    "#1b1f26",
+    "#4a2419",
+    "#7d3520",
+    "#b85a3a",
+    "#e58a66",
+    "#ffc9b0",
 )
 """The same on a dark one."""
 ROBUST = 98.0

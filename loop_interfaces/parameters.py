@@ -165,9 +165,18 @@ PROBLEM = _section(
 POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 """The size of the state of an equation."""
 OF_THE_PLANT = (
-    *("grid", "cost", "length", "n_z", "n_a", "actuator_extents"),
-    *("sample_time", "horizon"),
-    *("state_weight", "action_weight", "divergence_bound", "reduced_order"),
+    "grid",
+    "cost",
+    "length",
+    "n_z",
+    "n_a",
+    "actuator_extents",
+    "sample_time",
+    "horizon",
+    "state_weight",
+    "action_weight",
+    "divergence_bound",
+    "reduced_order",
 )
 """Parameters that a user's own plant supplies where the problem does not."""
 

@@ -73,8 +73,12 @@ _NAMES = {
     "pdeloop.finished_run": ("FinishedRun", "load_run"),
     "pdeloop.gradients": ("Gradients",),
     "pdeloop.plots": (
-        *("plot_behaviour", "plot_costs", "plot_episode"),
-        *("plot_gains", "plot_spectrum", "plot_training"),
+        "plot_behaviour",
+        "plot_costs",
+        "plot_episode",
+        "plot_gains",
+        "plot_spectrum",
+        "plot_training",
     ),
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}

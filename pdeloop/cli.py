@@ -21,8 +21,20 @@ from pdeloop.output import complain, drop_unwritable
 DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, STOPPED_BY_SIGNAL, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
 COMMANDS = (
-    *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
-    *("report", "animate", "compare", "export", "study", "problems", "new", "check"),
+    "train",
+    "evaluate",
+    "identify",
+    "bag",
+    "monitor",
+    "reproduce",
+    "report",
+    "animate",
+    "compare",
+    "export",
+    "study",
+    "problems",
+    "new",
+    "check",
 )
 """The modules of `pdeloop.commands`, in the order of the help."""
 

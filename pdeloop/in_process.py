@@ -98,7 +98,7 @@ class LocalPair:
             return BatchResult(table, trajectories=seen)
         numbers = batch.rows[:, StartColumn.MODEL].astype(int).tolist()
         models = design_each(
-            *(episode.states, episode.actions, numbers, self.plant.target, self._settings)
+            episode.states, episode.actions, numbers, self.plant.target, self._settings
         )
         return BatchResult(table, models, trajectories=seen)
 

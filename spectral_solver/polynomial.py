@@ -52,17 +52,49 @@ PLAN = np.dtype(
             (name, np.int64)
             for name in (
                 # Addresses of constants and scratch, and the distances of their planes.
-                *("constants", "constants_apart", "scratch", "scratch_apart"),
+                "constants",
+                "constants_apart",
+                "scratch",
+                "scratch_apart",
                 # Offsets in c. Spectra of the step, as in `kernel`; m_q; C_qp and p C_qp.
-                *("e", "e2", "q", "qm", "f1m", "f2m", "f3m", "f", "supports"),
-                *("multipliers", "polynomials", "slopes"),
-                *("analysis", "synthesis"),  # unused
+                "e",
+                "e2",
+                "q",
+                "qm",
+                "f1m",
+                "f2m",
+                "f3m",
+                "f",
+                "supports",
+                "multipliers",
+                "polynomials",
+                "slopes",
+                "analysis",  # unused, like the next
+                "synthesis",
                 # Of the integrals of powers along a path.
-                *("weight_begin", "weight_middle", "weight_end"),
+                "weight_begin",
+                "weight_middle",
+                "weight_end",
                 # Offsets in w.
-                *("x", "z1", "z2", "next", "b", "c", "qf", "ff"),
-                *("part", "sum", "tape", "covector", "on_b", "on_c", "on_force"),
-                *("path", "power", "now", "total"),
+                "x",
+                "z1",
+                "z2",
+                "next",
+                "b",
+                "c",
+                "qf",
+                "ff",
+                "part",
+                "sum",
+                "tape",
+                "covector",
+                "on_b",
+                "on_c",
+                "on_force",
+                "path",
+                "power",
+                "now",
+                "total",
             )
         ),
     ]

@@ -27,14 +27,16 @@ from tests.support.made_once import made_once
 from tests.support.small import RECORDED, REPRODUCED, SMALL
 
 LONG = (
-    *("test_soak", "test_launch", "test_beyond", "test_working_directory", "test_foreign"),
-    *(
-        "test_readme_commands",
-        "test_pairs",
-        "test_introspection",
-        "test_actuators",
-        "test_operator",
-    ),
+    "test_soak",
+    "test_launch",
+    "test_beyond",
+    "test_working_directory",
+    "test_foreign",
+    "test_readme_commands",
+    "test_pairs",
+    "test_introspection",
+    "test_actuators",
+    "test_operator",
 )
 """Files with the longest tests over topics. One of them at the end leaves the other workers idle."""
 

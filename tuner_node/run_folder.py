@@ -58,16 +58,14 @@ from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
 TRANSIENT = (
-    *(
-        "out",
-        "resume",
-        "pairs",
-        "max_batch",
-        "episode_timeout",
-        "max_attempts",
-        "recorder",
-        "plant_fingerprint",
-    ),
+    "out",
+    "resume",
+    "pairs",
+    "max_batch",
+    "episode_timeout",
+    "max_attempts",
+    "recorder",
+    "plant_fingerprint",
     *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER, *VIEWER)),
 )
 """Parameters that change how a training is carried out, not what comes out of it."""

@@ -33,8 +33,12 @@ the way back."""
 
 
 PARAMETER_SERVICES = {
-    *("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"),
-    *("set_parameters", "set_parameters_atomically"),
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
 }
 """Services of rclpy itself, in which a malformed request ends in an exception."""
 

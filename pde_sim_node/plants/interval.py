@@ -91,7 +91,8 @@ class Interval(Dynamics):
         shapes: Callable[[Array], Array] | None = None,
     ) -> None:
         for name, given, known in (
-            *(("left", left, Wall), ("right", right, Wall)),
+            ("left", left, Wall),
+            ("right", right, Wall),
             ("inputs", inputs, Input),
         ):
             if given not in get_args(known):

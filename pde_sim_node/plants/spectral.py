@@ -21,8 +21,14 @@ from pde_sim_node.plants.batch import BatchPlant
 from spectral_solver.workers import ParallelStep
 
 _NUMBERS = (
-    *("n_z", "n_a", "sample_time", "integration_time", "horizon"),
-    *("state_weight", "action_weight", "divergence_bound"),
+    "n_z",
+    "n_a",
+    "sample_time",
+    "integration_time",
+    "horizon",
+    "state_weight",
+    "action_weight",
+    "divergence_bound",
 )
 
 

@@ -358,9 +358,22 @@ class ControllerCheck(Check):
             require_same(self.law(*rows), alone, "the single rows")
 
     probes = (
-        *(every_state, model, exploration, draws, result_again, known_plant, lost_states, void),
-        *(divergence, two_explorations, target_held_back, policy_held_back, model_held_back),
-        *(no_control, law_of_the_page, two_policies),
+        every_state,
+        model,
+        exploration,
+        draws,
+        result_again,
+        known_plant,
+        lost_states,
+        void,
+        divergence,
+        two_explorations,
+        target_held_back,
+        policy_held_back,
+        model_held_back,
+        no_control,
+        law_of_the_page,
+        two_policies,
     )
 
 

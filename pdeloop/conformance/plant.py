@@ -340,9 +340,21 @@ class PlantCheck(Check):
         self.beginning()
 
     probes = (
-        *(first_state, cost, repeat, start_again, other_starts, other_actions, silence),
-        *(acknowledgement, stage_costs, start_columns, seeds, two_rows, divergence),
-        *(release_of_the_run, giving_up),
+        first_state,
+        cost,
+        repeat,
+        start_again,
+        other_starts,
+        other_actions,
+        silence,
+        acknowledgement,
+        stage_costs,
+        start_columns,
+        seeds,
+        two_rows,
+        divergence,
+        release_of_the_run,
+        giving_up,
     )
 
 

@@ -207,8 +207,17 @@ class TunerCheck(Check):
         require(start.run != self.run, "another id", f"{start.run} again")
 
     probes = (
-        *(exploration, start_again, void, failure, other_models, first_rollout, policy_again),
-        *(other_costs, divergence, end_of_the_run, another_run),
+        exploration,
+        start_again,
+        void,
+        failure,
+        other_models,
+        first_rollout,
+        policy_again,
+        other_costs,
+        divergence,
+        end_of_the_run,
+        another_run,
     )
 
     def _started_anew(self, **how: Any) -> None:

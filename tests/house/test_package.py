@@ -207,8 +207,10 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
         ("recorder_node", ""),
         ("viewer_node", "pair0"),
         ("tuner_node", ""),
-        *(("pde_sim_node", "pair0"), ("controller_node", "pair0")),
-        *(("pde_sim_node", "pair1"), ("controller_node", "pair1")),
+        ("pde_sim_node", "pair0"),
+        ("controller_node", "pair0"),
+        ("pde_sim_node", "pair1"),
+        ("controller_node", "pair1"),
     ]
     known = {spec.name for spec in table()}
     for node in nodes:

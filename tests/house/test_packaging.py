@@ -110,7 +110,13 @@ def test_a_package_that_a_distribution_lacks_does_not_stop_the_tests(tmp_path: P
     assert done.stderr.startswith("not installed: chromium (Debian's names)")
     assert asked.read_text().splitlines()[0] == "update -qq"
     assert {line.split()[-1] for line in asked.read_text().splitlines()[1:]} == {
-        *("chromium", "gcc", "libc6-dev", "iproute2", "zsh", "fish", "faketime")
+        "chromium",
+        "gcc",
+        "libc6-dev",
+        "iproute2",
+        "zsh",
+        "fish",
+        "faketime",
     }
 
 

@@ -72,7 +72,11 @@ MODELS: dict[str, FieldModel] = {
         "k", numbers(N_Z, 3), numbers(3, 3), numbers(3, N_A), constant=numbers(3)
     ),
     "readings": ReadingsModel(
-        *(numbers(3, 3), numbers(3, N_A), numbers(2, 3), numbers(3, 2), numbers(N_Z, 2)),
+        numbers(3, 3),
+        numbers(3, N_A),
+        numbers(2, 3),
+        numbers(3, 2),
+        numbers(N_Z, 2),
         innovations=np.eye(2),
     ),
     "sensed": SensedModel(

@@ -348,7 +348,11 @@ def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits
     explored, actions = problem.explore(0)
     U = np.eye(SENSORS)
     context = Context(
-        *(U, plant.target, plant.state_weight, plant.action_weight, plant.horizon),
+        U,
+        plant.target,
+        plant.state_weight,
+        plant.action_weight,
+        plant.horizon,
         Trajectory(explored[:-1], actions),
         sensors=SENSORS,
     )
@@ -397,7 +401,12 @@ def _declared(problem: pdeloop.Problem, n_a: int) -> Actuators:
     settings = build_training(problem.values).settings
     zero, explored = np.zeros((SENSORS, 1)), Trajectory(np.zeros((2, SENSORS)), np.zeros((1, n_a)))
     return Context(
-        *(zero, zero[:, 0], 1.0, 1.0, 1, explored),
+        zero,
+        zero[:, 0],
+        1.0,
+        1.0,
+        1,
+        explored,
         actuator_positions=settings.actuator_positions,
         actuator_widths=settings.actuator_widths,
     ).actuators(n_a)
@@ -475,9 +484,7 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
             found.append(super().fit(*given, **options))
             return found[-1]
 
-    problem = Recorded(
-        *(readings, actions, actuators, sigma, np.zeros(SENSORS), np.full(2, np.nan))
-    )
+    problem = Recorded(readings, actions, actuators, sigma, np.zeros(SENSORS), np.full(2, np.nan))
     with threadpool_limits(1):
         last = part_by_part(problem, shared, problem.interpolated(), DEFAULTS)[1]
     before = found[0][1]

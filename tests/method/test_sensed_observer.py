@@ -203,7 +203,12 @@ def small() -> tuple[pdeloop.Problem, Context]:
     law = Observer(rows_of(10, U, plant.n_a), plant.horizon)
     first, second = (Trajectory(states, actions) for states, actions in explored)
     context = Context(
-        *(law.model.U, plant.target, plant.state_weight, plant.action_weight, plant.horizon, first),
+        law.model.U,
+        plant.target,
+        plant.state_weight,
+        plant.action_weight,
+        plant.horizon,
+        first,
         sensors=SENSORS,
         further=[second],
         law=law,

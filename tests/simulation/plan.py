@@ -28,13 +28,25 @@ KINDS = {
 }
 """Faults, and how often each is drawn."""
 FORGED = (
-    *("policy", "target", "model", "episode/start", "state", "action", "episode/cost"),
-    *("model/identified", "samples"),
+    "policy",
+    "target",
+    "model",
+    "episode/start",
+    "state",
+    "action",
+    "episode/cost",
+    "model/identified",
+    "samples",
 )
 """Topics on which messages are forged."""
 STALE = {
     "stale": (
-        *("episode/start", "policy", "model", "state", "action", "episode/cost"),
+        "episode/start",
+        "policy",
+        "model",
+        "state",
+        "action",
+        "episode/cost",
         "model/identified",
     ),
     "another run": ("policy", "model", "state", "action", "episode/cost", "model/identified"),

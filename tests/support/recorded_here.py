@@ -113,7 +113,7 @@ def _send_episode(
     if batch.exploratory:
         numbers = batch.rows[:, 3].astype(int).tolist()
         models = design_each(
-            *(record.states, record.actions, numbers, pair.plant.target, pair._settings)
+            record.states, record.actions, numbers, pair.plant.target, pair._settings
         )
         sent(MODEL_IDENTIFIED, episode, len(record.actions), models)
 

@@ -194,8 +194,11 @@ def test_a_training_that_is_stopped_by_a_service_says_how_to_go_on(
 
 def test_figures_show_what_the_arrays_hold(run, small) -> None:
     for draw in (
-        *(pdeloop.plot_costs, pdeloop.plot_training, pdeloop.plot_behaviour),
-        *(pdeloop.plot_gains, pdeloop.plot_spectrum),
+        pdeloop.plot_costs,
+        pdeloop.plot_training,
+        pdeloop.plot_behaviour,
+        pdeloop.plot_gains,
+        pdeloop.plot_spectrum,
     ):
         assert draw(run).axes
     plant = small.plant()

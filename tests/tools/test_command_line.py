@@ -442,7 +442,13 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
 
 def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
     done = run(
-        *("train", str(SMALL), "--in-process", "--iterations", "16", "--out", "run"),
+        "train",
+        str(SMALL),
+        "--in-process",
+        "--iterations",
+        "16",
+        "--out",
+        "run",
         environment={"TERM": "xterm-256color"},
         cwd=tmp_path,
     )

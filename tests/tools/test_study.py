@@ -353,7 +353,12 @@ def dask_cluster(
         address = address_in(file)
         known = [
             started(
-                *("dask_worker", "--no-nanny", "--nthreads", "1", "--local-directory", str(folder)),
+                "dask_worker",
+                "--no-nanny",
+                "--nthreads",
+                "1",
+                "--local-directory",
+                str(folder),
                 packages=worker,
             )
             for _ in range(workers)

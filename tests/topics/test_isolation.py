@@ -95,7 +95,9 @@ def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_pa
     done = subprocess.run(
         # With a /dev/shm of its own: the defaults use it, and other tests watch the common one.
         [
-            *(*alone, "sh", "-c"),
+            *alone,
+            "sh",
+            "-c",
             'mount -t tmpfs tmpfs /dev/shm && exec "$0" -m controller_node.node',
             sys.executable,
         ],

@@ -84,8 +84,16 @@ def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
     started = launch(installed, workspace, "loop.launch.py", **options)
     tuner = installed.node(
         "tuner_node",
-        *("--params-file", str(SMALL), "-r", "__ns:=/lab"),
-        *("-p", f"out:={tmp_path / 'run'}", "-p", "iterations:=20", "-p", "law:=feedforward"),
+        "--params-file",
+        str(SMALL),
+        "-r",
+        "__ns:=/lab",
+        "-p",
+        f"out:={tmp_path / 'run'}",
+        "-p",
+        "iterations:=20",
+        "-p",
+        "law:=feedforward",
     )
     installed.wait(tuner, LIMIT)
     expected = train_here(parameters(law="feedforward", iterations=20))

@@ -117,8 +117,15 @@ def test_the_command_line_informs_verifies_and_identifies(loop, recorded, tmp_pa
     out = tmp_path / "model.npz"
     text = loop.wait(
         loop.pdeloop(
-            *("identify", "--bag", str(recorded), "--environment", "1"),
-            *("--order", "4", "--out", str(out)),
+            "identify",
+            "--bag",
+            str(recorded),
+            "--environment",
+            "1",
+            "--order",
+            "4",
+            "--out",
+            str(out),
         ),
         LIMIT,
     )
@@ -346,7 +353,11 @@ def test_one_recorder_records_several_pairs(loop, tmp_path):
     with operator(loop) as desk:
         tuner = loop.node(
             "tuner_node",
-            *("--params-file", str(SMALL), "-p", "recorder:=start", *pairs),
+            "--params-file",
+            str(SMALL),
+            "-p",
+            "recorder:=start",
+            *pairs,
             *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3),
         )
         lacking = "recorder of pair 0 and recorder of pair 1"  # both pairs are there
