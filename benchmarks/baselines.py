@@ -334,7 +334,7 @@ def text(result: Mapping[str, Any]) -> str:
         for method in sorted(last, key=lambda name: last[name]):
             shown = [method, *(cells.get((method, budget), "") for budget in budgets)]
             known = bound is not None and finished(last[method])
-            shown.append(f"{100 * (last[method] / bound - 1):.1f} %" if known else "-")
+            shown.append(f"{100 * (last[method] / bound - 1):z.1f} %" if known else "-")
             lines.append(f"| {' | '.join(shown)} |")
         if bound is not None:
             lines.append(f"| any controller | {' | '.join([f'{bound:.4g}'] * len(budgets))} | 0 |")

@@ -356,7 +356,7 @@ def text(result: Mapping[str, Any]) -> str:
         cells = [name, str(len(rows)), f"{100 * mean['helped']:.0f} %"]
         cells += [f"{100 * mean['wrong']:.1f} % ({100 * low:.0f} to {100 * high:.0f})"]
         cells += [f"{100 * mean[key]:.0f} %" for key in ("missed", "none_wrong")]
-        cells += [f"{100 * value:+.1f} %" for value in (mean["change"], worst, mean["possible"])]
+        cells += [f"{100 * value:+z.1f} %" for value in (mean["change"], worst, mean["possible"])]
         cells += [f"{sum(row['own_wrong'] for row in rows)}"]
         lines.append(f"| {' | '.join(cells)} |")
     if lost := [f"{row['case']}, seed {row['seed']}" for row in result["rows"] if "error" in row]:

@@ -301,7 +301,7 @@ def text(results: Sequence[Mapping[str, Any]]) -> str:
                 f"{result['problem']:<14}{draw:>7}"
                 f"{f'{lqt.mean():.4g} ({lqt.max():.4g})':>18}"
                 f"{f'{best.mean():.4g} ({best.max():.4g})':>20}{limit:>12.4g}"
-                f"{100 * (best.mean() / limit - 1):>17.1f} %"
+                f"{100 * (best.mean() / limit - 1):>z17.1f} %"
             )
     for result in results:
         falls = zip(result["iterations"], result["last_fall"], strict=True)

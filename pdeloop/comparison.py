@@ -67,7 +67,7 @@ class Comparison:
                     str(row["seeds"]),
                     " to ".join(map(str, dict.fromkeys([*counted[:1], *counted[-1:]]))) or "-",
                     *(_number(costs[name], ".4g") for name in ("none", "lqt", "adapted")),
-                    "-" if below is None else f"{below:.1f} %",
+                    "-" if below is None else f"{below:z.1f} %",
                     "" if first is None else _against(first),
                 ]
             )
@@ -148,10 +148,10 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _against(first: dict[str, Any]) -> str:
-    text = f"{first['percent']:+.1f} %"
+    text = f"{first['percent']:+z.1f} %"
     if first["interval"] is not None:
         low, high = first["interval"]
-        text += f" ({low:+.1f} to {high:+.1f})"
+        text += f" ({low:+z.1f} to {high:+z.1f})"
     return text
 
 

@@ -165,7 +165,7 @@ def reduction_texts(found: Mapping[str, Any] | None) -> tuple[str, str]:
         return "diverged", "diverged"
 
     def one(value: float, between: Sequence[float] | None) -> str:
-        return f"{value:.1f}" + (f" ({between[0]:.1f} to {between[1]:.1f})" if between else "")
+        return f"{value:z.1f}" + (f" ({between[0]:z.1f} to {between[1]:z.1f})" if between else "")
 
     return (
         one(found["ratio_of_means"], found["ratio_interval"]),

@@ -22,6 +22,7 @@ from pdeloop.cli import FAILED, main
 from pdeloop.comparison import compare
 from pdeloop.export import GainLaw, curve_csv
 from pdeloop.finished_run import load_run
+from pdeloop.study.table import reduction_texts
 from tests.support.small import SMALL
 
 LIMIT = 0.2
@@ -78,6 +79,16 @@ def test_a_run_against_itself_is_no_percent_above(runs: dict[str, Path]) -> None
     found = compare([run, run])
     assert found.differing == {}
     assert found.rows()[1]["above_first"] == {"percent": 0.0, "interval": [0.0, 0.0]}
+
+
+def test_a_share_that_rounds_to_zero_has_no_minus_sign(runs: dict[str, Path]) -> None:
+    run = load_run(runs["plain"])
+    adapted = run.costs["adapted"]
+    lower = replace(run, costs={**run.costs, "adapted": 0.9999 * adapted, "lqt": 0.9998 * adapted})
+    text = compare([run, lower]).text()
+    assert "0.0 %" in text.splitlines()[2] and "-0.0" not in text
+    found = {"ratio_of_means": -0.01, "ratio_interval": (-0.04, 0.01), "mean_of_ratios": -0.02}
+    assert reduction_texts({**found, "mean_interval": None}) == ("0.0 (0.0 to 0.0)", "0.0")
 
 
 def test_costs_of_another_plant_are_not_compared(

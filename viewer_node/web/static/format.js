@@ -20,7 +20,7 @@ export function text(value, step = 0) {
   }
   const digits = step ? Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) : null;
   const words = digits === null ? String(Number(value.toPrecision(4))) : value.toFixed(digits);
-  return words.replace("-", "−");
+  return Number(words) === 0 ? words.replace("-", "") : words.replace("-", "−"); // no "−0.0"
 }
 
 // A span of time in its largest unit, or in two while the larger one is small.
