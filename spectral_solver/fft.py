@@ -237,8 +237,8 @@ def fft(w: int, x: int, y: int, d: int, t: Any, c: int, e: int) -> int:
     v = t.twiddles
     first_pass(w, x, y, d, b, c, v, e)
     v += 7 * whole_lanes(b)
-    s = 8
     m = b
+    s = t.m // b  # 8, which as a constant would be a type of its own to compile for, without use
     passes = t.radices
     while passes:
         x, y = y, x

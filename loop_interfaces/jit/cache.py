@@ -85,8 +85,8 @@ def jit_in_closure(function: F) -> F:
 
 
 def inlined_njit(function: F) -> F:
-    """Compile into every function that calls it, for the constants that it is called with."""
-    compiled: F = numba.njit(function, forceinline=True)
+    """As `jit`, but inlined into every function that calls it, for the constants it is called with."""
+    compiled: F = numba.njit(**_PART, forceinline=True)(function)
     return compiled
 
 

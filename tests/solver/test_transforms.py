@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.jit.simd import WIDTH
-from spectral_solver.fft import fft, is_transform_length, plane_size
+from spectral_solver.fft import fft, is_transform_length, one_pass, pass8, plane_size
 from spectral_solver.memory import Constants, aligned, lay_out
 from spectral_solver.spectra import TRANSFORM, analyse, synthesise
 
@@ -70,6 +70,15 @@ def test_a_complex_transform_is_numpys(m: int) -> None:
     grid.scratch[at : at + m], grid.scratch[grid.d + at : grid.d + at + m] = z
     found = transform(grid.plans, at, int(grid.plan["z2"]), *grid.where)
     np.testing.assert_allclose(grid.read(found, m), np.fft.fft(z[0] + 1j * z[1]), atol=1e-12)
+
+
+def test_passes_are_compiled_three_times_and_not_to_machine_code() -> None:
+    """For one turn, for stride 8 and for any: each further time costs every first run a second."""
+    test_a_complex_transform_is_numpys(8)
+    for function in (one_pass, pass8):
+        assert len(function.signatures) == 3
+        for made in function.overloads.values():
+            assert made.library.get_pointer_to_function(made.fndesc.llvm_cpython_wrapper_name) == 0
 
 
 # 16, 48, 128 and 144 have a compiled transform; for the others it is a product with a matrix.
