@@ -294,7 +294,7 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
         shows("training paused", "The training ends after the rollouts under way.")
         assert tab.ask(f"{button % 'stop'}.disabled")
         rounded = "import('/format.js').then(({ text }) => [-0.04, -0.06].map((x) => text(x, 0.1)))"
-        assert tab.ask(rounded) == ["0.0", "−0.1"]
+        assert tab.ask(rounded) == ["0.0", "\N{MINUS SIGN}0.1"]
         assert tab.console == []
 
 
