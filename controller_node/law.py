@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.arrays import read_only
 from loop_interfaces.jit import cache, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.simd import (
@@ -125,4 +126,4 @@ def control(
 def load_compiled() -> None:
     """Load the law, or compile it."""
     nothing = np.zeros((0, 1))
-    control(np.zeros(1, LAW), nothing, nothing)
+    control(np.zeros(1, LAW), read_only(nothing), nothing)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.simd import whole_lanes
 from loop_interfaces.topics import StartColumn
 
@@ -145,7 +145,7 @@ class ProjectedLaw:
         """
         if not self._set:
             raise ValueError("the law has no policies yet; call set() before actions().")
-        z = np.ascontiguousarray(states, dtype=np.float64)
+        z = read_only(states)
         shape = self._shape
         if z.shape != (shape[0], self._n_z):
             raise ValueError(

@@ -7,6 +7,16 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+def read_only(values: ArrayLike) -> Array:
+    """The values as compiled functions take what they only read: a view in C order, not writable.
+
+    To Numba the orders and permissions of arrays are types, for each of which it compiles a function.
+    """
+    view: Array = np.ascontiguousarray(values, dtype=np.float64).view()
+    view.setflags(write=False)
+    return view
+
+
 def float_array(name: str, values: ArrayLike) -> Array:
     """The values as float64; a ValueError unless they are an array of real numbers."""
     try:

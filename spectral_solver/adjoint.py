@@ -34,7 +34,7 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import call_c
@@ -279,7 +279,7 @@ class Adjoint:
         return self._run(states, actions, covectors)[1:]
 
     def _run(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array, Array]:
-        z, a, y = (np.ascontiguousarray(x, dtype=np.float64) for x in (states, actions, covectors))
+        z, a, y = (read_only(x) for x in (states, actions, covectors))
         batch, plan = len(z), self._plans[0]
         for what, given, size in (("states", z, plan["n_z"]), ("actions", a, plan["n_a"])):
             if given.shape != (batch, size):

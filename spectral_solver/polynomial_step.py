@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
 from spectral_solver.fft import is_transform_length, plane_size
@@ -153,7 +153,7 @@ class PolynomialStep:
 
     def spectra(self, states: Array) -> Array:
         """Spectra (M, 2, modes), real and imaginary parts: the real FFT over the number of points."""
-        z = np.ascontiguousarray(states, dtype=np.float64)
+        z = read_only(states)
         found = np.empty((len(z), 2, self._last + 1))
         if self._whole:
             analysed(z, found, self._plans)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.array_files import checked_array
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_method.models.base import Arrays, Samples, linearised, numbers_of, text_of
 from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.finite_difference_fit import fit_finite_difference
@@ -63,12 +63,12 @@ class CoarseModel:
     def step(self, states: Array, actions: Array) -> Array:
         coarse = self.inner.step(states[:, self.points], actions)
         after = np.zeros(states.shape)
-        add_products(coarse, np.ascontiguousarray(self.interpolation.T), after)
+        add_products(read_only(coarse), read_only(self.interpolation.T), after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         coarse = np.zeros((len(covectors), len(self.points)))
-        add_products(np.ascontiguousarray(covectors), self.interpolation, coarse)
+        add_products(read_only(covectors), read_only(self.interpolation), coarse)
         on_points, on_actions = self.inner.pull_back(states[:, self.points], actions, coarse)
         on_states = np.zeros(states.shape)
         on_states[:, self.points] = on_points

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.array_files import checked_array
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.text import shown
 from loop_method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
 from loop_method.models.finite_difference_kernels import (
@@ -128,15 +128,15 @@ class FiniteDifferenceModel:
         return np.array(rows, dtype=np.int64)
 
     def step(self, states: Array, actions: Array) -> Array:
-        z, a = _contiguous(states), _contiguous(actions)
+        z, a = read_only(states), read_only(actions)
         after = np.empty_like(z)
-        advance(z, a, self.table, self._axes, *self._arrays(), self.substeps, after)
+        advance(z, a, self.table, self._axes, *self._arrays, self.substeps, after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        z, a, y = _contiguous(states), _contiguous(actions), _contiguous(covectors)
+        z, a, y = read_only(states), read_only(actions), read_only(covectors)
         on_states, on_actions = np.empty_like(z), np.empty_like(a)
-        known = (self.table, self._axes, *self._arrays(), self.substeps)
+        known = (self.table, self._axes, *self._arrays, self.substeps)
         pull_back(z, a, y, *known, on_states, on_actions)
         return on_states, on_actions
 
@@ -149,10 +149,10 @@ class FiniteDifferenceModel:
         -------
         (M, F, n_x), (M, n_z)
         """
-        z, a, end = _contiguous(states), _contiguous(actions), _contiguous(after)
+        z, a, end = read_only(states), read_only(actions), read_only(after)
         found = np.empty((len(z), len(self.features), self.coefficients.shape[2]))
         miss = np.empty_like(z)
-        known = (self.table, self._axes, *self._arrays(), self.substeps)
+        known = (self.table, self._axes, *self._arrays, self.substeps)
         mean_features(z, a, end, *known, found, miss)
         return found, miss
 
@@ -211,13 +211,10 @@ class FiniteDifferenceModel:
     def _axes(self) -> Table:
         return np.array(self.shape or self.coefficients.shape[2:], dtype=np.int64)
 
+    @cached_property
     def _arrays(self) -> tuple[Array, Array, Array]:
-        return self.coefficients, self.B, self.constant
+        return read_only(self.coefficients), read_only(self.B), read_only(self.constant)
 
 
 def _filled(numbers: Sequence[int], value: int) -> list[int]:
     return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
-
-
-def _contiguous(values: Array) -> Array:
-    return np.ascontiguousarray(values, dtype=np.float64)

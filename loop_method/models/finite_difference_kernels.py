@@ -18,6 +18,13 @@ A shift is 0 .. n_x - 1, counted on the ring.
 
 
 @jit
+def copy(source: Array, target: Array) -> None:
+    """Element by element: Numba compiles the text of an error for `target[:] = source`, a second."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@jit
 def forcing(action: Array, B: Array, constant: Array, force: Array) -> None:
     """B a + c, as components by points."""
     flat = force.reshape(force.size)
@@ -48,8 +55,8 @@ def monomial(z: Array, row: Array, ring: Array) -> None:
     """A monomial at the points 1 .. n_x of a ring, whose ends are repeated."""
     n_x = z.shape[1]
     c, ahead = row[1], row[1 + MOST_FACTORS]
-    ring[1 : 1 + n_x - ahead] = z[c, ahead:]
-    ring[1 + n_x - ahead : 1 + n_x] = z[c, :ahead]
+    copy(z[c, ahead:], ring[1 : 1 + n_x - ahead])
+    copy(z[c, :ahead], ring[1 + n_x - ahead : 1 + n_x])
     multiply(z, row, 0, ring[1 : 1 + n_x])
     ring[0], ring[n_x + 1] = ring[n_x], ring[1]
 
@@ -178,8 +185,8 @@ def advance(
     force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
     stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
     for m in range(len(states)):
+        copy(states[m], after[m])
         z = after[m].reshape(shape)
-        z[:] = states[m].reshape(shape)
         forcing(actions[m], B, constant, force)
         for _ in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
@@ -197,17 +204,17 @@ def pull_back(
     tape, k = np.empty((substeps, 4, components, n_x)), np.empty((4, components, n_x))
     z, on_m, on_force = np.empty(shape), np.empty(n_x), np.empty(shape)
     own, y, g = np.empty(shape), np.empty(shape), np.empty(shape)
-    total = np.empty(shape)
+    total, flat, flat_own = np.empty(shape), z.reshape(z.size), own.reshape(own.size)
     for m in range(len(states)):
-        z[:] = states[m].reshape(shape)
+        copy(states[m], flat)
         forcing(actions[m], B, constant, force)
         for n in range(substeps):
             runge_kutta(z, table, axes, C, force, h, tape[n], k, ring, value)
-        own[:] = covectors[m].reshape(shape)
+        copy(covectors[m], flat_own)
         on_force[:] = 0.0
         for n in range(substeps - 1, -1, -1):
             g[:] = 0.0
-            total[:] = own
+            copy(flat_own, total.reshape(total.size))
             for stage in range(3, -1, -1):
                 weight = h / 6.0 if stage in (0, 3) else h / 3.0
                 reach = 0.0 if stage == 3 else (h if stage == 2 else 0.5 * h)
@@ -219,14 +226,14 @@ def pull_back(
                 for c in range(components):
                     for i in range(n_x):
                         total[c, i] += g[c, i]
-            own[:] = total
-        on_states[m] = own.reshape(own.size)
-        flat = on_force.reshape(on_force.size)
+            copy(total.reshape(total.size), flat_own)
+        copy(flat_own, on_states[m])
+        forces = on_force.reshape(on_force.size)
         for j in range(B.shape[1]):
             on_actions[m, j] = 0.0
-        for i in range(flat.size):
+        for i in range(forces.size):
             for j in range(B.shape[1]):
-                on_actions[m, j] += B[i, j] * flat[i]
+                on_actions[m, j] += B[i, j] * forces[i]
 
 
 @cached_njit()
@@ -241,15 +248,17 @@ def mean_features(
     stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
     path, bent = np.empty((substeps + 1, components, n_x)), np.empty(shape)
     z = np.empty(shape)
+    flat = z.reshape(z.size)
     for m in range(len(states)):
-        z[:] = states[m].reshape(shape)
-        path[0] = z
+        copy(states[m], flat)
+        copy(flat, path[0].reshape(z.size))
         forcing(actions[m], B, constant, force)
         for n in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
-            path[n + 1] = z
+            copy(flat, path[n + 1].reshape(z.size))
         end = after[m].reshape(shape)
-        miss[m] = (end - z).reshape(z.size)
+        for i in range(z.size):
+            miss[m, i] = after[m, i] - flat[i]
         found[m] = 0.0
         for n in range(substeps + 1):
             weight = (0.5 if n in (0, substeps) else 1.0) / substeps

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.cache import cached_njit
 from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 
@@ -41,15 +41,15 @@ class LinearModel:
 
     def step(self, states: Array, actions: Array) -> Array:
         after = np.tile(self.constant, (len(states), 1))
-        add_products(np.ascontiguousarray(states), np.ascontiguousarray(self.A.T), after)
-        add_products(np.ascontiguousarray(actions), np.ascontiguousarray(self.B.T), after)
+        add_products(read_only(states), read_only(self.A.T), after)
+        add_products(read_only(actions), read_only(self.B.T), after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         on_states, on_actions = np.zeros(states.shape), np.zeros(actions.shape)
-        y = np.ascontiguousarray(covectors)
-        add_products(y, np.ascontiguousarray(self.A), on_states)
-        add_products(y, np.ascontiguousarray(self.B), on_actions)
+        y = read_only(covectors)
+        add_products(y, read_only(self.A), on_states)
+        add_products(y, read_only(self.B), on_actions)
         return on_states, on_actions
 
     def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, read_only
 from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 from loop_method.models.linear import add_products
 from loop_method.models.settings import FieldModelSettings
@@ -73,7 +73,7 @@ class LowRankModel:
 def _products(rows: Array, matrix: Array) -> Array:
     """rows @ matrix, one row after the other."""
     totals = np.zeros((len(rows), matrix.shape[1]))
-    add_products(np.ascontiguousarray(rows), np.ascontiguousarray(matrix), totals)
+    add_products(read_only(rows), read_only(matrix), totals)
     return totals
 
 

@@ -6,10 +6,12 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from loop_interfaces.arrays import read_only
 from loop_method.models import Measured, affine_law
 from loop_method.models.files import model_of
 from loop_method.models.finite_difference import (
@@ -17,7 +19,8 @@ from loop_method.models.finite_difference import (
     features_of,
     neighbour_features,
 )
-from loop_method.models.linear import LinearModel
+from loop_method.models.finite_difference_kernels import advance
+from loop_method.models.linear import LinearModel, add_products
 from loop_method.models.prediction import errors, pieces, predicted
 from loop_method.models.spectral import SpectralModel
 
@@ -207,3 +210,22 @@ def test_a_model_that_overflows_counts_as_the_worst():
     model = LinearModel("linear", 1e200 * np.eye(3), np.zeros((3, 1)), np.zeros(3))
     rollout = Measured(np.ones((6, 3)), np.zeros((5, 1)))
     assert errors(model, [rollout], np.zeros(3), 2.0).tolist() == [2.0]
+
+
+def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> None:
+    """A run reads some from files and messages, which cannot be written, and slices others."""
+    z = np.random.default_rng(0).standard_normal((4, 16))
+    frozen = z.copy()
+    frozen.setflags(write=False)
+    kinds = [z, frozen, np.asfortranarray(z), np.repeat(z, 2, axis=1)[:, ::2], z.astype(np.float32)]
+    assert len({numba.typeof(read_only(kind)) for kind in kinds}) == 1
+    model = LinearModel("k", np.asfortranarray(np.eye(16)), np.zeros((16, 1)), np.zeros(16))
+    features = features_of(1, 2)
+    C, B = np.zeros((len(features), 1, 16)), np.zeros((16, 3))[:, ::3]
+    differences = FiniteDifferenceModel("k", features, C, B, np.zeros(16), 1)
+    for states in kinds:
+        for one in (model, differences):
+            np.testing.assert_array_equal(one.step(states, np.zeros((4, 1))), states)
+    for compiled in (add_products, advance):
+        assert len(compiled.signatures) == 1
+    assert z.flags.writeable
