@@ -253,3 +253,18 @@ def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> No
         assert made.state()["noise"] == found
         with pytest.raises(ValueError, match="noise"):
             made.restore({**made.state(), "noise": np.array(-found)})
+
+
+def test_a_training_that_was_too_short_for_a_find_warns_of_readings_that_seem_noisy() -> None:
+    sigma, given = (
+        0.05,
+        {"optimizer": "gauss_newton", "optimizer_settings.fields": 1, "rollouts": 8},
+    )
+    values, pair = with_noise(sigma, **given)
+    training = build_training(values)
+    train(training, pair, lambda row: None)
+    summary = summarise(training)
+    assert summary["noise"]["found"] == [0.0]
+    assert summary["noise"]["seeming"] == [pytest.approx(sigma, rel=0.1)]
+    (said,) = (text for text in warnings(summary) if "noise" in text)
+    assert "seem to have" in said and "none was declared" in said
