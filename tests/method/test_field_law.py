@@ -15,6 +15,7 @@ from loop_method.design.finite_horizon import finite_horizon
 from loop_method.models import affine_law
 from loop_method.models.spectral import SpectralModel
 from loop_method.reduce.settings import IdentificationSettings
+from tests.support.small import FEW_FITS
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 24, 3, 64
@@ -39,8 +40,8 @@ def episode(model: SpectralModel, noise: float = 0.0) -> tuple[Array, Array]:
     return np.array(states) + noise * rng.standard_normal((STEPS + 1, N_Z)), actions
 
 
-def settings(identification: str) -> DesignSettings:
-    return DesignSettings(N_A, 6, Q, R, identification=identification)
+def settings(identification: str, **constants: int) -> DesignSettings:
+    return DesignSettings(N_A, 6, Q, R, identification=identification, constants=constants)
 
 
 def law(true: SpectralModel, target: Array) -> ModelRows:
@@ -109,13 +110,14 @@ def test_actions_that_saturate_are_known_as_such() -> None:
 def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     target = np.zeros(N_Z)
     noisy = [episode(plant(), noise=1.0)]
-    found = designed(noisy, target, settings("field")).field
+    field = settings("field", **FEW_FITS)
+    found = designed(noisy, target, field).field
     assert found is not None and found.fitted is not None and found.rows is None
     assert (
         found.fitted.error > IdentificationSettings().field_error
         and "not accurate enough" in found.text()[-1]
     )
-    rows, plain = (design(noisy, target, settings(name)) for name in ("field", "regression"))
+    rows, plain = (design(noisy, target, how) for how in (field, settings("regression")))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
 
 

@@ -25,6 +25,7 @@ from loop_method.adapt.verdict import (
     evidence_of,
 )
 from loop_method.design.lqt import track
+from loop_method.models.settings import FieldModelSettings
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits
 
@@ -70,7 +71,11 @@ class Plant:
             trajectory = self.run(np.zeros((N_A, 2 * N_S)), seed, noise).trajectory
             assert trajectory is not None
             explored.append(trajectory)
-        return Context(self.U, self.target, Q, R, T, explored[0], further=explored[1:])
+        # Few kinds of models: most of the time would be spent on those that predict nothing.
+        few = FieldModelSettings(folds=2, largest_degree=2)
+        return Context(
+            self.U, self.target, Q, R, T, explored[0], further=explored[1:], field_models=few
+        )
 
     def cost(self, policy: np.ndarray) -> float:
         return float(np.mean([self.run(policy, 10**6 + i).cost for i in range(40)]))

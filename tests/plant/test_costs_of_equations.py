@@ -15,7 +15,7 @@ from loop_method.design.tracking import track_horizon
 from pde_sim_node.build import build_plant
 from pdeloop.bags.verify import verify
 from tests.support.recorded_here import record_run
-from tests.support.small import SMALL, same_bits
+from tests.support.small import FEW_FITS, SMALL, same_bits
 
 N_Z, T = 32, 12
 SHIPPED = {"burgers": 6, "allen-cahn": 6, "kdv": 12}
@@ -128,7 +128,7 @@ def test_a_run_keeps_it_and_evaluates_with_it(tmp_path: Any) -> None:
     given = {"state_weight": np.linspace(0.5, 1.5, 32), "terminal_weight": 2.0}
     small = pdeloop.problem("burgers", n_z=32, horizon=20, cost=given)
     run = pdeloop.train(
-        small, rollouts=8, evaluation_fields=2, out=tmp_path / "run", reduced_order=4
+        small, rollouts=8, evaluation_fields=2, out=tmp_path / "run", reduced_order=4, **FEW_FITS
     )
     assert run.costs["lqt"].mean() < run.costs["none"].mean()
     again = build_plant(pdeloop.load_run(tmp_path / "run").values)

@@ -133,7 +133,8 @@ def test_it_is_shipped_by_name_and_trained(tmp_path: Path) -> None:
     problem = tmp_path / "rod.yaml"
     problem.write_text(
         "/**: {ros__parameters: {plant: interval, "
-        "physical: {points: 17, right: neumann, inputs: right, growth: 0.5}}}"
+        "physical: {points: 17, right: neumann, inputs: right, growth: 0.5}, "
+        "field_model_settings: {folds: 2, largest_degree: 2}}}"
     )
     out = tmp_path / "run"
     assert main(["train", str(problem), *words, "--out", str(out)]) == 0

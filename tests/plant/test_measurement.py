@@ -25,7 +25,7 @@ from pde_sim_node.plant import Instruments, Plant
 from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.real_time import Timing
 from pdeloop.in_process import LocalPair, train
-from tests.support.small import parameters, same_bits, train_here
+from tests.support.small import FEW_FITS, parameters, same_bits, train_here
 from tuner_node.build import build_training
 
 GRID = {
@@ -350,6 +350,7 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
         "optimizer": optimizer,
         "rollouts": 13,
         "horizon": 10,
+        **(FEW_FITS if optimizer == "gauss_newton" else {}),
     }
     both = train_here(parameters(seeds=2, **options), max_batch=3)
     alone = train_here(parameters(seed=1, **options))

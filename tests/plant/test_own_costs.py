@@ -18,6 +18,7 @@ from loop_method.laws.feedforward import FeedForward
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
+from tests.support.small import FEW_FITS
 
 N_Z, N_A, T = 6, 2, 20
 A = 0.95 * np.linalg.qr(np.random.default_rng(0).standard_normal((N_Z, N_Z)))[0]
@@ -91,7 +92,9 @@ def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
 
 
 def test_a_training_designs_and_adapts_for_it() -> None:
-    run = pdeloop.train(plant=Servo(), rollouts=9, evaluation_fields=2, reduced_order=N_Z)
+    run = pdeloop.train(
+        plant=Servo(), rollouts=9, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS
+    )
     plant, U = DynamicsPlant(Servo()), run.models[0].U
     z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target
     K, b = finite_horizon_of(A, B, drift, plant.cost, z_r)

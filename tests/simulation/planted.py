@@ -107,7 +107,7 @@ BUGS = {
     ),
     "tuner: lost samples": Bug(_PAIR, "return self.samples.lost(", "return 0 * self.samples.lost("),
     "tuner: episodes that the controller takes back": Bug(
-        _PAIR, "if not failure.retry and self.used(failure.episode):", "if False:"
+        _PAIR, "if not failure.retry and not repeated and self.used(failure.episode):", "if False:"
     ),
     "tuner: models of another controller": Bug(
         _PAIR,

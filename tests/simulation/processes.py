@@ -41,7 +41,7 @@ from pde_sim_node.plants.loading import hand_over
 from pde_sim_node.real_time import Timing
 from tests.simulation.disk import Disk
 from tests.support.plants import Rods
-from tests.support.small import parameters
+from tests.support.small import FEW_FITS, parameters
 from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.run_folder import RunIdentity
@@ -58,7 +58,7 @@ EVERY_PAIR = -1
 @cache
 def values(iterations: int, own_plant: bool, law: str = "affine") -> dict[str, Any]:
     """The parameters of the training: as few and as short episodes as have all of its phases."""
-    budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9}
+    budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9, **FEW_FITS}
     if iterations:
         budget = {"optimizer": "two_point", "iterations": iterations}
     limits: dict[str, Any] = {

@@ -25,7 +25,7 @@ from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import main
 from tests.support.interpreter import ROOT, python
-from tests.support.small import same_bits
+from tests.support.small import FEW_FITS, same_bits
 
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
@@ -217,7 +217,7 @@ def test_an_installed_package_offers_plants_by_name(
     ("name", "given", "method"),
     [
         (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
-        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15}),
+        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, **FEW_FITS}),
     ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(

@@ -10,7 +10,7 @@ import pytest
 
 from pdeloop.bags.verify import verify
 from tests.support.loop_harness import Processes, until
-from tests.support.small import SMALL, parameters, train_here
+from tests.support.small import FEW_FITS, SMALL, parameters, train_here
 from tests.support.small_loop import LIMIT, PARAMETERS, adapted, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
@@ -26,6 +26,7 @@ OWN: dict[str, Any] = {
     "n_a": 2,
     "horizon": HORIZON,
     "reduced_order": 3,
+    **FEW_FITS,
 }
 WORDS = [word for name, value in OWN.items() for word in ("-p", f"{name}:={value}")]
 

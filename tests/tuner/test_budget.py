@@ -15,7 +15,7 @@ from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn, StartColumn
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
-from tests.support.small import SMALL, parameters, same_bits, train_here
+from tests.support.small import FEW_FITS, SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
@@ -29,7 +29,7 @@ BUDGETS: list[dict[str, Any]] = [
         "optimizer": "gauss_newton",
         "rollouts": 12,
         "horizon": 10,
-        "field_model_settings.folds": 2,
+        **FEW_FITS,
         **NOISE,
     },
     {"optimizer": "two_point", "rollouts": 16},
