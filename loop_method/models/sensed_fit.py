@@ -119,8 +119,24 @@ def fit_sensed(
     if not holds or (start is None and problem.noise):
         problem.forget()
         found.append(part_by_part(problem, shared, fields, settings))
-    error, shared, fields = min(found, key=lambda own: own[0])
+    if problem.noise and near is None:
+        problem.forget()
+        found.append(part_by_part(problem, dispersion_of(shared), fields, settings))
+        # Errors that are all below the noise tell no equation from another.
+        error, shared, fields = min(found, key=lambda own: problem.implausibility(*own[1:]))
+    else:
+        error, shared, fields = min(found, key=lambda own: own[0])
     return shared, field_of(fields, n), max(error - problem.noise, 0.0)
+
+
+def dispersion_of(shared: Array) -> Array:
+    """No equation but the dispersion of another, on which the descent depends: a fit begins anew there.
+
+    What few rollouts suggested may be a wrong optimum, from which no descent leads away.
+    """
+    found, own = np.zeros_like(shared), TERMS.index((1, 3))
+    found[own] = shared[own]
+    return found
 
 
 def part_by_part(

@@ -169,6 +169,14 @@ class SensedProblem:
         """That over whole rollouts, without what noise has in it."""
         return self._error(shared, fields, self.y.shape[1]) - self.noise
 
+    def implausibility(self, shared: Array, fields: Array) -> float:
+        """The error over whole rollouts and the ridge of the prior: least for the likeliest unknowns.
+
+        Unlike what a fit minimises, it has the same ridges whatever that fit found to be relevant.
+        """
+        steps, x = self.y.shape[1], np.concatenate([shared, fields.ravel()])
+        return self._error(shared, fields, steps) + float(np.sum(self._prior(steps) * x * x))
+
     def _error(self, shared: Array, fields: Array, steps: int) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
             residuals = self._residuals(shared, fields[None], steps)
@@ -222,11 +230,16 @@ class SensedProblem:
         return parts(x)
 
     def _ridge(self, steps: int) -> Array:
+        ridge = self._prior(steps)
+        ridge[: self.shared] += self._precision
+        ridge[COEFFICIENTS + 1 : self.shared] += self.place_ridge**2
+        return ridge
+
+    def _prior(self, steps: int) -> Array:
         rollouts, weight, settings = len(self.y), self._weight(steps), self._settings
         shared = np.full(self.shared, weight / settings.sensed_deviation**2)
         shared[SHARED:] = weight / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
-        shared += settings.sensed_ridge**2 + self._precision
-        shared[COEFFICIENTS + 1 :] += self.place_ridge**2
+        shared += settings.sensed_ridge**2
         rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
         field = settings.sensed_field_ridge**2 / rollouts * rising
         if self.spread is None:

@@ -493,15 +493,19 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
 
 
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
-    """What they suggest is fitted to all rollouts from their beginning."""
+    """It is fitted to all rollouts from their beginning, from what two suggest and from nothing.
+
+    So is an equation of earlier rollouts, from which no descent may lead to a likelier one. Of errors
+    that are all below the noise the least is no better: the likeliest unknowns are taken.
+    """
     rng, actuators = np.random.default_rng(6), DECLARED
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
-    asked, worse = [], 0.0
+    starts: list[Array] = []
+    likelier, dispersion = np.zeros(unknowns(3)), TERMS.index((1, 3))
 
-    def recorded(*given: Any) -> tuple[float, Array, Array]:
-        asked.append(given)
-        error, *found = part_by_part(*given)
-        return error + worse, found[0], found[1]
+    def recorded(problem: SensedProblem, start: Array, *given: Any) -> tuple[float, Array, Array]:
+        starts.append(start)
+        return worse, likelier, np.zeros_like(problem.interpolated())
 
     ridges, guess = [], sensed_fit._first_guess
 
@@ -512,17 +516,41 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "part_by_part", recorded)
         patch.setattr(sensed_fit, "_first_guess", guessed)
+        patch.setattr(SensedProblem, "implausibility", lambda _, x, fields: abs(x[0] - wanted))
         # Of noise alone, which any equation explains.
         few = {"settings": FEW_ITERATIONS}
-        shared, fields, error = fit_sensed(readings, actions, actuators, 1.0, None, **few)
-        assert error < DEFAULTS.sensed_reproduced and len(asked) == 1
+        worse, wanted = 10.0, 0.0
+        shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
+        assert same_bits(shared, likelier) and len(starts) == 2
+        worse, wanted = 0.0, 1e9
+        shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
+        assert shared.any() and len(starts) == 4
+        again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
+        assert again.any() and len(starts) == 5
+        for guessed_start, start in ((starts[2], starts[3]), (shared, starts[4])):
+            assert start[dispersion] == guessed_start[dispersion] and np.sum(start != 0.0) <= 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
-        assert len(asked) == 1
-        worse = 10.0  # then what two of them suggest is kept
-        _, _, error = fit_sensed(readings, actions, actuators, 1.0, None, **few)
-    assert error < DEFAULTS.sensed_reproduced and len(asked) == 2
+        assert len(starts) == 5
     # What two of them have to say of each actuator is noise.
     assert ridges == [DEFAULTS.sensed_held_ridge] * 2
     # Nobody says where those of a plant of one's own are.
     free = SensedProblem(readings, actions, _equally_spaced(3), 1.0, readings[0, 0], np.ones(3))
     assert not free.holds
+
+
+def test_the_likeliest_unknowns_are_so_whatever_a_fit_found_relevant() -> None:
+    """The shift of actuators without strength changes no reading: all it costs is the prior."""
+    rng = np.random.default_rng(8)
+    readings, actions = rng.standard_normal((2, 12, SENSORS)), rng.standard_normal((2, 12, 3))
+    nowhere = np.zeros(SENSORS), np.full(2, np.nan)
+    problem = SensedProblem(readings, actions, DECLARED, 0.5, *nowhere)
+    shared, fields = np.zeros(unknowns(3)), problem.interpolated()
+    before = problem.implausibility(shared, fields)
+    shared[COEFFICIENTS + 1] = 3.0
+    moved = problem.implausibility(shared, fields)
+    # With errors as shares of the readings' mean square, each of the readings counts 1 / number.
+    variance = 0.5**2 / np.sum(readings**2)
+    assert moved - before == pytest.approx(variance * (3.0 / 10.0) ** 2, rel=1e-3)
+    problem.place_ridge = 7.0
+    problem.fit(shared, fields, lengths=[4])
+    assert problem.implausibility(shared, fields) == moved
