@@ -251,9 +251,11 @@ def misjudged_noise(summary: Row) -> list[str]:
     declared = f"{noise['declared']:.2g}" if noise["declared"] else "none"
     said = []
     if found := [one for one in noise["found"] if one]:
+        weak = ", and was explored too weakly" if max(found) > noise["declared"] else ""
         said.append(
             f"measurement noise of about {span(found, '.2g')} was found{_share(found, summary)}, and "
-            f"{declared} was declared (measurement_noise): the optimiser accounted for it"
+            f"{declared} was declared (measurement_noise): the optimiser accounted for it, the first "
+            f"law did not{weak}"
         )
     if seeming := [one for one in noise.get("seeming", []) if one]:
         about = "at most" if max(seeming) < noise["declared"] else "about"

@@ -62,7 +62,8 @@ class FieldLaw:
         law and of the law to compare with; infinite where there is none, or it diverges.
     noise : float
         Measurement noise that the model was fitted for where another one, or none, was declared; 0:
-        what was declared.
+        what was declared. There is no law then, as the exploration was drawn for the declared noise,
+        and is too weak for the effects of the actuators where that is less.
     """
 
     fitted: FittedModel | None
@@ -101,10 +102,12 @@ class FieldLaw:
             f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
         ]
         if self.noise:
-            lines.append(
-                f"  measurement noise of about {self.noise:.2g} was found, which was not declared "
-                "(measurement_noise): the model was fitted for it"
-            )
+            return [
+                *lines,
+                f"  measurement noise of about {self.noise:.2g} was found, which was not declared: the "
+                "law is that of the regression; declare it (measurement_noise) and explore again, as "
+                "strongly as it requires",
+            ]
         if self.rows is None:
             return [*lines, "  it is not accurate enough: the law is that of the regression"]
         taken = "its law is used" if self.better else "the law of the regression is used"
@@ -130,15 +133,16 @@ def best_model(
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
 ) -> tuple[FittedModel | None, float]:
-    """The model of the whole field that predicts trajectories best, or pieces of them, and the noise.
+    """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
 
+    The noise is what the model was fitted for where another, or none, was declared; 0: as declared.
     Pieces, because the state of a chaotic plant soon becomes independent of its initial field. They are
     predicted even by models that take noise for the field, so noise that was not declared is
     looked for before. The work grows with the third power of the size of the state, so there is a
     largest one.
     """
     if len(target) > settings.field_largest:
-        return None, noise
+        return None, 0.0
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
     whole = fit_field_model(
         rollouts, target, action_limit=action_limit, noise=noise, settings=models
@@ -156,10 +160,10 @@ def best_model(
     if misjudged is not None:
         return misjudged
     if error <= settings.field_error:
-        return whole, noise
+        return whole, 0.0
     parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
     found = fit_field_model(parts, target, action_limit=action_limit, noise=noise, settings=models)
-    return (found if found is not None and found.error < error else whole), noise
+    return (found if found is not None and found.error < error else whole), 0.0
 
 
 def field_law(
@@ -198,16 +202,14 @@ def field_law(
     models : FieldModelSettings
         How models are fitted and one is chosen.
     """
-    declared = noise
-    fitted, noise = best_model(trajectories, target, action_limit, settings, declared, models)
-    found = 0.0 if noise == declared else noise
-    if fitted is None or fitted.error > settings.field_error:
-        return FieldLaw(fitted)
+    fitted, found = best_model(trajectories, target, action_limit, settings, noise, models)
+    if fitted is None or found or fitted.error > settings.field_error:
+        return FieldLaw(fitted, noise=found)
     model, n_s = fitted.model, other.U.shape[1]
     A, B = model.linearise(target, np.zeros(model.n_a))
     drift = model.step(target[None], np.zeros((1, model.n_a)))[0] - target
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
-        return FieldLaw(fitted, noise=found)
+        return FieldLaw(fitted)
     horizon = max(len(actions) for _, actions in trajectories)
     try:
         if cost is None:
@@ -215,9 +217,9 @@ def field_law(
         else:
             K, b = finite_horizon_of(A, B, drift, cost, target)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
-        return FieldLaw(fitted, noise=found)
+        return FieldLaw(fitted)
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
-        return FieldLaw(fitted, noise=found)
+        return FieldLaw(fitted)
     fields = [states[0] for states, _ in trajectories]
     if noise:
         fields = list(smoothed(np.stack(fields), noise))
@@ -248,7 +250,7 @@ def field_law(
             total += action_weight * float(np.sum(actions**2))
         return total / (horizon * len(fields))
 
-    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other), found)
+    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other))
 
 
 def sum_of(cost: Cost, states: Array, actions: Array) -> float:

@@ -330,6 +330,7 @@ def test_noise_that_was_not_declared_so_is_a_warning(
     noise = {"declared": declared, "found": found}
     (text,) = misjudged_noise({"noise": noise, "seeds": len(found)})
     assert said in text
+    assert ("explored too weakly" in text) == (max(found) > declared)
     assert misjudged_noise({"noise": {"declared": declared, "found": [0.0]}, "seeds": 1}) == []
     assert misjudged_noise({"seeds": 1}) == []  # a result of an older version
 
