@@ -69,7 +69,7 @@ class ProjectedLaw:
         self._shape = (0, 0)
         identity = np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))
         self._take(np.concatenate([identity] * 2, axis=2), np.arange(count))
-        control(self._plan, np.tile(z_r, (count, 1)), self._reduced_targets)
+        control(self._plan, read_only(np.tile(z_r, (count, 1))), self._reduced_targets)
         plan["limit"] = action_limit
         self._set = False
 

@@ -24,6 +24,7 @@ from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameters import model_order
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant, complete
+from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
@@ -33,6 +34,7 @@ from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from pdeloop.unused import refuse_unused
+from spectral_solver import polynomial_step
 from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import kind_of, training_parameters
@@ -74,16 +76,20 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def load_compiled(values: Mapping[str, Any]) -> None:
+def load_compiled(values: Mapping[str, Any], *, fits: bool = False) -> None:
     """Load or compile what a run with these parameters needs; ValueError where that is impossible.
 
     Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
+
+    fits: also what fits of field models call, as a compiler that knows the plant's FFT is faster.
     """
     notice = threading.Timer(4.0, print, ["compiling, once ..."], {"file": sys.stderr})
     notice.daemon = True
     notice.start()
     try:
         plant = build_plant(values)
+        if fits and _fits_circles(values, plant):
+            polynomial_step.load_compiled()
         controller_node.law.load_compiled()
         if importlib.util.find_spec("fast_path"):
             compiled = ["pde_sim_node"] * (plant.parallel is not None)
@@ -91,6 +97,12 @@ def load_compiled(values: Mapping[str, Any]) -> None:
                 importlib.import_module(f"{node}.fast_path").load_compiled()
     finally:
         notice.cancel()
+
+
+def _fits_circles(values: Mapping[str, Any], plant: Plant) -> bool:
+    """Whether models of one field on a periodic axis are fitted, whose kinds are tried first."""
+    whole = plant.grid.is_circle and len(plant.grid.components) == 1 and not values["sensors"]
+    return whole and (kind_of(values).needs_trajectories or values["identification"] == "field")
 
 
 def begin(
@@ -109,7 +121,7 @@ def begin(
         check_messages(values, training)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).refuse_another()
-    load_compiled(values)
+    load_compiled(values, fits=True)
     RunFolder(folder).create(values)
     return folder, values
 

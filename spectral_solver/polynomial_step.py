@@ -217,3 +217,16 @@ def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:
     values = (e - 1) / r, (e - 1 - r) / r**2, (e - 1 - r - r**2 / 2) / r**3
     phi1, phi2, phi3 = (np.mean(value, axis=1) for value in values)
     return phi1, phi2, phi3
+
+
+def load_compiled() -> None:
+    """Load what the steps and the fits of any size call, or compile it."""
+    n_x = 2 * WIDTH  # the least size whose spectra are compiled
+    none, constant = np.zeros(n_x // 2 + 1, dtype=np.complex128), np.zeros(n_x)
+    equation = Polynomials(
+        none, none[None], np.ones((1, 1)), np.zeros((n_x, 1)), constant, 2, np.inf
+    )
+    step, states, actions = PolynomialStep(equation), np.zeros((1, n_x)), np.zeros((1, 1))
+    step.step(states, actions)
+    step.integrals(states, actions, states)
+    step.pull_back(states, actions, states)

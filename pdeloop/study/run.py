@@ -129,8 +129,9 @@ def run(
             with executor() as pool:
                 todo = {n: v for n, v in trainings.items() if n not in finished}
                 if isinstance(pool, ProcessPoolExecutor):  # of this machine: once for all of them
-                    for values in {v["equation"]: v for v in todo.values()}.values():
-                        load_compiled(values)
+                    different = {(v["equation"], v["optimizer"]): v for v in todo.values()}
+                    for values in different.values():
+                        load_compiled(values, fits=True)
                 write_study(folder, study)  # not before there are workers
                 waiting = {
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from controller_node.law import control, load_compiled
 from controller_node.policy import ProjectedLaw, excitation
 
 N_Z, N_S, N_A = 64, 5, 3
@@ -39,6 +40,17 @@ def test_is_the_law() -> None:
             action, K_a @ U.T @ states[m] + K_b @ U.T @ TARGET, rtol=1e-12, atol=1e-12
         )
     np.testing.assert_allclose(law.reduced_targets, [U.T @ TARGET for U in models], atol=1e-13)
+
+
+def test_states_of_a_message_and_of_this_process_are_one_type_to_the_compiler() -> None:
+    load_compiled()
+    law = ProjectedLaw(bases(1), TARGET)
+    policies, states = batch(2)
+    law.set(policies)
+    expected = law.actions(states)
+    states.setflags(write=False)
+    assert np.array_equal(law.actions(states), expected)
+    assert len(control.signatures) == 1
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 13])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -23,6 +24,10 @@ from loop_method.models.finite_difference_kernels import advance
 from loop_method.models.linear import LinearModel, add_products
 from loop_method.models.prediction import errors, pieces, predicted
 from loop_method.models.spectral import SpectralModel
+from pdeloop.training_run import load_compiled, resolve
+from spectral_solver import polynomial as compiled
+from spectral_solver import polynomial_step
+from tests.support.small import SMALL
 
 
 def spectral(n_z=24, degree=3, clip=np.inf):
@@ -226,6 +231,39 @@ def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> No
     for states in kinds:
         for one in (model, differences):
             np.testing.assert_array_equal(one.step(states, np.zeros((4, 1))), states)
-    for compiled in (add_products, advance):
-        assert len(compiled.signatures) == 1
+    for kernel in (add_products, advance):
+        assert len(kernel.signatures) == 1
     assert z.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("options", "loaded"),
+    [
+        ({"optimizer": "model_based"}, True),
+        ({"optimizer": "two_point", "identification": "field"}, True),
+        ({"optimizer": "two_point"}, False),
+        ({"optimizer": "gauss_newton", "sensors": 8}, False),
+    ],
+)
+def test_what_the_fits_of_a_training_call_is_compiled_before_it(
+    options: dict[str, Any], loaded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[None] = []
+    monkeypatch.setattr(polynomial_step, "load_compiled", lambda: calls.append(None))
+    values = resolve(str(SMALL), options)
+    load_compiled(values)
+    assert not calls
+    load_compiled(values, fits=True)
+    assert bool(calls) == loaded
+
+
+def test_what_is_compiled_for_a_small_grid_serves_every_other() -> None:
+    polynomial_step.load_compiled()
+    model, rng = replace(spectral(n_z=32), substeps=2), np.random.default_rng(0)
+    z, a = rng.standard_normal((2, 32)), rng.standard_normal((2, 2))
+    model.step(z, a)
+    model.pull_back(z, a, z)
+    model.compiled.integrals(z, a, z)
+    kernels = compiled.advance, compiled.analysed, compiled.synthesised
+    for kernel in (*kernels, compiled.integrals, compiled.pull_back):
+        assert len(kernel.signatures) == 1
