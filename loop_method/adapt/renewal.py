@@ -109,18 +109,46 @@ def renew(
     descend = _descent(loop, rng, settings, components, periodic, least_gain)
     few = settings.mixtures // 2
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
-        found = descend([first, improved], fields, 0)
-        if found is None:
+        only = descend([first, improved], fields, 0)
+        if only is None:
             return None
-        before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, found[0]))
-        return Renewal(found[0], found[0], [], 1.0, Estimate(after - before), found[1])
-    made, steps = _of_parts(descend, first, parts or [first] * settings.folds, fields, few)
-    found = descend([first, improved], fields, settings.mixtures if final else few)
-    if found is None:
-        return None
-    fraction, change = held_out_fraction(loop, first, made, fields, settings)
-    theta = first + fraction * (found[0] - first)
-    return Renewal(theta, found[0], made, fraction, change, steps + found[1])
+        before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, only[0]))
+        return Renewal(only[0], only[0], [], 1.0, Estimate(after - before), only[1])
+
+    def from_fields(
+        start: Array, starts: Sequence[Array], drawn: int, of_parts: int
+    ) -> Renewal | None:
+        made, steps = _of_parts(descend, first, starts, fields, of_parts)
+        best = descend([first, start], fields, drawn)
+        if best is None:
+            return None
+        fraction, change = held_out_fraction(loop, first, made, fields, settings)
+        theta = first + fraction * (best[0] - first)
+        return Renewal(theta, best[0], made, fraction, change, steps + best[1])
+
+    starts = [first] * settings.folds
+    drawn, most = settings.mixtures if final else few, settings.most_mixtures
+    found = from_fields(improved, parts or starts, drawn, few)
+    if found is None or not final or most <= drawn:
+        return found
+    if not is_overfitted(loop, first, found, fields, settings):
+        return found
+    # A law that is best on too few fields is no start: the descent would stay near it.
+    again = from_fields(first, starts, most, most)
+    if again is None or not again.change.value < found.change.value:
+        return found
+    return replace(again, steps=found.steps + again.steps)
+
+
+def is_overfitted(
+    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ImprovementSettings
+) -> bool:
+    """True if fields that were left out confirm too little of what a law gains on its own."""
+    before, after = loop.costs(first, fields), loop.costs(found.improved, fields)
+    known = np.isfinite(before) & np.isfinite(after)
+    gain = float(np.sum(before[known] - after[known])) / len(fields)
+    worthwhile = gain > settings.first_gain * float(before[known].mean()) if known.any() else False
+    return worthwhile and -found.change.value < settings.confirmed * gain
 
 
 def renew_from_states(
@@ -139,7 +167,7 @@ def renew_from_states(
 
     records: all rollouts, denoised.
     """
-    settings, found = replace(settings, mixtures=0), None
+    settings, found = replace(settings, mixtures=0, most_mixtures=0), None
     for count in (settings.chaotic_fields, settings.chaotic_most):
         fields = measured_states(records, count)
         # Others than last time, so that the laws of the parts may know those of their own part.

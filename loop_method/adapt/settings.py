@@ -37,6 +37,20 @@ class ImprovementSettings(Settings):
         0,
         1000,
     )
+    most_mixtures: int = setting(
+        96,
+        "the same for the final law where fewer fields make one that the fields left out do not "
+        "confirm",
+        0,
+        1000,
+    )
+    confirmed: float = setting(
+        0.5,
+        "share of its gain on its own fields that a law must have on those left out, or it is made "
+        "again on more drawn fields",
+        0.0,
+        1.0,
+    )
     chaotic_fields: int = setting(
         32,
         "measured states used as initial fields of a chaotic plant, for which no fields are drawn",

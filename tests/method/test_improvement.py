@@ -12,7 +12,7 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.initial_fields import averaged_over_shifts, invariant_share, mixtures
-from loop_method.adapt.renewal import confirmed_fraction
+from loop_method.adapt.renewal import Renewal, confirmed_fraction, is_overfitted, renew
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.design.lqt import track
 from loop_method.models.linear import LinearModel
@@ -287,3 +287,30 @@ def test_a_way_from_the_best_law_is_not_confirmed_by_fields_that_were_left_out()
     ]
     assert confirmed[0][0] >= 0.5 and confirmed[0][1].value < -0.5 * (found.before - found.after)
     assert confirmed[1] == (0.0, ZERO)
+
+
+def renewed(measured: np.ndarray, **constants: int) -> tuple[Renewal, float]:
+    """The law made from a few fields, and its cost on many others."""
+    closed = loop()
+    none, settings = closed.no_control, ModelBasedSettings(mixtures=2, **constants)
+    found = renew(closed, none, none, [], measured, np.random.default_rng(6), settings)
+    assert found is not None
+    return found, float(closed.costs(found.theta, fields(100)).mean())
+
+
+def test_a_law_that_other_fields_do_not_confirm_is_made_again_on_more_draws() -> None:
+    """The fields look alike everywhere, so that draws of their distribution tell what eight do not."""
+    measured = np.random.default_rng(101).normal(size=(8, N_Z))
+    few, cost = renewed(measured, most_mixtures=2)
+    assert few.fraction == 0.0
+    assert is_overfitted(loop(), loop().no_control, few, measured, ModelBasedSettings())
+    more, less = renewed(measured, most_mixtures=96)
+    assert more.fraction == 1.0 and more.change.is_negative(1.0)
+    assert less < 0.95 * cost and more.steps > few.steps
+
+
+def test_a_law_that_other_fields_confirm_is_kept_to_the_bit() -> None:
+    measured = np.random.default_rng(102).normal(size=(8, N_Z))
+    (few, _), (more, _) = (renewed(measured, most_mixtures=most) for most in (2, 96))
+    assert few.fraction > 0.0 and few.theta.tobytes() == more.theta.tobytes()
+    assert not is_overfitted(loop(), loop().no_control, few, measured, ModelBasedSettings())
