@@ -19,7 +19,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record, State
@@ -109,8 +108,7 @@ class Proposer:
         """Continue from a checkpoint; ValueError if it is not one."""
         found = noise_of(state) if "noise" in state else 0.0
         if self.sensed:
-            shape = self.sensed.equation.shape
-            self.sensed.equation = checked_array(state, "equation", "f", shape).copy()
+            self.sensed.restore(state)
         self._take_noise(found)
 
     def _take_noise(self, noise: float) -> None:

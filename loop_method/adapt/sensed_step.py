@@ -6,9 +6,10 @@ Applies where every sensor is read once and a model of the field reproduces the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
@@ -17,7 +18,14 @@ from loop_method.adapt.field_step import extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
 from loop_method.adapt.settings import GaussNewtonSettings
-from loop_method.models.sensed import KIND, Actuators, interpolated, sensed_model, unknowns
+from loop_method.models.sensed import (
+    KIND,
+    Actuators,
+    interpolated,
+    sensed_model,
+    unknowns,
+    unknowns_of,
+)
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 
@@ -41,7 +49,7 @@ class SensedProposals:
 
     Attributes
     ----------
-    equation : (12 + n_a,) array
+    equation : (24 + n_a,) array
         The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
@@ -58,6 +66,10 @@ class SensedProposals:
         self._largest_cost, self._settings = largest_cost, settings
         self._own = own or GaussNewtonSettings()
         self.equation: Array = np.zeros(unknowns(len(actuators.centres)))
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from the `equation` of a checkpoint."""
+        self.equation = unknowns_of(state, "equation", len(self._actuators.centres)).copy()
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""

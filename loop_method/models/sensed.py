@@ -15,6 +15,7 @@ points in it. Below the grid the second derivative does what a finer one would: 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,14 +28,22 @@ from loop_method.models.base import Arrays, numbers_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import fewer_of, substeps_of
+from loop_method.models.symbols import ORDERS
 from spectral_solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
 
-# p and j of the terms; 1 is added for the constant.
-TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
-_DIFFUSION, _HIGHEST = TERMS.index((1, 2)), TERMS.index((3, 0))
+FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
+"""p and j of the terms that every fit begins with."""
+TERMS = FIRST + tuple(
+    (p, j)
+    for p, highest in enumerate(ORDERS, start=1)
+    for j in range(highest + 1)
+    if (p, j) not in FIRST
+)
+"""Those of every equation that a model of the whole field may have."""
 COEFFICIENTS = len(TERMS) + 1
+"""Their number, and 1 for the constant."""
 # b, x_0, s and w.
 _ACTUATORS = 4
 KIND = "sensed"
@@ -43,6 +52,8 @@ SHARED = COEFFICIENTS + _ACTUATORS
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
+# The size of the field that does so above the third power.
+_SIZE = 4.0
 WAVES = 16
 """Cosines and sines of an initial field, in addition to its mean."""
 # The least number of grid points.
@@ -54,10 +65,28 @@ def unknowns(n_a: int) -> int:
     return SHARED + n_a
 
 
+def open_unknowns(shared: Array) -> NDArray[np.intp]:
+    """The unknowns that a fit starting from these finds: all but those terms that are not used yet."""
+    own = np.arange(len(shared))
+    return np.flatnonzero((own < len(FIRST)) | (own >= len(TERMS)) | (shared != 0.0))
+
+
 def well_posed(shared: Array) -> Array:
     """The nearest unknowns whose short waves do not grow and whose large fields are not driven on."""
     found = shared.copy()
-    found[_DIFFUSION], found[_HIGHEST] = max(shared[_DIFFUSION], 0.0), min(shared[_HIGHEST], 0.0)
+
+    def bound(term: tuple[int, int], sign: float) -> float:
+        i = TERMS.index(term)
+        found[i] = sign * max(sign * shared[i], 0.0)
+        return float(found[i])
+
+    # The highest even derivative damps, the diffusion of large fields as well.
+    if not bound((1, 4), -1.0):
+        bound((1, 2), 1.0)
+    bound((3, 2), 1.0)
+    for p in range(len(ORDERS), 2, -2):
+        if bound((p, 0), -1.0):
+            break
     return found
 
 
@@ -110,7 +139,7 @@ class SensedModel(SpectralModel):
 
     Attributes
     ----------
-    shared : (12 + n_a,) array
+    shared : (24 + n_a,) array
         Its unknowns, in their units.
     actuators : Actuators
         What is declared of them.
@@ -156,7 +185,7 @@ class SensedModel(SpectralModel):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         return SensedModel(
             **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
-            shared=_shared_of(arrays, whole.n_a),
+            shared=unknowns_of(arrays, "shared", whole.n_a),
             actuators=Actuators(
                 numbers_of(arrays, "centres", whole.n_a), _widths_of(arrays, whole.n_a)
             ),
@@ -180,12 +209,16 @@ def _widths_of(arrays: Arrays, n_a: int) -> Array:
     return widths
 
 
-def _shared_of(arrays: Arrays, n_a: int) -> Array:
-    """The unknowns of `arrays`; older ones have equal actuators."""
-    known = arrays.get("shared")
-    if known is not None and known.shape == (SHARED,):
-        return np.append(numbers_of(arrays, "shared", SHARED), np.zeros(n_a))
-    return numbers_of(arrays, "shared", unknowns(n_a))
+def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
+    """The unknowns of `arrays`; older ones have the first terms alone, or equal actuators as well."""
+    further, known = SHARED - len(TERMS) + len(FIRST), arrays.get(name)
+    if known is None or known.shape not in ((further,), (further + n_a,)):
+        return numbers_of(arrays, name, unknowns(n_a))
+    older = np.zeros(unknowns(n_a))
+    own = numbers_of(arrays, name, len(known))
+    older[: len(FIRST)] = own[: len(FIRST)]
+    older[len(TERMS) : len(TERMS) + len(own) - len(FIRST)] = own[len(FIRST) :]
+    return older
 
 
 def sensed_model(
@@ -200,7 +233,7 @@ def sensed_model(
 
     Parameters
     ----------
-    shared : (12 + n_a,) array
+    shared : (24 + n_a,) array
         The unknowns that all rollouts share, in their units.
     sensors : int
         n_y.
@@ -215,17 +248,17 @@ def sensed_model(
     """
     n = grid_points(sensors)
     equation = SensedEquation(shared, n, actuators, settings)
-    symbols = np.stack([equation.linear, equation.square, equation.cube])
-    substeps = substeps_of(symbols, largest, settings)
+    symbols, followed = equation.symbols, equation.followed(largest)
+    substeps = substeps_of(followed, largest, settings)
     return SensedModel(
         KIND,
-        equation.linear,
+        symbols[0],
         symbols[1:],
-        np.eye(2),
+        np.eye(len(symbols) - 1),
         equation.supports * equation.strengths,
         np.full(n, equation.constant),
         substeps=substeps,
-        fewer=fewer_of(symbols, largest, substeps, settings),
+        fewer=fewer_of(followed, largest, substeps, settings),
         shared=shared,
         actuators=actuators,
         sensors=sensors,
@@ -234,7 +267,7 @@ def sensed_model(
 
 
 class SensedEquation:
-    """The equation in Fourier space, for unknowns (12 + n_a,)."""
+    """The equation in Fourier space, for unknowns (24 + n_a,)."""
 
     def __init__(
         self,
@@ -246,13 +279,19 @@ class SensedEquation:
         waves, self._settings = np.arange(n // 2 + 1), settings
         derivative = 2j * np.pi * waves
         derivative[waves == n // 2] = 0.0
-        symbols = np.zeros((3, waves.size), dtype=np.complex128)
-        for i, (p, j) in enumerate(TERMS):
-            unit = 1.0 / (_TIME * _WAVENUMBER**j)
-            symbols[p - 1] += unit * shared[i] * derivative**j
-        linear, self.square, self.cube = symbols
+        used = [i for i in range(len(TERMS)) if shared[i]]
+        degree = max(3, *(TERMS[i][0] for i in used), 0)
+        self.symbols: Spectrum = np.zeros((degree, waves.size), dtype=np.complex128)
+        """Of the powers 1, 2, ... of the field."""
+        for i in used:
+            p, j = TERMS[i]
+            wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
+            unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
+            self.symbols[p - 1] += unit * shared[i] * derivative**j
+        self._fourth = bool(shared[TERMS.index((1, 4))])
         # What grows faster would overflow within an episode.
-        self.linear = np.minimum(linear.real, settings.sensed_growth) + 1j * linear.imag
+        grown = self.symbols[0]
+        self.symbols[0] = np.minimum(grown.real, settings.sensed_growth) + 1j * grown.imag
         self.constant = float(shared[COEFFICIENTS - 1]) / _TIME
         b, x_0, s, w = shared[COEFFICIENTS:SHARED] / _TIME
         self.strengths: Array = b + shared[SHARED:] / _TIME
@@ -268,13 +307,23 @@ class SensedEquation:
 
     def substeps(self, sizes: Array) -> NDArray[np.int64]:
         """Internal steps for fields of these sizes."""
-        symbols = np.stack([self.square, self.cube])
-        symbols = symbols[:, : 2 * symbols.shape[1] // 3]
-        z = sizes[:, None]
-        rates = np.abs(2.0 * z * symbols[0]) + np.abs(3.0 * z * z * symbols[1])
+        symbols = self.followed(float(sizes.max()))[1:, : 2 * self.symbols.shape[1] // 3]
+        rates = _rates(symbols, sizes).max(axis=1)
         most = self._settings.substeps
-        steps = np.nan_to_num(np.ceil(rates.max(axis=1) / self._settings.reach), nan=most)
+        steps = np.nan_to_num(np.ceil(rates / self._settings.reach), nan=most)
         return np.asarray(np.clip(steps, 1, most), dtype=np.int64)
+
+    def followed(self, size: float) -> Spectrum:
+        """The symbols whose rates, for fields of this size, the internal steps follow.
+
+        Short waves that a fourth derivative damps faster than the powers drive them follow long ones.
+        """
+        if not self._fourth:
+            return self.symbols
+        damped = _rates(self.symbols[1:], np.array([size]))[0] <= -self.symbols[0].real
+        found: Spectrum = np.where(damped, 0.0, self.symbols)
+        found[0] = self.symbols[0]
+        return found
 
     def compiled(self, substeps: int, supports: Array, clip: float = np.inf) -> PolynomialStep:
         """The step, with these internal steps and supports, and a constant forcing of 1.
@@ -283,15 +332,23 @@ class SensedEquation:
         ValueError if the unknowns are not finite.
         """
         equation = Polynomials(
-            self.linear,
-            np.stack([self.square, self.cube]),
-            np.eye(2),
+            self.symbols[0],
+            self.symbols[1:],
+            np.eye(len(self.symbols) - 1),
             supports,
             np.ones(len(supports)),
             substeps,
             clip,
         )
         return PolynomialStep(equation)
+
+
+def _rates(symbols: Spectrum, sizes: Array) -> Array:
+    """How fast powers of these symbols, above the first, act on each wave of fields of these sizes."""
+    z, found = sizes[:, None], np.zeros((len(sizes), symbols.shape[1]))
+    for p, own in enumerate(symbols, start=2):
+        found += np.abs(p * z ** (p - 1) * own)
+    return found
 
 
 def field_of(coefficients: Array, n: int) -> Array:

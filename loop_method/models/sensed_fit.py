@@ -34,6 +34,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import TERMS, Actuators, coefficients_of, field_of, grid_points
+from loop_method.models.sensed_growth import Found, further_terms, grown, start_with
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -66,7 +67,7 @@ def fit_sensed(
         What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
-    start : (12 + n_a,) array, optional
+    start : (24 + n_a,) array, optional
         The shared unknowns to begin with; from several equations, with no actuators, if there are none.
     target : (n_y,) array, optional
         z_r at the sensors.
@@ -82,7 +83,7 @@ def fit_sensed(
 
     Returns
     -------
-    (12 + n_a,) array, (rollouts, n) array and float
+    (24 + n_a,) array, (rollouts, n) array and float
         The shared unknowns with the least error, the initial fields, and the error: what is minimised,
         but for the ridge and for what noise has in it. It is infinite where no equation reproduces even
         the beginning of the rollouts.
@@ -93,48 +94,65 @@ def fit_sensed(
     problem = SensedProblem(y, a, actuators, noise, target, distances, settings)
     problem.spread = spread
     fields, n = problem.interpolated(), grid_points(y.shape[2])
-    if start is None:
+    if start is not None:
+        known = None if near is None else coefficients_of(near)
+        found = _refined(problem, start, fields, known, settings)
+    else:
         calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
         acted = [m for m in calmest if a[m].any()]
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
-        few = SensedProblem(
-            *(y[pair], a[pair], actuators, noise, target, distances[pair], settings),
-            settings.sensed_held_ridge if problem.holds else settings.sensed_place_ridge,
-        )
-        error, shared, fields[pair] = _first_guess(few, settings)
+        error, shared, fields[pair] = _first_guess(problem.part(pair, hold=True), settings)
         if not np.isfinite(error):
             return shared, field_of(fields, n), np.inf
-    else:
-        shared = start
-    if near is None:
+        found = _refined(problem, shared, fields, None, settings, first=True)
+        shared = further_terms(problem, found, settings)
+        if shared is not found[1]:
+            found = _refined(problem, shared, problem.interpolated(), None, settings, first=True)
+    error, shared, fields = found
+    return shared, field_of(fields, n), max(error, 0.0)
+
+
+def _refined(
+    problem: SensedProblem,
+    shared: Array,
+    fields: Array,
+    known: Array | None,
+    settings: FieldModelSettings,
+    *,
+    first: bool = False,
+) -> Found:
+    """The fit to all rollouts from these unknowns; known: their fields, if an earlier fit found them.
+
+    first: the equation is that of a few rollouts.
+    """
+    fresh = known is None
+    if known is None:
         _, _, known = problem.fit(shared, fields, known=True)
-    else:
-        known = coefficients_of(near)
-    whole, found = [y.shape[1]] * _WHOLE, []
+    whole, found = [problem.y.shape[1]] * _WHOLE, []
     # Else the equation does not hold for the other rollouts: nothing is near enough for a whole fit.
     holds = problem.error(shared, known) <= settings.sensed_reproduced
     if holds:
         found.append(problem.fit(shared, known, lengths=whole))
     # With noise two rollouts leave much of an equation open.
-    if not holds or (start is None and problem.noise):
+    if not holds or (first and problem.noise):
         problem.forget()
         found.append(part_by_part(problem, shared, fields, settings))
-    if problem.noise and near is None:
+    if problem.noise and fresh:
         problem.forget()
         found.append(part_by_part(problem, dispersion_of(shared), fields, settings))
         # Errors that are all below the noise tell no equation from another.
         error, shared, fields = min(found, key=lambda own: problem.implausibility(*own[1:]))
     else:
         error, shared, fields = min(found, key=lambda own: own[0])
-    return shared, field_of(fields, n), max(error - problem.noise, 0.0)
+    return error - problem.noise, shared, fields
 
 
 def dispersion_of(shared: Array) -> Array:
-    """No equation but the dispersion of another, on which the descent depends: a fit begins anew there.
+    """No equation but the terms and the dispersion of another, on which a descent depends.
 
     What few rollouts suggested may be a wrong optimum, from which no descent leads away.
     """
-    found, own = np.zeros_like(shared), TERMS.index((1, 3))
+    found, own = start_with(shared), TERMS.index((1, 3))
     found[own] = shared[own]
     return found
 
@@ -156,20 +174,23 @@ def part_by_part(
     return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
 
 
-def _first_guess(
-    problem: SensedProblem, settings: FieldModelSettings
-) -> tuple[float, Array, Array]:
-    """The least error, without that of the noise, and the unknowns of a few rollouts that have it."""
-    least, best = np.inf, (np.zeros(problem.shared), problem.interpolated())
+def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:
+    """The least error, and the unknowns of a few rollouts that have it."""
+    best = np.inf, np.zeros(problem.shared), problem.interpolated()
+    reached, longest = 0, best
     for i, share in enumerate(_DISPERSIONS):
-        good = least <= settings.sensed_reproduced
-        if least <= settings.sensed_enough or (good and i >= _FEW):
+        good = best[0] <= settings.sensed_reproduced
+        if best[0] <= settings.sensed_enough or (good and i >= _FEW):
             break
-        first = np.zeros(problem.shared)
-        first[TERMS.index((1, 3))] = share * settings.sensed_dispersion
+        start = np.zeros(problem.shared)
+        start[TERMS.index((1, 3))] = share * settings.sensed_dispersion
         problem.forget()
         most = settings.sensed_hopeless
-        error, *found = problem.fit(first, problem.interpolated(), most=most)
-        if error - problem.noise < least:
-            least, best = error - problem.noise, (found[0], found[1])
-    return least, *best
+        error, *found = problem.fit(start, problem.interpolated(), most=most)
+        if error - problem.noise < best[0]:
+            best = error - problem.noise, found[0], found[1]
+        if problem.reached > reached:
+            reached, longest = problem.reached, (np.inf, found[0], found[1])
+    if np.isfinite(best[0]) or not reached:
+        return best
+    return grown(problem, longest, problem.missing(*longest[1:], reached), reached, settings)

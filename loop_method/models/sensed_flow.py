@@ -8,7 +8,7 @@ linear in the supports and their strengths, so that each row has inputs of its o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,11 @@ _FASTEST = 1e50
 
 
 class SensedFlow:
-    """The equation with the unknowns (12 + n_a,), and with each of them less by a difference.
+    """The equation with the unknowns (24 + n_a,), and with some of them less by a difference each.
 
     Parameters
     ----------
-    shared : (12 + n_a,) array
+    shared : (24 + n_a,) array
         The unknowns.
     n : int
         Number of grid points.
@@ -39,8 +39,10 @@ class SensedFlow:
         How they do.
     clip : float
         As of `SensedEquation.compiled`.
+    varied : sequence of int
+        Which unknowns, in their order.
     difference : float
-        Zero: the equation alone.
+        By how much.
     """
 
     def __init__(
@@ -51,21 +53,24 @@ class SensedFlow:
         sizes: Array,
         settings: FieldModelSettings,
         clip: float,
+        varied: Sequence[int] = (),
         difference: float = 0.0,
     ) -> None:
-        changes = np.zeros((1, shared.size))
-        if difference:
-            changes = np.vstack([changes, difference * np.eye(shared.size)])
+        changes = np.zeros((1 + len(varied), shared.size))
+        changes[1 + np.arange(len(varied)), list(varied)] = difference
         equations = [SensedEquation(shared - own, n, actuators, settings) for own in changes]
-        first, self._terms = equations[0], equations[1 : 1 + len(TERMS)]
+        first, self._terms = (
+            equations[0],
+            [own for i, own in zip(varied, equations[1:], strict=True) if i < len(TERMS)],
+        )
         self.finite = all(
-            bool(np.abs(each.linear).max() < _FASTEST) for each in [first, *self._terms]
+            bool(np.abs(each.symbols[0]).max() < _FASTEST) for each in [first, *self._terms]
         )
         """False where the unknowns are so far off that nothing can be simulated."""
         self._modes, self._clip, self._first = n // 2 + 1, clip, first
         self._substeps = _few(first.substeps(sizes)) if self.finite else np.ones(0, np.int64)
         # Shift, spacing and width of the actuators change the supports; the others only strengths.
-        moved = range(COEFFICIENTS + 2, SHARED + 1) if difference else ()
+        moved = [k for k, i in enumerate(varied, start=1) if COEFFICIENTS < i < SHARED]
         self._supports = np.hstack([equations[i].supports for i in (0, *moved)])
         n_a, self._blocks = len(actuators.centres), 1 + len(moved)
         self._gains = np.zeros((len(equations), self._blocks * n_a + 1))

@@ -10,12 +10,15 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import (
     COEFFICIENTS,
+    FIRST,
     SHARED,
+    TERMS,
     WAVES,
     Actuators,
     coefficients_of,
     grid_points,
     interpolated,
+    open_unknowns,
     unknowns,
     well_posed,
 )
@@ -50,7 +53,9 @@ class SensedProblem:
         least: float = 0.0,
     ) -> None:
         self.y, self.a, self._actuators, self._settings = y, a, actuators, settings
+        self._noise, self._aim = noise, target
         self.shared = unknowns(len(actuators.centres))
+        self._open = open_unknowns(np.zeros(self.shared))
         self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
         self.noise: float = (noise / self._size) ** 2
         self.place_ridge = place_ridge
@@ -62,6 +67,8 @@ class SensedProblem:
         self._sizes = settings.sensed_margin * windows.max(axis=1)
         self._clip = settings.sensed_clip * float(near.max())
         self._precision = np.zeros(self.shared)
+        self.reached = 0
+        """Steps of the rollouts that the last fit was over when it ended."""
         self.spread: Array | None = None
         sensors = y.shape[2]
         self._n = grid_points(sensors)
@@ -109,10 +116,11 @@ class SensedProblem:
         known: the shared ones stay as they are; lengths: of the fits, `lengths` if there are none;
         most: the error after any of them, besides noise, with which the fit is given up.
         """
-        every = self.lengths
+        every, self._open = self.lengths, open_unknowns(shared)
         # The fields of a known equation need less of a continuation.
         lengths = lengths or ([*every[: _FIRST + 1][-1:], every[-1]] if known else every)
         for steps, following in zip(lengths, [*lengths[1:], lengths[-1]], strict=True):
+            self.reached = steps
             moved = self._descend(shared, fields, steps, known)
             # What fits the beginning may overflow later.
             if np.isfinite(self._error(*moved, following)):
@@ -122,6 +130,38 @@ class SensedProblem:
             if self._error(shared, fields, steps) > most + self.noise:
                 return np.inf, shared, fields
         return self._error(shared, fields, lengths[-1]), shared, fields
+
+    @property
+    def _loose(self) -> list[int]:
+        """Unknowns that nobody knows the size of."""
+        found = [int(i) for i in self._open if len(FIRST) <= i < len(TERMS)]
+        fourth = TERMS.index((1, 4)) in found
+        return [*found, TERMS.index((1, 2))] if fourth else found
+
+    def missing(self, shared: Array, fields: Array, steps: int) -> tuple[int, float, float]:
+        """The term that promises the largest fall of the error, its coefficient, and the fall.
+
+        That of a step of Gauss and Newton in this term and all other unknowns; the fall is 0 where
+        nothing is finite.
+        """
+        own, self._open = self._open, np.arange(self.shared)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                residual, J = self._linearised(shared, fields, steps, known=False)
+            H, g = self._normal(residual, J, steps)
+            g = g + self._ridge(steps) * np.concatenate([shared, fields.ravel()])
+        finally:
+            self._open = own
+        if not (np.isfinite(H).all() and np.isfinite(g).all()):
+            return 0, 0.0, 0.0
+        known = np.append(open_unknowns(shared), np.arange(self.shared, len(H)))
+        inverse, best = np.linalg.inv(H[np.ix_(known, known)]), (0, 0.0, 0.0)
+        for i in np.setdiff1d(np.arange(len(TERMS)), known).tolist():
+            explained = inverse @ H[known, i]
+            slope, curvature = g[i] - explained @ g[known], H[i, i] - explained @ H[known, i]
+            if curvature > 0.0 and slope**2 / curvature > best[2]:
+                best = i, float(-slope / curvature), float(slope**2 / curvature)
+        return best
 
     def forget(self) -> None:
         """Take all unknowns for relevant again."""
@@ -139,8 +179,9 @@ class SensedProblem:
             return before
         variance = max(float(np.sum(residual**2)), self.noise) / residual.size
         inverse = np.linalg.inv(self._normal(residual, J, steps)[0])
-        own = variance * np.diag(inverse)[: self.shared]
-        found: Array = variance / np.maximum(shared**2 + own, np.finfo(float).tiny)
+        own = variance * np.diag(inverse)[: len(self._open)]
+        found, known = np.zeros(self.shared), shared[self._open]
+        found[self._open] = variance / np.maximum(known**2 + own, np.finfo(float).tiny)
         return found
 
     def refined(self, shared: Array, fields: Array) -> Array:
@@ -155,7 +196,7 @@ class SensedProblem:
         if not np.isfinite(J).all():
             return np.zeros(len(self._waves))
         inverse = np.linalg.inv(self._normal(residual, J, steps)[0])
-        found: Array = self._weight(steps) * np.diag(inverse)
+        found: Array = self.weight(steps) * np.diag(inverse)
         return found
 
     @property
@@ -167,7 +208,29 @@ class SensedProblem:
 
     def error(self, shared: Array, fields: Array) -> float:
         """That over whole rollouts, without what noise has in it."""
-        return self._error(shared, fields, self.y.shape[1]) - self.noise
+        return self.excess(shared, fields, self.y.shape[1])
+
+    def excess(self, shared: Array, fields: Array, steps: int) -> float:
+        """The same over some steps."""
+        return self._error(shared, fields, steps) - self.noise
+
+    def part(self, rollouts: Sequence[int], *, hold: bool = False) -> SensedProblem:
+        """The same for some of the rollouts; hold: with actuators near where they are declared."""
+        own, settings = list(rollouts), self._settings
+        part = type(self)(
+            self.y[own],
+            self.a[own],
+            self._actuators,
+            self._noise,
+            self._aim,
+            self._distances[own],
+            settings,
+        )
+        if hold:
+            part.place_ridge = (
+                settings.sensed_held_ridge if self.holds else settings.sensed_place_ridge
+            )
+        return part
 
     def implausibility(self, shared: Array, fields: Array) -> float:
         """The error over whole rollouts and the ridge of the prior: least for the likeliest unknowns.
@@ -188,17 +251,19 @@ class SensedProblem:
     ) -> tuple[Array, Array]:
         settings = self._settings
         damping = settings.sensed_damping
-        begin = self.shared if known else 0
-        ridge = self._ridge(steps)[begin:]
-        x = np.concatenate([shared, fields.ravel()])[begin:]
+        varied = self._open[:0] if known else self._open
+        common = len(varied)
+        ridge = self._ridge(steps)[len(self._open) - common :]
+        x = np.concatenate([shared[varied], fields.ravel()])
 
         def parts(x: Array) -> tuple[Array, Array]:
-            own = shared if known else x[: self.shared]
-            return own, x[self.shared - begin :].reshape(fields.shape)
+            own = shared.copy()
+            own[varied] = x[:common]
+            return own, x[common:].reshape(fields.shape)
 
         def objective(x: Array) -> float:
-            shared, fields = parts(x)
-            residual = self._residuals(shared, fields[None], steps)
+            own, fields = parts(x)
+            residual = self._residuals(own, fields[None], steps)
             total = float(np.sum(residual**2) + np.sum(ridge * x * x))
             return total if np.isfinite(total) else np.inf
 
@@ -217,8 +282,7 @@ class SensedProblem:
                 while damping < _MOST_DAMPING:
                     damped = H + np.diag(damping * np.diag(H) + 1e-12)
                     moved = x - np.linalg.solve(damped, g)
-                    if not known:
-                        moved[: self.shared] = well_posed(moved[: self.shared])
+                    moved[:common] = well_posed(parts(moved)[0])[varied]
                     value = objective(moved)
                     if value < now:
                         x, now = moved, value
@@ -233,13 +297,15 @@ class SensedProblem:
         ridge = self._prior(steps)
         ridge[: self.shared] += self._precision
         ridge[COEFFICIENTS + 1 : self.shared] += self.place_ridge**2
-        return ridge
+        return np.concatenate([ridge[self._open], ridge[self.shared :]])
 
     def _prior(self, steps: int) -> Array:
-        rollouts, weight, settings = len(self.y), self._weight(steps), self._settings
+        """That of all unknowns."""
+        rollouts, weight, settings = len(self.y), self.weight(steps), self._settings
         shared = np.full(self.shared, weight / settings.sensed_deviation**2)
         shared[SHARED:] = weight / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
         shared += settings.sensed_ridge**2
+        shared[self._loose] *= 1e-4
         rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
         field = settings.sensed_field_ridge**2 / rollouts * rising
         if self.spread is None:
@@ -248,7 +314,7 @@ class SensedProblem:
             field += weight / self.spread**2
         return np.concatenate([shared, np.tile(field, rollouts)])
 
-    def _weight(self, steps: int) -> float:
+    def weight(self, steps: int) -> float:
         """The variance of the noise on a residual."""
         rollouts, _, sensors = self.y.shape
         compared = len(range(0, steps, self._stride(steps)))
@@ -259,18 +325,27 @@ class SensedProblem:
         return -(-steps // self._settings.sensed_compared)
 
     def _residuals(
-        self, shared: Array, fields: Array, steps: int, difference: float = 0.0
+        self, shared: Array, fields: Array, steps: int, varied: Sequence[int] = ()
     ) -> Array:
-        """Errors for unknowns (12 + n_a,) and fields (P, R, 33), as shares of the whole.
+        """Errors for unknowns (24 + n_a,) and fields (P, R, 33), as shares of the whole.
 
-        (P, R, errors): those of the readings and, over whole rollouts, that of the distance. With a
-        difference, P is followed by the first fields with each of the unknowns less by it.
+        (P, R, errors): those of the readings and, over whole rollouts, that of the distance. P is
+        followed by the first fields with each of the varied unknowns less by a difference.
         """
-        stride, own = self._stride(steps), (self._settings, self._clip, difference)
-        flow = SensedFlow(shared, self._n, self._actuators, self._sizes, *own)
+        stride, settings = self._stride(steps), self._settings
+        flow = SensedFlow(
+            shared,
+            self._n,
+            self._actuators,
+            self._sizes,
+            settings,
+            self._clip,
+            varied,
+            settings.sensed_difference,
+        )
         compared = len(range(0, steps, stride))
         rows, (rollouts, _, sensors) = len(fields), self.y.shape
-        rows += self.shared if difference else 0
+        rows += len(varied)
         if not flow.finite:
             return np.full((rows, rollouts, compared * sensors), np.inf)
         found = np.empty((rows, rollouts, compared, sensors))
@@ -301,7 +376,8 @@ class SensedProblem:
         own, difference = fields.shape[1], self._settings.sensed_difference
         nearby = np.tile(fields, (1 + own, 1, 1))
         nearby[1:] -= difference * np.eye(own)[:, None]
-        residuals = self._residuals(shared, nearby, steps, 0.0 if known else difference)
+        varied = [] if known else self._open.tolist()
+        residuals = self._residuals(shared, nearby, steps, varied)
         changes = (residuals[0] - residuals[1:]) / difference
         # The shared ones first.
         return residuals[0], np.concatenate([changes[own:], changes[:own]]).swapaxes(0, 1)
@@ -313,7 +389,7 @@ class SensedProblem:
         """
         own = len(self._waves)
         common = J.shape[1] - own
-        ridge = self._ridge(steps)[self.shared - common :]
+        ridge = self._ridge(steps)[len(self._open) - common :]
         H, g = np.diag(ridge), np.zeros(len(ridge))
         for m, (r, part) in enumerate(zip(residual, J, strict=True)):
             rows = np.r_[:common, common + m * own : common + (m + 1) * own]

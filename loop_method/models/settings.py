@@ -171,6 +171,21 @@ class FieldModelSettings(Settings):
     sensed_enough: float = setting(
         1e-5, "error at which no other dispersion is tried as a start", 0, 1
     )
+    sensed_further: int = setting(
+        4,
+        "maximum number of terms that are added where the first ones do not reproduce readings",
+        0,
+        12,
+    )
+    sensed_further_fall: float = setting(
+        0.01, "share of the error that a further term must promise to take away", 0, 1
+    )
+    sensed_further_chi: float = setting(
+        12.0, "the same relative to the variance that noise alone gives", 0, 1000
+    )
+    sensed_further_worse: float = setting(
+        2.0, "growth of the error at which no further term is added", 1, 1000
+    )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
     sensed_attempts: int = setting(
         5, "maximum number of times that an equation is looked for in vain", 1, 1000

@@ -18,7 +18,15 @@ from loop_method.models.finite_difference import (
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
-from loop_method.models.sensed import SHARED, Actuators, SensedModel, grid_points, unknowns
+from loop_method.models.sensed import (
+    FIRST,
+    SHARED,
+    TERMS,
+    Actuators,
+    SensedModel,
+    grid_points,
+    unknowns,
+)
 from loop_method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2
@@ -110,10 +118,16 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
 def test_an_older_model_between_sensors_has_equal_actuators_of_no_declared_width() -> None:
     arrays = MODELS["sensed"].arrays()
     older = {name: own for name, own in arrays.items() if name != "widths"}
-    found = model_of({**older, "shared": arrays["shared"][:SHARED]}).arrays()
-    shared = found["shared"]
-    np.testing.assert_array_equal(shared[:SHARED], arrays["shared"][:SHARED])
-    assert shared.shape == arrays["shared"].shape and not shared[SHARED:].any()
+    own = arrays["shared"]
+    first = np.append(own[: len(FIRST)], own[len(TERMS) :])
+    for known in (first, first[: len(first) - N_A]):
+        found = model_of({**older, "shared": known}).arrays()
+        shared = found["shared"]
+        assert shared.shape == own.shape and not shared[len(FIRST) : len(TERMS)].any()
+        np.testing.assert_array_equal(shared[: len(FIRST)], own[: len(FIRST)])
+        np.testing.assert_array_equal(shared[len(TERMS) : SHARED], own[len(TERMS) : SHARED])
+        equal = len(known) < len(first)
+        np.testing.assert_array_equal(shared[SHARED:], 0.0 if equal else own[SHARED:])
     np.testing.assert_array_equal(found["widths"], np.zeros(N_A))
     declared = model_of({**older, "width": np.array(0.25)}).arrays()
     np.testing.assert_array_equal(declared["widths"], np.full(N_A, 0.25))

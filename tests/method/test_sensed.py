@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +17,10 @@ from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Traj
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.sensed_step import SensedProposals
-from loop_method.models import sensed_fit
+from loop_method.models import sensed_fit, sensed_growth
 from loop_method.models.sensed import (
     COEFFICIENTS,
+    FIRST,
     SHARED,
     TERMS,
     Actuators,
@@ -28,9 +30,11 @@ from loop_method.models.sensed import (
     interpolated,
     sensed_model,
     unknowns,
+    well_posed,
 )
 from loop_method.models.sensed_fit import fit_sensed, part_by_part
 from loop_method.models.sensed_flow import SensedFlow
+from loop_method.models.sensed_growth import Found, further_terms, start_with
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
@@ -173,8 +177,8 @@ def _coefficients(model: SpectralModel) -> Array:
 
 def test_an_action_moves_the_field_as_the_input_matrix_says() -> None:
     shared = np.zeros(unknowns(5))
-    shared[:12] = [2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1, 0.1, 5.0, -1.0, 0.5, 2.0]
-    shared[12:] = [1.0, -2.0, 0.0, 0.5, 3.0]
+    shared[: len(FIRST)] = [2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1]
+    shared[len(TERMS) :] = [0.1, 5.0, -1.0, 0.5, 2.0, 1.0, -2.0, 0.0, 0.5, 3.0]
     model = sensed_model(shared, SENSORS, _equally_spaced(5), 1.0)
     z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
     moved = _step(model, z, action) - _step(model, z, 0.0 * action)
@@ -209,6 +213,94 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
 
 
+def _of_further_terms(sigma: float) -> tuple[SensedProblem, Array]:
+    """Readings of u' = u - u^5 with diffusion, and its unknowns."""
+    actuators, rng = DECLARED, np.random.default_rng(3)
+    shared = np.zeros(unknowns(3))
+    for term, value in {(1, 0): 5.0, (1, 2): 1.0, (5, 0): -10.0}.items():
+        shared[TERMS.index(term)] = value
+    shared[COEFFICIENTS] = 10.0
+    model = sensed_model(shared, SENSORS, actuators, 4.0)
+    x = np.arange(model.n_z) / model.n_z
+    actions, drawn = 2.0 * rng.standard_normal((3, 30, 3)), rng.uniform(-1, 1, (3, 3))
+    fields = [4.0 * a * np.cos(2 * np.pi * (x - b)) + 2.0 * c for a, b, c in drawn]
+    readings = np.stack([_readings(model, *pair) for pair in zip(actions, fields, strict=True)])
+    readings += sigma * rng.standard_normal(readings.shape)
+    zero, unknown = np.zeros(SENSORS), np.full(3, np.nan)
+    return SensedProblem(readings, actions, actuators, sigma, zero, unknown), shared
+
+
+def test_a_term_that_the_first_ones_lack_is_found_and_no_other() -> None:
+    problem, shared = _of_further_terms(0.05)
+    with threadpool_limits(1):
+        error, *found = problem.fit(np.zeros(len(shared)), problem.interpolated())
+        further = further_terms(problem, (error - problem.noise, found[0], found[1]), DEFAULTS)
+    quintic = TERMS.index((5, 0))
+    assert found[0][quintic] == 0.0
+    assert further[quintic] == pytest.approx(-10.0, rel=0.2)
+    assert np.flatnonzero(further[len(FIRST) : len(TERMS)]).tolist() == [quintic - len(FIRST)]
+
+
+def test_terms_that_predict_no_other_rollout_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are fitted to every other one."""
+    problem, _ = _of_further_terms(0.05)
+    with threadpool_limits(1):
+        error, *found = problem.fit(np.zeros(problem.shared), problem.interpolated())
+        first = error - problem.noise, found[0], found[1]
+        seen = []
+
+        def of_junk(some: SensedProblem, begin: Found, *_: Any) -> Found:
+            seen.append(len(some.y))
+            junk = begin[1].copy()
+            junk[TERMS.index((2, 2))] = 1.0
+            return 0.0, junk, begin[2]
+
+        monkeypatch.setattr(sensed_growth, "grown", of_junk)
+        assert further_terms(problem, first, DEFAULTS) is found[0]
+    assert seen == [2]
+
+
+def test_a_term_begins_on_the_side_where_it_is_well_posed() -> None:
+    fourth, quintic = TERMS.index((1, 4)), TERMS.index((5, 0))
+    start = start_with(np.zeros(unknowns(2)), (fourth, 3.0))
+    assert start[fourth] < 0.0 and np.count_nonzero(start) == 1
+    start[: len(FIRST)] = 1.0
+    both = start_with(start, (quintic, -2.0))
+    assert both[fourth] < 0.0 > both[quintic] and np.count_nonzero(both) == 2
+
+
+def test_a_fourth_derivative_allows_a_negative_diffusion_and_the_fifth_power_a_positive_third() -> (
+    None
+):
+    shared = np.zeros(unknowns(2))
+    for term in ((1, 2), (1, 4), (3, 0), (5, 0)):
+        shared[TERMS.index(term)] = 1.0 if term == (3, 0) else -1.0
+    assert same_bits(well_posed(shared), shared)
+    for highest in ((1, 4), (5, 0)):
+        shared[TERMS.index(highest)] = 0.5
+    bounded = well_posed(shared)
+    assert not bounded.any()
+
+
+def test_short_waves_that_a_fourth_derivative_damps_need_no_internal_steps() -> None:
+    """Phase separation: the waves that follow others would ask for eight times as many."""
+    shared, actuators, n = np.zeros(unknowns(1)), _equally_spaced(1), grid_points(16)
+    for term, value in {(1, 2): -630.0, (1, 4): -31.0, (3, 2): 39.5}.items():
+        shared[TERMS.index(term)] = value
+    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
+    (substeps,) = equation.substeps(np.array([4.0]))
+    assert 1 < substeps <= 8
+
+    def after(substeps: int) -> Array:
+        step = equation.compiled(substeps, equation.supports)
+        z = step.spectra(4.0 * np.cos(2 * np.pi * x)[None] + np.sin(14 * np.pi * x))
+        for _ in range(20):
+            step.advance(z, np.zeros((1, 2)))
+        return step.states(z)
+
+    np.testing.assert_allclose(after(int(substeps)), after(64), atol=1e-3)
+
+
 def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() -> None:
     """Burgers' equation, of which one internal step would be beyond the stability limit."""
     shared = np.zeros(unknowns(1))
@@ -235,19 +327,21 @@ def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
     rng = np.random.default_rng(2)
     actuators, n, T, R = _equally_spaced(3), grid_points(SENSORS), 6, 2
     shared = rng.standard_normal(unknowns(3))
+    shared[len(FIRST) : len(TERMS)] *= 1e-3  # else nothing stays finite
     fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
     sizes = np.linspace(3.0, 0.1, T)
 
-    def last(unknowns: Array, fields: Array, difference: float) -> Array:
-        flow = SensedFlow(unknowns, n, actuators, sizes, DEFAULTS, 10.0, difference)
+    def last(unknowns: Array, fields: Array, varied: list[int]) -> Array:
+        flow = SensedFlow(unknowns, n, actuators, sizes, DEFAULTS, 10.0, varied, 0.5)
         found = [z.copy() for z in flow.path(fields, actions, T)]
         return found[-1]
 
-    together = last(shared, fields, 0.5)
-    assert len(together) == len(fields) + len(shared)
-    np.testing.assert_array_equal(together[:2], last(shared, fields, 0.0))
-    for own, change in zip(together[2:], 0.5 * np.eye(len(shared)), strict=True):
-        expected = last(shared - change, fields[:1], 0.0)[0]
+    varied = [i for i in range(len(shared)) if i % 5]
+    together = last(shared, fields, varied)
+    assert len(together) == len(fields) + len(varied)
+    np.testing.assert_array_equal(together[:2], last(shared, fields, []))
+    for own, change in zip(together[2:], 0.5 * np.eye(len(shared))[varied], strict=True):
+        expected = last(shared - change, fields[:1], [])[0]
         np.testing.assert_allclose(own, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -266,7 +360,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
             0.03 * scale,
         )
     assert error < DEFAULTS.sensed_reproduced
-    square = SensedEquation(shared, grid_points(16), actuators).square
+    square = SensedEquation(shared, grid_points(16), actuators).symbols[1]
     # -1/2 (u^2)_x of readings that are scaled, in a sampling time of 0.05.
     assert square[1].imag == pytest.approx(-0.05 * np.pi / scale, rel=0.15)
 
@@ -297,7 +391,7 @@ def test_noise_does_not_make_short_waves_grow() -> None:
     with threadpool_limits(1):
         shared = problem.fit(np.zeros(problem.shared), problem.interpolated())[1]
     assert shared[TERMS.index((1, 2))] >= 0.0 >= shared[TERMS.index((3, 0))]
-    growth = SensedEquation(shared, grid_points(4), _equally_spaced(2)).linear.real
+    growth = SensedEquation(shared, grid_points(4), _equally_spaced(2)).symbols[0].real
     assert growth[-2] <= growth[0]
 
 
@@ -308,10 +402,10 @@ def test_readings_that_no_equation_explains_are_given_up_early() -> None:
 
     class Counted(SensedProblem):
         def _residuals(
-            self, shared: Array, fields: Array, steps: int, difference: float = 0.0
+            self, shared: Array, fields: Array, steps: int, varied: Sequence[int] = ()
         ) -> Array:
             simulated.append(steps)
-            return super()._residuals(shared, fields, steps, difference)
+            return super()._residuals(shared, fields, steps, varied)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "SensedProblem", Counted)
@@ -509,7 +603,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
 
     ridges, guess = [], sensed_fit._first_guess
 
-    def guessed(problem: SensedProblem, *given: Any) -> tuple[float, Array, Array]:
+    def guessed(problem: SensedProblem, *given: Any) -> Found:
         ridges.append(problem.place_ridge)
         return guess(problem, *given)
 
