@@ -139,7 +139,9 @@ def _refined(
         found.append(part_by_part(problem, shared, fields, settings))
     if problem.noise and fresh:
         problem.forget()
-        found.append(part_by_part(problem, dispersion_of(shared), fields, settings))
+        most = settings.sensed_hopeless
+        anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
+        found += [anew] if np.isfinite(anew[0]) else []
         # Errors that are all below the noise tell no equation from another.
         error, shared, fields = min(found, key=lambda own: problem.implausibility(*own[1:]))
     else:
@@ -158,19 +160,27 @@ def dispersion_of(shared: Array) -> Array:
 
 
 def part_by_part(
-    problem: SensedProblem, shared: Array, fields: Array, settings: FieldModelSettings
+    problem: SensedProblem,
+    shared: Array,
+    fields: Array,
+    settings: FieldModelSettings,
+    most: float = np.inf,
 ) -> tuple[float, Array, Array]:
     """The fit over longer and longer parts; with noise, declared actuators stay where they are.
 
     The beginning of noisy rollouts does not determine where and how strong each of them is: what the
     equation does would be taken for that, and no descent leads back.
+
+    most: the error after any part, besides noise, with which the fit is given up.
     """
     if not problem.holds:
-        return problem.fit(shared, fields)
+        return problem.fit(shared, fields, most=most)
     problem.place_ridge = settings.sensed_held_ridge
-    _, shared, fields = problem.fit(shared, fields)
+    error, shared, fields = problem.fit(shared, fields, most=most)
     problem.place_ridge = 0.0
     problem.forget()
+    if not np.isfinite(error):
+        return error, shared, fields
     return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
 
 

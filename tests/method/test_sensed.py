@@ -584,6 +584,9 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
     before = found[0][1]
     assert np.abs(before[COEFFICIENTS + 1 :]).max() < 0.1
     np.testing.assert_allclose(last[SHARED:], [0.0, 3.0, -3.0], atol=1.0)
+    fits = len(found)
+    given_up = part_by_part(problem, shared, problem.interpolated(), DEFAULTS, -1.0)
+    assert np.isinf(given_up[0]) and len(found) == fits + 1 and not problem.place_ridge
 
 
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
@@ -595,10 +598,12 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     rng, actuators = np.random.default_rng(6), DECLARED
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
     starts: list[Array] = []
+    mosts: list[tuple[float, ...]] = []
     likelier, dispersion = np.zeros(unknowns(3)), TERMS.index((1, 3))
 
     def recorded(problem: SensedProblem, start: Array, *given: Any) -> tuple[float, Array, Array]:
         starts.append(start)
+        mosts.append(given[2:])
         return worse, likelier, np.zeros_like(problem.interpolated())
 
     ridges, guess = [], sensed_fit._first_guess
@@ -625,6 +630,11 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
             assert start[dispersion] == guessed_start[dispersion] and np.sum(start != 0.0) <= 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
         assert len(starts) == 5
+        # Given up: what it had reached is no fit.
+        worse, wanted = np.inf, 0.0
+        again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
+        assert again.any() and len(starts) == 6
+        assert mosts == [(), (DEFAULTS.sensed_hopeless,)] * 2 + [(DEFAULTS.sensed_hopeless,)] * 2
     # What two of them have to say of each actuator is noise.
     assert ridges == [DEFAULTS.sensed_held_ridge] * 2
     # Nobody says where those of a plant of one's own are.
