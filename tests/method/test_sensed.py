@@ -449,6 +449,7 @@ def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits
         plant.horizon,
         Trajectory(explored[:-1], actions),
         sensors=SENSORS,
+        field_models=replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15),
     )
 
     def make() -> GaussNewton:

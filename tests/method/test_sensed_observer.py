@@ -43,11 +43,14 @@ from loop_method.models.sensed import (
 )
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
+from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
 
 Array = np.ndarray
 SENSORS, N_A, T = 8, 3, 24
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15)
+"""For claims that need no exact equation."""
 ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.zeros(N_A))
 RNG = np.random.default_rng(17)
 
@@ -138,7 +141,10 @@ def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
     known = np.zeros(SENSORS), np.full(len(seen), np.nan)
     off = [
         np.linalg.norm(
-            fit_sensed(readings, taken, ACTUATORS, sigma, CUBIC, *known, spread)[1] - np.array(true)
+            fit_sensed(
+                readings, taken, ACTUATORS, sigma, CUBIC, *known, spread, settings=FEW_ITERATIONS
+            )[1]
+            - np.array(true)
         )
         for spread in (learned.spread, None)
     ]
@@ -212,6 +218,7 @@ def small() -> tuple[pdeloop.Problem, Context]:
         sensors=SENSORS,
         further=[second],
         law=law,
+        field_models=FEW_ITERATIONS,
     )
     return problem, context
 
