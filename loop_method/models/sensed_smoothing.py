@@ -102,8 +102,13 @@ class Smoothing:
         # Readings that a law brings to the target say little of the size of the field before.
         first = float(np.sqrt(np.mean(readings[0] ** 2)))
         problem = SensedProblem(
-            *(readings[None], actions[None], self.actuators, self.noise, self.target),
-            *(np.array([distance]), self.settings),
+            readings[None],
+            actions[None],
+            self.actuators,
+            self.noise,
+            self.target,
+            np.array([distance]),
+            self.settings,
             least=first,
         )
         problem.spread = self.spread
