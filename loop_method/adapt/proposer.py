@@ -79,8 +79,14 @@ class Proposer:
                 f"the exploratory trajectory must have states of {target.size} and actions of "
                 f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
             )
-        weights = context.state_weight, context.action_weight
-        self.loop = ClosedLoopProblem(*(U, target, *weights, context.horizon, context.action_limit))
+        self.loop = ClosedLoopProblem(
+            U,
+            target,
+            context.state_weight,
+            context.action_weight,
+            context.horizon,
+            context.action_limit,
+        )
         # Few readings cannot be denoised; the fits to them account for the noise.
         self._noise = 0.0 if context.sensors else context.noise
         self._context = replace(context, noise=self._noise)
@@ -96,7 +102,12 @@ class Proposer:
             largest_cost = context.field_models.sensed_largest_cost
             largest_cost *= self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(
-                *(self.loop, actuators, context.noise, largest_cost, context.field_models), settings
+                self.loop,
+                actuators,
+                context.noise,
+                largest_cost,
+                context.field_models,
+                settings,
             )
 
     def state(self) -> State:
@@ -166,7 +177,7 @@ class Proposer:
                 ):
                     known = self._without_noise(measured)
                     return field_step.propose(
-                        *(self._context, belief, whole, known, policy, damping, self._settings),
+                        self._context, belief, whole, known, policy, damping, self._settings
                     )
         # What was measured is denoised once it is known how noisy it is.
         data, loop = self._data(records), self.loop
@@ -176,7 +187,11 @@ class Proposer:
         level = loop.mean_cost_of(incumbents)
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         proposal = local_step.propose(
-            *(loop, data, shares, incumbents, compared),
+            loop,
+            data,
+            shares,
+            incumbents,
+            compared,
             damping=damping,
             accepted=accepted,
             settings=self._settings,
@@ -209,7 +224,8 @@ class Proposer:
 
         before, fresh : the remembered rollouts before, and those.
         """
-        every = self._without_noise([*(measured := self._measurements(before)), *fresh])
+        measured = self._measurements(before)
+        every = self._without_noise([*measured, *fresh])
         known, new = every[: len(measured)], every[len(measured) :]
         return last.verdict(self._context, laws, known, new, self._settings.confidence)
 

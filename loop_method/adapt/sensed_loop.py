@@ -54,7 +54,7 @@ class SensedLoop(ObservedLoop):
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[every // 2 :: every], self.state_weight * every
         smoothing = Smoothing(
-            *(model.shared, model.actuators, model.noise, target, model.spread), self.settings
+            model.shared, model.actuators, model.noise, target, model.spread, self.settings
         )
         known = distance(record, weight, self.action_weight, self.horizon)
         return smoothing.field(record.acted_from, record.actions, known)
@@ -113,8 +113,15 @@ def fit_rollouts(
     readings, actions, distances = of_rollouts(problem, rollouts)
     for first in (None,) if start is None else (start, None):
         found = fit_sensed(
-            *(readings, actions, actuators, noise, first, problem.target, distances),
-            *(spread, settings),
+            readings,
+            actions,
+            actuators,
+            noise,
+            start=first,
+            target=problem.target,
+            distances=distances,
+            spread=spread,
+            settings=settings,
         )
         if found[2] <= settings.sensed_reproduced:
             return found
@@ -136,7 +143,7 @@ def sensed_from(
     """
     sensors, n_a, settings = context.sensors, records[0].actions.shape[1], context.field_models
     problem = ClosedLoopProblem(
-        *(context.U, context.target, context.state_weight, context.action_weight, context.horizon)
+        context.U, context.target, context.state_weight, context.action_weight, context.horizon
     )
     largest_cost = settings.sensed_largest_cost * problem.cost_of(records[0])
     chosen = whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
@@ -167,8 +174,16 @@ def sensed_from(
         if spread is not None and settled(likely, spread, settings):
             break
         again = fit_sensed(
-            *(readings, actions, actuators, context.noise, shared, context.target, distances),
-            *(likely, settings, fields),
+            readings,
+            actions,
+            actuators,
+            context.noise,
+            start=shared,
+            target=context.target,
+            distances=distances,
+            spread=likely,
+            settings=settings,
+            near=fields,
         )
         if again[2] > settings.sensed_reproduced:
             break

@@ -436,6 +436,18 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     assert not proposals.equation.any()
 
 
+def test_a_checkpoint_of_the_first_terms_alone_is_continued() -> None:
+    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
+    older = np.arange(1.0, unknowns(2) - len(TERMS) + len(FIRST) + 1)
+    proposals.restore({"equation": older})
+    np.testing.assert_array_equal(proposals.equation[: len(FIRST)], older[: len(FIRST)])
+    assert not proposals.equation[len(FIRST) : len(TERMS)].any()
+    np.testing.assert_array_equal(proposals.equation[len(TERMS) :], older[len(FIRST) :])
+    with pytest.raises(ValueError):
+        proposals.restore({"equation": older[:-1]})
+
+
 def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
     problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16)
     plant = problem.plant()
