@@ -17,6 +17,7 @@ from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.adapt.sensed_loop import sensed_loop
 from loop_method.adapt.settings import ImprovementSettings
+from loop_method.adapt.trajectories import within
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.files import model_of
@@ -168,6 +169,26 @@ def also_in_pieces(
         return whole
     found = believe(context, records, whole.model.kind, settings.pieces)
     return replace(found, whole=False) if found and found.error <= most else whole
+
+
+def also_near(
+    context: Context,
+    records: Sequence[Record],
+    belief: Belief | None,
+    settings: ImprovementSettings,
+    limit: float,
+) -> Belief | None:
+    """A model of rollouts up to where a state exceeds this magnitude, where none predicts whole ones.
+
+    Else `belief` itself. A first law may drive the plant to where no model follows, and no good law
+    leads.
+    """
+    near = [within(record, limit) for record in records]
+    lost = sum(len(record.states) for record in records) - sum(len(own.states) for own in near)
+    if not lost or (context.sensors and isinstance(context.law, Observer)):
+        return belief
+    found = believe(context, [own for own in near if len(own.actions)])
+    return found if found and found.error <= largest_error(context, settings) else belief
 
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:

@@ -35,7 +35,7 @@ from loop_method.adapt.base import (
     require_positive,
     require_results,
 )
-from loop_method.adapt.belief import Belief, also_in_pieces, believe, largest_error
+from loop_method.adapt.belief import Belief, also_in_pieces, also_near, believe, largest_error
 from loop_method.adapt.initial_fields import initial_fields, is_chaotic
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch
@@ -52,6 +52,8 @@ from loop_method.seeds import field_seed
 
 __all__ = ["ModelBased"]
 
+_REACH = 3.0
+"""Magnitude of the states that a model must describe, in terms of the largest one measured before."""
 _REMEMBERED = 10**6
 """Rollouts, more than there ever are: the law is not renewed any more once it knows enough fields."""
 _LOCAL = "local."
@@ -110,8 +112,8 @@ class ModelBased(Optimizer):
         ]
         self._before = [*explored, *context.measured]
         self._schedule = Schedule(len(self._before), rollouts, self._settings)
-        largest = max(float(np.abs(record.states).max()) for record in self._before)
-        self._records = Records(_REMEMBERED, 3.0 * largest)
+        self._reach = _REACH * max(float(np.abs(known.states).max()) for known in self._before)
+        self._records = Records(_REMEMBERED, self._reach)
         self._progress = Progress(self._first.copy())
         self._local: LocalSearch | None = None
 
@@ -240,6 +242,8 @@ class ModelBased(Optimizer):
             self._take_noise(other[1])
         elif belief is not None and not self._is_believed(belief):
             belief = also_in_pieces(self._context, known, belief, self._settings)
+        if belief is None or not self._is_believed(belief):
+            belief = also_near(self._context, known, belief, self._settings, self._reach)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):

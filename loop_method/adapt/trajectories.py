@@ -185,6 +185,16 @@ class Records:
         return states[:length], actions[: max(length - 1, 0)]
 
 
+def within(record: Record, limit: float) -> Record:
+    """The rollout up to the first state that exceeds this magnitude."""
+    far = np.abs(record.states).max(axis=1) > limit
+    if not far.any():
+        return record
+    length = int(np.argmax(far))
+    actions = record.actions[: max(length - 1, 0)]
+    return replace(record, states=record.states[:length], actions=actions)
+
+
 def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
     """Denoised rollouts.
 

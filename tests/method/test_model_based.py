@@ -206,6 +206,26 @@ def test_a_first_law_under_which_the_plant_diverges_is_improved_on_the_model() -
         json.dumps(row, allow_nan=False)
 
 
+def test_a_first_law_that_leads_to_where_no_model_follows_is_no_obstacle() -> None:
+    """The plant is linear up to three times the states of its explorations, and random beyond."""
+    plant = Plant()
+    explored = plant.context().every_exploration
+    far = 3.0 * max(np.abs(known.states).max() for known in explored)
+    growing = plant.A - plant.B @ plant.best[:, :N_S]  # under the law below
+
+    def beyond(s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        random = far * rng.standard_normal(N_S) - growing @ s
+        return random if np.abs(plant.U @ s).max() > far else np.zeros(N_S)
+
+    wild = Plant(beyond)
+    optimizer = make(wild, share=-1.0)
+    rows = finished(wild, optimizer)
+    assert rows[0]["diverged"] == 0 and rows[0]["cost"] > 10.0 * wild.cost(wild.best)
+    assert rows[0]["mismatch"] < 1e-6
+    assert rows[-1]["chosen"] == ADAPTED
+    assert wild.cost(optimizer.policy) <= 1.05 * wild.cost(wild.best)
+
+
 def test_a_large_budget_ends_once_the_fields_are_known() -> None:
     plant = Plant()
     settings = ModelBasedSettings(enough_fields=12)
