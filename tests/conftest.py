@@ -14,6 +14,7 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.laws.registry import OWN_LAWS
@@ -61,6 +62,13 @@ def _nothing_left(temporary_folder: Path, request: pytest.FixtureRequest) -> Ite
     before = leftovers.files(temporary_folder)
     yield
     leftovers.check(temporary_folder, before, f"the tests of {request.node.name}")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Linear algebra in one thread: with as many as cores, most of them spin while five workers run."""
+    with threadpool_limits(limits=1):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,7 +8,10 @@ import re
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy.linalg
+from threadpoolctl import threadpool_info
 
 from tests.conftest import LONG
 from tests.support.interpreter import ROOT
@@ -142,3 +145,9 @@ def test_what_tests_need_of_these_is_installed_with_them(name: str) -> None:
 def test_files_that_come_first_are_there() -> None:
     missing = [name for name in LONG if not (ROOT / "tests" / "topics" / f"{name}.py").is_file()]
     assert missing == []
+
+
+def test_linear_algebra_of_the_tests_has_one_thread() -> None:
+    """Radau's method on 128 points took twenty times as long with two of them."""
+    assert scipy.linalg.inv(np.eye(2))[0, 0] == 1.0  # whose library was loaded before any test ran
+    assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
