@@ -144,11 +144,20 @@ def is_overfitted(
     loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ImprovementSettings
 ) -> bool:
     """True if fields that were left out confirm too little of what a law gains on its own."""
+    gain = _own_gain(loop, first, found, fields, settings)
+    return gain > 0.0 and -found.change.value < settings.confirmed * gain
+
+
+def _own_gain(
+    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ImprovementSettings
+) -> float:
+    """By how much the law after the descent is better than the first; 0 where it is hardly better."""
     before, after = loop.costs(first, fields), loop.costs(found.improved, fields)
     known = np.isfinite(before) & np.isfinite(after)
+    if not known.any():
+        return 0.0
     gain = float(np.sum(before[known] - after[known])) / len(fields)
-    worthwhile = gain > settings.first_gain * float(before[known].mean()) if known.any() else False
-    return worthwhile and -found.change.value < settings.confirmed * gain
+    return gain if gain > settings.first_gain * float(before[known].mean()) else 0.0
 
 
 def renew_from_states(
@@ -164,6 +173,7 @@ def renew_from_states(
     """As `renew`, of a chaotic plant, from measured states: more where few leave the gain in doubt.
 
     Costs differ so much from state to state that a law made from a few is hardly better from others.
+    Where it is, the plant is only unstable, and more states would make the same law.
 
     records: all rollouts, denoised.
     """
@@ -173,6 +183,9 @@ def renew_from_states(
         # Others than last time, so that the laws of the parts may know those of their own part.
         found = renew(*(loop, first, improved, [], fields, rng, settings), final=final)
         if found is None or found.change.is_negative(settings.confidence, settings.chaotic_clear):
+            break
+        gain = _own_gain(loop, first, found, fields, settings)
+        if gain > 0.0 and -found.change.value >= settings.chaotic_confirmed * gain:
             break
     return found
 

@@ -66,6 +66,12 @@ class ImprovementSettings(Settings):
     chaotic_clear: float = setting(
         10.0, "multiple of the standard errors of the verdict at which it is clear", 0.0, 100.0
     )
+    chaotic_confirmed: float = setting(
+        0.8,
+        "share of a law's gain on its own states, on those left out, at which few suffice",
+        0.0,
+        1.0,
+    )
     pieces: int = setting(
         8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
     )

@@ -105,13 +105,28 @@ def test_it_goes_on_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rows[0] == rows[1] and same_bits(optimizer.policy, again.policy)
 
 
+class Costs:
+    """A loop in which the first law costs 100 from every state, and another one `gain` less."""
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def costs(self, theta: float, fields: np.ndarray) -> np.ndarray:
+        return np.full(len(fields), 100.0 - self.gain * theta)
+
+
 @pytest.mark.parametrize(
-    ("gains", "counts"),
-    [([30.0], [32]), ([3.0, 30.0], [32, 96]), ([0.0, 0.0], [32, 96])],
-    ids=["clear", "in doubt", "none"],
+    ("gains", "own", "counts"),
+    [
+        ([30.0], 60.0, [32]),
+        ([3.0, 30.0], 60.0, [32, 96]),
+        ([3.0], 3.5, [32]),
+        ([0.0, 0.0], 0.0, [32, 96]),
+    ],
+    ids=["clear", "in doubt", "in doubt, but as large as from their own states", "none"],
 )
 def test_more_states_are_taken_where_the_gain_from_few_is_in_doubt(
-    gains: list[float], counts: list[int], monkeypatch: pytest.MonkeyPatch
+    gains: list[float], own: float, counts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[int] = []
 
@@ -125,7 +140,7 @@ def test_more_states_are_taken_where_the_gain_from_few_is_in_doubt(
 
     monkeypatch.setattr(renewal, "renew", renewed)
     rollout = Record(np.zeros((N_A, 2)), 1.0, np.zeros((200, N_Z)), np.zeros((199, N_A)))
-    known: Any = (None, 0.0, 0.0, [rollout], np.random.default_rng(0), SETTINGS)
+    known: Any = (Costs(own), 0.0, 0.0, [rollout], np.random.default_rng(0), SETTINGS)
     found = renew_from_states(*known)
     assert seen == counts
     assert found is not None and found.change.value == -gains[-1]
