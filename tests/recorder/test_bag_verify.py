@@ -96,6 +96,14 @@ def test_a_whole_run_is_verified_with_its_results(run, capsys):
     assert capsys.readouterr().out.endswith("no difference, to the bit\n")
 
 
+def test_a_run_whose_first_exploration_diverged_is_followed_and_identified_from_the_other(tmp_path):
+    record_run(tmp_path / "run", exploration_variance=100.0, divergence_bound=3.2)
+    report = verify(tmp_path / "run")
+    assert report.good and not (report.incomplete or report.notes), report.text()
+    found = identify_bag(tmp_path / "run" / "bag", {})
+    assert {source["episode"] for source in found.sources} == {PART + 1}
+
+
 NOTHING: dict[str, Callable[[dict[str, Any]], Any]] = {
     "as it is": lambda told: None,
     "without a storage": lambda told: told.update(storage_identifier=""),

@@ -17,6 +17,7 @@ from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import (
     ACTION,
+    COMPLETED,
     COST,
     MODEL,
     MODEL_IDENTIFIED,
@@ -24,6 +25,7 @@ from loop_interfaces.topics import (
     START,
     STATE,
     TARGET,
+    CostColumn,
     Topic,
 )
 from pdeloop.bags.mcap_messages import Message
@@ -109,8 +111,9 @@ def _send_episode(
         sent(STATE, episode, k, state)
         if k < len(record.actions):
             sent(ACTION, episode, k, record.actions[k])
-    sent(COST, episode, len(record.actions), record.costs.rows())
-    if batch.exploratory:
+    costs = record.costs.rows()
+    sent(COST, episode, len(record.actions), costs)
+    if batch.exploratory and (costs[:, CostColumn.ENDED] == COMPLETED).all():
         numbers = batch.rows[:, 3].astype(int).tolist()
         models = design_each(
             record.states, record.actions, numbers, pair.plant.target, pair._settings
