@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import re
 import shutil
@@ -205,6 +207,27 @@ def test_result_and_figures_are_on_the_first_screen_and_what_it_is_about_at_the_
     best = min(costs[name].mean() for name in controllers_of(folder))
     shown = float(tab.ask("document.querySelector('.outcome b').textContent"))
     assert shown == pytest.approx(best, rel=1e-3)
+
+
+def test_on_a_phone_a_table_shows_to_which_side_there_is_more(folder, tab):
+    tab.size(390, 844)
+    tab.go((folder / "report" / "index.html").as_uri())
+    place = tab.ask(
+        "(() => { const box = document.querySelector('.scroll'); box.scrollIntoView();"
+        " const { left, right, top, bottom } = box.getBoundingClientRect();"
+        " return [left, right, top, bottom].map(Math.round); })()"
+    )
+    for share, shadows in ((0, [False, True]), (0.5, [True, True]), (1, [True, False])):
+        tab.ask(
+            "(() => { const box = document.querySelector('.scroll');"
+            f" box.scrollLeft = {share} * (box.scrollWidth - box.clientWidth); }})()"
+        )
+        taken = tab.send("Page.captureScreenshot", format="png")["data"]
+        left, right, top, bottom = place
+        grey = imread(io.BytesIO(base64.b64decode(taken)))[top:bottom, :, :3].mean(axis=2)
+        sides = [np.median(grey[:, left + 1]), np.median(grey[:, right - 2])]
+        assert [bool(side < 0.9) for side in sides] == shadows, (share, sides)
+    tab.size(1280, 900)
 
 
 def test_figures_follow_the_dark_scheme(folder, tab):
