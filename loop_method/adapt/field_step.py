@@ -107,7 +107,12 @@ def improved(
     """The best law on a model near to theta, and by how much its cost is lower."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
-        *(loop, theta, fields, weights, curvature_of(loop), settings),
+        loop,
+        theta,
+        fields,
+        weights,
+        curvature_of(loop),
+        settings,
         trust=settings.trust * damping,
     )
     return None if found is None else (found.theta, found.before - found.after)

@@ -316,8 +316,9 @@ class GaussNewton(Optimizer):
         if now.believed:
             rng = np.random.default_rng([self._seed, _CONFIRMING])
             with threadpool_limits(limits=1):
+                judging = fresh[: self._settings.judging]
                 comparison = self._proposer.comparison(
-                    *(self._laws, known, now.believed, fresh[: self._settings.judging], rng)
+                    self._laws, known, now.believed, judging, rng
                 )
         if comparison is None:
             base, measured = self._base, [*self._context.measured, *known]

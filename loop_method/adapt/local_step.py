@@ -112,7 +112,11 @@ def _fit(
     weights = [own * share for own, share in zip(young, shares, strict=True)]
     x, a, after, weight = steps_of(data, weights, V)
     return fit(
-        *(x, a, after - x, weight, settings.ridge_values),
+        x,
+        a,
+        after - x,
+        weight,
+        settings.ridge_values,
         leading=min(settings.cubic_modes, V.shape[1]),
         linear_ridge=settings.linear_ridge,
         action_ridge=settings.action_ridge,

@@ -85,9 +85,14 @@ def whole_field_law(
     b = b - K @ loop.target
 
     def under(U: Array) -> ClosedLoop:
-        weight = loop.state_weight, loop.action_weight
         return ClosedLoop(
-            *(U, loop.target, *weight, loop.horizon, loop.action_limit), model=loop.model
+            U,
+            loop.target,
+            loop.state_weight,
+            loop.action_weight,
+            loop.horizon,
+            loop.action_limit,
+            model=loop.model,
         )
 
     first = under(np.eye(n))

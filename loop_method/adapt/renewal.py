@@ -181,7 +181,7 @@ def renew_from_states(
     for count in (settings.chaotic_fields, settings.chaotic_most):
         fields = measured_states(records, count)
         # Others than last time, so that the laws of the parts may know those of their own part.
-        found = renew(*(loop, first, improved, [], fields, rng, settings), final=final)
+        found = renew(loop, first, improved, [], fields, rng, settings, final=final)
         if found is None or found.change.is_negative(settings.confidence, settings.chaotic_clear):
             break
         gain = _own_gain(loop, first, found, fields, settings)

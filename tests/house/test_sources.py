@@ -1,8 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Every source file says whose it is, as REP-2004 asks of each level."""
+"""What holds for every source file: whose it is, as REP-2004 asks, and how calls are written."""
 
 from __future__ import annotations
 
+import ast
 import subprocess
 
 from tests.support.interpreter import ROOT
@@ -18,3 +19,19 @@ def test_every_source_file_of_our_own_has_the_copyright_statement() -> None:
     texts = {file: file.read_text() for file in files if file.exists()}
     missing = [file for file, text in texts.items() if text and STATEMENT not in text[:120]]
     assert missing == [], f"expected '# {STATEMENT}' as the first line"
+
+
+def test_calls_name_their_arguments_one_by_one() -> None:
+    """f(*(a, b)) is f(a, b)."""
+    listed = subprocess.check_output(["git", "ls-files", "*.py"], cwd=ROOT, text=True)
+    files = [ROOT / name for name in listed.splitlines()]
+    found = [
+        f"{file.relative_to(ROOT)}:{node.lineno}"
+        for file in files
+        if file.exists()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Call)
+        for given in node.args
+        if isinstance(given, ast.Starred) and isinstance(given.value, ast.Tuple | ast.List)
+    ]
+    assert found == []
