@@ -39,11 +39,15 @@ def test_a_process_that_goes_on_is_named(
     temporary_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leftovers, "PATIENCE", 0.0)
-    child = subprocess.Popen(["sleep", "600"], start_new_session=True)
+    code = "print('running', flush=True); input()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, **pipes)
     try:
-        with pytest.raises(AssertionError, match=r"leave processes: .*sleep 600"):
+        # In the middle of exec a process has neither an environment nor a command.
+        assert child.stdout.readline() == "running\n"
+        with pytest.raises(AssertionError, match=r"leave processes: .*input\(\)"):
             leftovers.check(temporary_folder, set(), "they")
     finally:
         child.kill()
-        child.wait()
+        child.communicate(timeout=60)
     leftovers.check(temporary_folder, leftovers.files(temporary_folder), "they")
