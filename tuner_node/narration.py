@@ -136,9 +136,12 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     none, lqt, adapted = (sum(summary["costs"][name]) for name in ("none", "lqt", "adapted"))
     if comparable and not diverged["none"] and lqt >= none > 0:
         share = 100 * (1 - adapted / none)
+        against = f"{abs(share):.1f} % {'less' if share >= 0 else 'more'} than"
+        if adapted == none:
+            against = "as much as"
         lines.append(
             "  the LQT law costs at least as much as no control; the adapted one costs "
-            f"{abs(share):.1f} % {'less' if share >= 0 else 'more'} than no control"
+            f"{against} no control"
         )
     if not any(summary["changed"]):
         lines.append(

@@ -141,6 +141,9 @@ def test_a_gain_on_a_law_that_is_worse_than_no_control_is_told_against_no_contro
     words = "at least as much as no control; the adapted one costs 62.5 % less than no control"
     assert any(line.endswith(words) for line in closing_lines("kdv", summary(costs=costs), ""))
     assert not any("at least as much" in line for line in closing_lines("kdv", summary(), ""))
+    costs["adapted"] = costs["none"]  # no control was kept
+    words = "at least as much as no control; the adapted one costs as much as no control"
+    assert any(line.endswith(words) for line in closing_lines("kdv", summary(costs=costs), ""))
 
 
 def test_a_plant_that_costs_nothing_without_control_has_no_share_of_that():
