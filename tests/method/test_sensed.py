@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +16,7 @@ from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Traj
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.sensed_step import SensedProposals
-from loop_method.models import sensed_fit, sensed_growth
+from loop_method.models import sensed_fit
 from loop_method.models.sensed import (
     COEFFICIENTS,
     FIRST,
@@ -25,25 +24,22 @@ from loop_method.models.sensed import (
     TERMS,
     Actuators,
     SensedEquation,
-    SensedModel,
     grid_points,
     interpolated,
     sensed_model,
     unknowns,
-    well_posed,
 )
 from loop_method.models.sensed_fit import fit_sensed, part_by_part
 from loop_method.models.sensed_flow import SensedFlow
-from loop_method.models.sensed_growth import Found, further_terms, start_with
+from loop_method.models.sensed_growth import Found
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
+from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 from tests.support.small import same_bits
-from tuner_node.build import build_training
 
 Array = np.ndarray
-SENSORS = 8
 FIELD = 11
 FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=4)
 """For readings that no equation explains, on which iterations are spent in vain."""
@@ -59,7 +55,7 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, 
     actuators = (
         Actuators(np.array(positions), np.zeros(plant.n_a))
         if positions
-        else _equally_spaced(plant.n_a)
+        else equally_spaced(plant.n_a)
     )
     with threadpool_limits(1):
         shared, fields, error = fit_sensed(
@@ -92,7 +88,7 @@ def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
     def off(*known: Array) -> float:
         """The relative error of the simulated distance from the target."""
         with threadpool_limits(1):
-            actuators = _equally_spaced(plant.n_a)
+            actuators = equally_spaced(plant.n_a)
             shared, fields, error = fit_sensed(readings, actions, actuators, 0.0, None, *known)
         assert error < 1e-5
         model = sensed_model(shared, SENSORS, actuators, _largest(fields))
@@ -109,10 +105,6 @@ def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
 def _scale(problem: pdeloop.Problem) -> float:
     """What the published readings are multiplied by."""
     return float(np.sqrt(problem.values["n_z"] / SENSORS))
-
-
-def _equally_spaced(n_a: int) -> Actuators:
-    return Actuators((np.arange(n_a) + 0.5) / n_a, np.zeros(n_a))
 
 
 def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
@@ -141,7 +133,7 @@ def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
     assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.015)
 
 
-def test_actuators_need_not_be_equally_spaced() -> None:
+def test_actuators_need_not_beequally_spaced() -> None:
     positions = [0.1, 0.22, 0.55]
     strong = {"actuator_positions": positions, "n_a": 3, "exploration_variance": 4.0}
     problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=30, **strong)
@@ -179,25 +171,16 @@ def test_an_action_moves_the_field_as_the_input_matrix_says() -> None:
     shared = np.zeros(unknowns(5))
     shared[: len(FIRST)] = [2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1]
     shared[len(TERMS) :] = [0.1, 5.0, -1.0, 0.5, 2.0, 1.0, -2.0, 0.0, 0.5, 3.0]
-    model = sensed_model(shared, SENSORS, _equally_spaced(5), 1.0)
+    model = sensed_model(shared, SENSORS, equally_spaced(5), 1.0)
     z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
     moved = _step(model, z, action) - _step(model, z, 0.0 * action)
     effect = model.B @ action
     assert np.linalg.norm(moved - effect) < 0.05 * np.linalg.norm(effect)
 
 
-def _readings(model: SensedModel, actions: Array, field: Array) -> Array:
-    """(T, n_y), from an initial field."""
-    z, seen, every = field[None], [], model.n_z // model.sensors
-    for action in actions:
-        seen.append(z[0, every // 2 :: every])
-        z = model.step(z, action[None])
-    return np.array(seen)
-
-
 def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     """The second of three is reversed and the third does nothing."""
-    actuators, rng = _equally_spaced(3), np.random.default_rng(2)
+    actuators, rng = equally_spaced(3), np.random.default_rng(2)
     shared = np.zeros(unknowns(3))
     shared[[TERMS.index((1, 0)), TERMS.index((1, 2)), COEFFICIENTS]] = 1.0, 0.5, 5.0
     shared[SHARED:] = 0.0, -10.0, -5.0
@@ -205,7 +188,7 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     x = np.arange(model.n_z) / model.n_z
     actions = 5.0 * rng.standard_normal((2, 20, 3))
     fields = [np.cos(2 * np.pi * x), 0.5 + np.sin(4 * np.pi * x)]
-    readings = [_readings(model, *pair) for pair in zip(actions, fields, strict=True)]
+    readings = [readings_of(model, *pair) for pair in zip(actions, fields, strict=True)]
     with threadpool_limits(1):
         found, _, error = fit_sensed(readings, list(actions), actuators)
     assert error < 1e-4
@@ -213,99 +196,11 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
 
 
-def _of_further_terms(sigma: float) -> tuple[SensedProblem, Array]:
-    """Readings of u' = u - u^5 with diffusion, and its unknowns."""
-    actuators, rng = DECLARED, np.random.default_rng(3)
-    shared = np.zeros(unknowns(3))
-    for term, value in {(1, 0): 5.0, (1, 2): 1.0, (5, 0): -10.0}.items():
-        shared[TERMS.index(term)] = value
-    shared[COEFFICIENTS] = 10.0
-    model = sensed_model(shared, SENSORS, actuators, 4.0)
-    x = np.arange(model.n_z) / model.n_z
-    actions, drawn = 2.0 * rng.standard_normal((3, 30, 3)), rng.uniform(-1, 1, (3, 3))
-    fields = [4.0 * a * np.cos(2 * np.pi * (x - b)) + 2.0 * c for a, b, c in drawn]
-    readings = np.stack([_readings(model, *pair) for pair in zip(actions, fields, strict=True)])
-    readings += sigma * rng.standard_normal(readings.shape)
-    zero, unknown = np.zeros(SENSORS), np.full(3, np.nan)
-    return SensedProblem(readings, actions, actuators, sigma, zero, unknown), shared
-
-
-def test_a_term_that_the_first_ones_lack_is_found_and_no_other() -> None:
-    problem, shared = _of_further_terms(0.05)
-    with threadpool_limits(1):
-        error, *found = problem.fit(np.zeros(len(shared)), problem.interpolated())
-        further = further_terms(problem, (error - problem.noise, found[0], found[1]), DEFAULTS)
-    quintic = TERMS.index((5, 0))
-    assert found[0][quintic] == 0.0
-    assert further[quintic] == pytest.approx(-10.0, rel=0.2)
-    assert np.flatnonzero(further[len(FIRST) : len(TERMS)]).tolist() == [quintic - len(FIRST)]
-
-
-def test_terms_that_predict_no_other_rollout_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are fitted to every other one."""
-    problem, _ = _of_further_terms(0.05)
-    with threadpool_limits(1):
-        error, *found = problem.fit(np.zeros(problem.shared), problem.interpolated())
-        first = error - problem.noise, found[0], found[1]
-        seen = []
-
-        def of_junk(some: SensedProblem, begin: Found, *_: Any) -> Found:
-            seen.append(len(some.y))
-            junk = begin[1].copy()
-            junk[TERMS.index((2, 2))] = 1.0
-            return 0.0, junk, begin[2]
-
-        monkeypatch.setattr(sensed_growth, "grown", of_junk)
-        assert further_terms(problem, first, DEFAULTS) is found[0]
-    assert seen == [2]
-
-
-def test_a_term_begins_on_the_side_where_it_is_well_posed() -> None:
-    fourth, quintic = TERMS.index((1, 4)), TERMS.index((5, 0))
-    start = start_with(np.zeros(unknowns(2)), (fourth, 3.0))
-    assert start[fourth] < 0.0 and np.count_nonzero(start) == 1
-    start[: len(FIRST)] = 1.0
-    both = start_with(start, (quintic, -2.0))
-    assert both[fourth] < 0.0 > both[quintic] and np.count_nonzero(both) == 2
-
-
-def test_a_fourth_derivative_allows_a_negative_diffusion_and_the_fifth_power_a_positive_third() -> (
-    None
-):
-    shared = np.zeros(unknowns(2))
-    for term in ((1, 2), (1, 4), (3, 0), (5, 0)):
-        shared[TERMS.index(term)] = 1.0 if term == (3, 0) else -1.0
-    assert same_bits(well_posed(shared), shared)
-    for highest in ((1, 4), (5, 0)):
-        shared[TERMS.index(highest)] = 0.5
-    bounded = well_posed(shared)
-    assert not bounded.any()
-
-
-def test_short_waves_that_a_fourth_derivative_damps_need_no_internal_steps() -> None:
-    """Phase separation: the waves that follow others would ask for eight times as many."""
-    shared, actuators, n = np.zeros(unknowns(1)), _equally_spaced(1), grid_points(16)
-    for term, value in {(1, 2): -630.0, (1, 4): -31.0, (3, 2): 39.5}.items():
-        shared[TERMS.index(term)] = value
-    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
-    (substeps,) = equation.substeps(np.array([4.0]))
-    assert 1 < substeps <= 8
-
-    def after(substeps: int) -> Array:
-        step = equation.compiled(substeps, equation.supports)
-        z = step.spectra(4.0 * np.cos(2 * np.pi * x)[None] + np.sin(14 * np.pi * x))
-        for _ in range(20):
-            step.advance(z, np.zeros((1, 2)))
-        return step.states(z)
-
-    np.testing.assert_allclose(after(int(substeps)), after(64), atol=1e-3)
-
-
 def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() -> None:
     """Burgers' equation, of which one internal step would be beyond the stability limit."""
     shared = np.zeros(unknowns(1))
     shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
-    n, actuators = grid_points(16), _equally_spaced(1)
+    n, actuators = grid_points(16), equally_spaced(1)
     equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
     field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
     (substeps,) = equation.substeps(largest)
@@ -325,7 +220,7 @@ def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() 
 
 def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
     rng = np.random.default_rng(2)
-    actuators, n, T, R = _equally_spaced(3), grid_points(SENSORS), 6, 2
+    actuators, n, T, R = equally_spaced(3), grid_points(SENSORS), 6, 2
     shared = rng.standard_normal(unknowns(3))
     shared[len(FIRST) : len(TERMS)] *= 1e-3  # else nothing stays finite
     fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
@@ -351,7 +246,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
     plant = problem.plant()
     explored, actions = problem.explore(1000)
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
-    scale, actuators = np.sqrt(plant.n_z / 16), _equally_spaced(plant.n_a)
+    scale, actuators = np.sqrt(plant.n_z / 16), equally_spaced(plant.n_a)
     with threadpool_limits(1):
         shared, _, error = fit_sensed(
             [explored[:-1], uncontrolled.states[:-1, 0]],
@@ -370,7 +265,7 @@ def test_what_a_part_of_a_rollout_does_not_determine_may_come_back_over_a_longer
     rng = np.random.default_rng(3)
     readings, actions = rng.standard_normal((1, 12, 4)), rng.standard_normal((1, 12, 2))
     known = np.zeros(4), np.full(1, np.nan)
-    problem = SensedProblem(readings, actions, _equally_spaced(2), 0.5, *known)
+    problem = SensedProblem(readings, actions, equally_spaced(2), 0.5, *known)
     shared = 0.1 * rng.standard_normal(unknowns(2))
     dispersion = TERMS.index((1, 3))
 
@@ -387,11 +282,11 @@ def test_noise_does_not_make_short_waves_grow() -> None:
     rng = np.random.default_rng(1)
     readings, actions = rng.standard_normal((1, 20, 4)), rng.standard_normal((1, 20, 2))
     known = np.zeros(4), np.full(1, np.nan)
-    problem = SensedProblem(readings, actions, _equally_spaced(2), 0.1, *known)
+    problem = SensedProblem(readings, actions, equally_spaced(2), 0.1, *known)
     with threadpool_limits(1):
         shared = problem.fit(np.zeros(problem.shared), problem.interpolated())[1]
     assert shared[TERMS.index((1, 2))] >= 0.0 >= shared[TERMS.index((3, 0))]
-    growth = SensedEquation(shared, grid_points(4), _equally_spaced(2)).symbols[0].real
+    growth = SensedEquation(shared, grid_points(4), equally_spaced(2)).symbols[0].real
     assert growth[-2] <= growth[0]
 
 
@@ -410,7 +305,7 @@ def test_readings_that_no_equation_explains_are_given_up_early() -> None:
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "SensedProblem", Counted)
         _, fields, error = fit_sensed(
-            list(readings), list(actions), _equally_spaced(2), settings=FEW_ITERATIONS
+            list(readings), list(actions), equally_spaced(2), settings=FEW_ITERATIONS
         )
     assert error == np.inf and np.isfinite(fields).all()
     assert max(simulated) < 40
@@ -429,7 +324,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
     loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
     proposals = SensedProposals(
-        loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf, settings=FEW_ITERATIONS
+        loop, equally_spaced(2), noise=0.0, largest_cost=np.inf, settings=FEW_ITERATIONS
     )
     with threadpool_limits(1):
         assert proposals.propose(records, records[0].policy, damping=1.0) is None
@@ -438,7 +333,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
 
 def test_a_checkpoint_of_the_first_terms_alone_is_continued() -> None:
     loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
-    proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
+    proposals = SensedProposals(loop, equally_spaced(2), noise=0.0, largest_cost=np.inf)
     older = np.arange(1.0, unknowns(2) - len(TERMS) + len(FIRST) + 1)
     proposals.restore({"equation": older})
     np.testing.assert_array_equal(proposals.equation[: len(FIRST)], older[: len(FIRST)])
@@ -488,90 +383,15 @@ def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits
     assert same_bits(first.ask()[0].policy, later.ask()[0].policy)
 
 
-class Unequal(pdeloop.Dynamics):
-    """A plant of one's own that says where its actuators are."""
-
-    n_a, grid = 2, pdeloop.Grid.interval(3.0, 60)
-    supports = np.zeros((60, 2))
-    supports[50:, 0] = supports[:6, 0] = 2.0
-    supports[20:24, 1] = -1.0
-
-    def initial_state(self, rng: np.random.Generator) -> Array:
-        return rng.standard_normal(60)
-
-    def step(self, z: Array, a: Array) -> Array:
-        return z + self.supports @ a
-
-
-def _declared(problem: pdeloop.Problem, n_a: int) -> Actuators:
-    """The actuators that a method is told of."""
-    settings = build_training(problem.values).settings
-    zero, explored = np.zeros((SENSORS, 1)), Trajectory(np.zeros((2, SENSORS)), np.zeros((1, n_a)))
-    return Context(
-        zero,
-        zero[:, 0],
-        1.0,
-        1.0,
-        1,
-        explored,
-        actuator_positions=settings.actuator_positions,
-        actuator_widths=settings.actuator_widths,
-    ).actuators(n_a)
-
-
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        *itertools.product(["burgers", "allen-cahn", "kdv", "fisher"], ["indicator", "gaussian"]),
-        ("kuramoto-sivashinsky-22", "equation"),
-        ("", "equation"),
-    ],
-)
-def test_actuators_are_declared_as_they_are(name: str, shape: str) -> None:
-    """Between two sensors nothing else tells where an actuator ends."""
-    given = {"sensors": SENSORS, "actuator_shape": shape}
-    problem = pdeloop.problem(name, **given) if name else pdeloop.problem(plant=Unequal(), **given)
-    supports = np.abs(problem.plant().supports)
-    n, n_a = supports.shape
-    declared = _declared(problem, n_a)
-    moments = np.exp(2j * np.pi * np.arange(n) / n) @ supports
-    centres = np.angle(moments) / (2 * np.pi) % 1.0
-    np.testing.assert_allclose(declared.centres, centres, atol=1.2 / n)
-    distance = (np.arange(n)[:, None] / n - centres + 0.5) % 1.0 - 0.5
-    second = np.sum(supports * distance**2, axis=0) / supports.sum(axis=0)
-    np.testing.assert_allclose(declared.widths, np.sqrt(12.0 * second), atol=1.2 / n)
-
-
-def test_actuators_that_a_plant_does_not_place_on_the_ring_are_declared_as_nothing() -> None:
-    """Neither one that acts nowhere nor those between walls have a place on a ring."""
-
-    class Idle(Unequal):
-        supports = np.zeros((60, 2))
-
-    class Walled(Unequal):
-        grid = pdeloop.Grid(pdeloop.Axis("x", 3.0, 60, periodic=False))
-
-    class Silent(Unequal):
-        supports = None
-
-    for kind in (Idle, Walled, Silent):
-        declared = _declared(pdeloop.problem(plant=kind(), sensors=SENSORS), 2)
-        np.testing.assert_array_equal(declared.centres, [0.25, 0.75])
-        assert not declared.declared
-
-
 def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> None:
     n, shared = grid_points(SENSORS), np.zeros(unknowns(3))
-    centres, unequal = _equally_spaced(3).centres, np.array([0.1, 0.2, 0.05])
+    centres, unequal = equally_spaced(3).centres, np.array([0.1, 0.2, 0.05])
     for actuators, widths in (
         (Actuators(centres, unequal), unequal),
-        (_equally_spaced(3), 0.5 / 3),
+        (equally_spaced(3), 0.5 / 3),
     ):
         supports = SensedEquation(shared, n, actuators).supports
         np.testing.assert_allclose(supports.mean(axis=0), widths)
-
-
-DECLARED = Actuators((np.arange(3) + 0.5) / 3, np.full(3, 0.5 / 3))
 
 
 def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
@@ -582,7 +402,7 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
     shared[SHARED:] = 0.0, 3.0, -3.0
     model = sensed_model(shared, SENSORS, actuators, 4.0)
     actions = 5.0 * rng.standard_normal((2, 30, 3))
-    readings = np.stack([_readings(model, own, np.zeros(model.n_z)) for own in actions])
+    readings = np.stack([readings_of(model, own, np.zeros(model.n_z)) for own in actions])
     readings += sigma * rng.standard_normal(readings.shape)
     found = []
 
@@ -651,7 +471,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     # What two of them have to say of each actuator is noise.
     assert ridges == [DEFAULTS.sensed_held_ridge] * 2
     # Nobody says where those of a plant of one's own are.
-    free = SensedProblem(readings, actions, _equally_spaced(3), 1.0, readings[0, 0], np.ones(3))
+    free = SensedProblem(readings, actions, equally_spaced(3), 1.0, readings[0, 0], np.ones(3))
     assert not free.holds
 
 

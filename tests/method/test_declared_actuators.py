@@ -1,0 +1,88 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Methods are told of actuators where the plant has them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import pdeloop
+from loop_interfaces.arrays import Array
+from loop_method.adapt import Context, Trajectory
+from loop_method.models.sensed import Actuators
+from tests.support.sensed import SENSORS
+from tuner_node.build import build_training
+
+
+class Unequal(pdeloop.Dynamics):
+    """A plant of one's own that says where its actuators are."""
+
+    n_a, grid = 2, pdeloop.Grid.interval(3.0, 60)
+    supports = np.zeros((60, 2))
+    supports[50:, 0] = supports[:6, 0] = 2.0
+    supports[20:24, 1] = -1.0
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return rng.standard_normal(60)
+
+    def step(self, z: Array, a: Array) -> Array:
+        return z + self.supports @ a
+
+
+def _declared(problem: pdeloop.Problem, n_a: int) -> Actuators:
+    """The actuators that a method is told of."""
+    settings = build_training(problem.values).settings
+    zero, explored = np.zeros((SENSORS, 1)), Trajectory(np.zeros((2, SENSORS)), np.zeros((1, n_a)))
+    return Context(
+        zero,
+        zero[:, 0],
+        1.0,
+        1.0,
+        1,
+        explored,
+        actuator_positions=settings.actuator_positions,
+        actuator_widths=settings.actuator_widths,
+    ).actuators(n_a)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        *itertools.product(["burgers", "allen-cahn", "kdv", "fisher"], ["indicator", "gaussian"]),
+        ("kuramoto-sivashinsky-22", "equation"),
+        ("", "equation"),
+    ],
+)
+def test_actuators_are_declared_as_they_are(name: str, shape: str) -> None:
+    """Between two sensors nothing else tells where an actuator ends."""
+    given = {"sensors": SENSORS, "actuator_shape": shape}
+    problem = pdeloop.problem(name, **given) if name else pdeloop.problem(plant=Unequal(), **given)
+    supports = np.abs(problem.plant().supports)
+    n, n_a = supports.shape
+    declared = _declared(problem, n_a)
+    moments = np.exp(2j * np.pi * np.arange(n) / n) @ supports
+    centres = np.angle(moments) / (2 * np.pi) % 1.0
+    np.testing.assert_allclose(declared.centres, centres, atol=1.2 / n)
+    distance = (np.arange(n)[:, None] / n - centres + 0.5) % 1.0 - 0.5
+    second = np.sum(supports * distance**2, axis=0) / supports.sum(axis=0)
+    np.testing.assert_allclose(declared.widths, np.sqrt(12.0 * second), atol=1.2 / n)
+
+
+def test_actuators_that_a_plant_does_not_place_on_the_ring_are_declared_as_nothing() -> None:
+    """Neither one that acts nowhere nor those between walls have a place on a ring."""
+
+    class Idle(Unequal):
+        supports = np.zeros((60, 2))
+
+    class Walled(Unequal):
+        grid = pdeloop.Grid(pdeloop.Axis("x", 3.0, 60, periodic=False))
+
+    class Silent(Unequal):
+        supports = None
+
+    for kind in (Idle, Walled, Silent):
+        declared = _declared(pdeloop.problem(plant=kind(), sensors=SENSORS), 2)
+        np.testing.assert_array_equal(declared.centres, [0.25, 0.75])
+        assert not declared.declared

@@ -1,0 +1,27 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models of fields of which a few points are measured, with actuators that are alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.models.sensed import Actuators, SensedModel
+
+SENSORS = 8
+
+
+def equally_spaced(n_a: int) -> Actuators:
+    return Actuators((np.arange(n_a) + 0.5) / n_a, np.zeros(n_a))
+
+
+def readings_of(model: SensedModel, actions: Array, field: Array) -> Array:
+    """(T, n_y), from an initial field."""
+    z, seen, every = field[None], [], model.n_z // model.sensors
+    for action in actions:
+        seen.append(z[0, every // 2 :: every])
+        z = model.step(z, action[None])
+    return np.array(seen)
+
+
+DECLARED = Actuators((np.arange(3) + 0.5) / 3, np.full(3, 0.5 / 3))
