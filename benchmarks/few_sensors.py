@@ -9,10 +9,7 @@ that an interrupted run continues where it stood.
 from __future__ import annotations
 
 import itertools
-import json
-import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +18,8 @@ from scipy.special import stdtrit
 
 import pdeloop
 from benchmarks.general import number
-from loop_interfaces.files import make_folder, read_json, write_atomically
+from benchmarks.kept import errors, kept_row, rows_of
 from loop_method.adapt.estimate import mean_of
-from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]
 
@@ -68,34 +64,21 @@ def run(
     """
     own = range(first, first + seeds)
     tasks = list(itertools.product(problems, sensors, noise, laws, own))
-    make_folder(folder)
-    rows = []
-    with processes(jobs) as pool:
-        work = partial(train, rollouts=rollouts, folder=folder.resolve())
-        for row in pool.map(work, tasks):
-            rows.append(row)
-            print(f"{line([row])} ({len(rows)} of {len(tasks)})", file=sys.stderr, flush=True)
-    return rows
+    return rows_of(tasks, train, line, rollouts=rollouts, jobs=jobs, folder=folder)
 
 
 def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
     """One training; its costs on the held-out fields, or the error that ended it."""
     problem, sensors, noise, law, seed = task
     label = f"{Path(problem).stem}-{sensors}-{noise:g}-{law}-{seed}-{rollouts}"
-    path = folder / f"{label}.json"
-    if path.exists():
-        found: dict[str, Any] = read_json(path)
-        return found
-    row: dict[str, Any] = {"problem": problem, "sensors": sensors, "noise": noise, "law": law}
-    row["seed"] = seed
-    given: dict[str, Any] = {"sensors": sensors, "measurement_noise": noise, "law": law}
-    try:
+    case = {"problem": problem, "sensors": sensors, "noise": noise, "law": law, "seed": seed}
+
+    def costs() -> dict[str, float]:
+        given: dict[str, Any] = {"sensors": sensors, "measurement_noise": noise, "law": law}
         done = pdeloop.train(problem, rollouts=rollouts, seed=seed, **given)
-        row |= {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
-    except (ValueError, RuntimeError) as error:
-        row["error"] = " ".join(str(error).split())
-    write_atomically(path, json.dumps(row).encode())
-    return row
+        return {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
+
+    return kept_row(folder / f"{label}.json", case, costs)
 
 
 def line(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -131,7 +114,4 @@ def text(rows: Sequence[Mapping[str, Any]]) -> str:
         case = tuple(row[key] for key in ("problem", "sensors", "noise", "law"))
         cases.setdefault(case, []).append(row)
     lines += [line(own) for own in cases.values()]
-    lines += [
-        f"{row['problem']}, seed {row['seed']}: {row['error']}" for row in rows if "error" in row
-    ]
-    return "\n".join(lines)
+    return "\n".join(lines + errors(rows))

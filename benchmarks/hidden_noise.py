@@ -10,20 +10,16 @@ it stood.
 from __future__ import annotations
 
 import itertools
-import json
-import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pdeloop
 from benchmarks.general import number
-from loop_interfaces.files import make_folder, read_json, write_atomically
+from benchmarks.kept import errors, kept_row, rows_of
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair
 from pdeloop.in_process import train as train_here
-from pdeloop.study.executors import processes
 from tuner_node.build import build_training
 from tuner_node.results import summarise
 
@@ -74,35 +70,22 @@ def run(
     """
     own = range(first, first + seeds)
     tasks = list(itertools.product(problems, optimizers, noise, told, own))
-    make_folder(folder)
-    rows = []
-    with processes(jobs) as pool:
-        work = partial(train, rollouts=rollouts, folder=folder.resolve())
-        for row in pool.map(work, tasks):
-            rows.append(row)
-            print(f"{line([row])} ({len(rows)} of {len(tasks)})", file=sys.stderr, flush=True)
-    return rows
+    return rows_of(tasks, train, line, rollouts=rollouts, jobs=jobs, folder=folder)
 
 
 def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
     """One training; its costs, the noise that it found, or the error that ended it."""
     problem, optimizer, noise, told, seed = task
     label = f"{Path(problem).stem}-{optimizer}-{noise:g}-{told:.3g}-{seed}-{rollouts}"
-    path = folder / f"{label}.json"
-    if path.exists():
-        found: dict[str, Any] = read_json(path)
-        return found
-    row: dict[str, Any] = {"problem": problem, "optimizer": optimizer, "noise": noise}
-    row |= {"told": told, "seed": seed}
-    given: dict[str, Any] = {"optimizer": optimizer, "rollouts": rollouts, "seed": seed}
-    try:
+    case = {"problem": problem, "optimizer": optimizer, "noise": noise, "told": told, "seed": seed}
+
+    def costs() -> dict[str, float]:
+        given: dict[str, Any] = {"optimizer": optimizer, "rollouts": rollouts, "seed": seed}
         summary = trained(problem, noise, told * noise, given)
-        row |= {key: costs[0] for key, costs in summary["costs"].items()}
-        row["found"] = summary["noise"]["found"][0]
-    except (ValueError, RuntimeError) as error:
-        row["error"] = " ".join(str(error).split())
-    write_atomically(path, json.dumps(row).encode())
-    return row
+        found = {key: costs[0] for key, costs in summary["costs"].items()}
+        return {**found, "found": summary["noise"]["found"][0]}
+
+    return kept_row(folder / f"{label}.json", case, costs)
 
 
 def trained(
@@ -146,7 +129,4 @@ def text(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         cases.setdefault(tuple(row[key] for key in CASE), []).append(row)
     lines += [line(own, cases.get((*case[:-1], RIGHT), ())) for case, own in cases.items()]
-    lines += [
-        f"{row['problem']}, seed {row['seed']}: {row['error']}" for row in rows if "error" in row
-    ]
-    return "\n".join(lines)
+    return "\n".join(lines + errors(rows))

@@ -70,9 +70,8 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
         return plant, {**own, **given}
-    names = [
-        name for name in ("grid", "cost", EXTENTS) if name != EXTENTS or not values.get(EXTENTS)
-    ]
+    names = ["grid", "cost"]
+    names += [] if values.get(EXTENTS) else [EXTENTS]
     names += ["state_weight", "action_weight"] if own["cost"] else []
     return plant, {**given, **{name: own[name] for name in names}}
 
