@@ -92,7 +92,7 @@ def fit_sensed(
     if target is None or distances is None:
         target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
     problem = SensedProblem(y, a, actuators, noise, target, distances, settings)
-    problem.spread = spread
+    problem.prior.spread = spread
     fields, n = problem.interpolated(), grid_points(y.shape[2])
     if start is not None:
         known = None if near is None else coefficients_of(near)
@@ -135,10 +135,10 @@ def _refined(
         found.append(problem.fit(shared, known, lengths=whole))
     # With noise two rollouts leave much of an equation open.
     if not holds or (first and problem.noise):
-        problem.forget()
+        problem.prior.forget()
         found.append(part_by_part(problem, shared, fields, settings))
     if problem.noise and fresh:
-        problem.forget()
+        problem.prior.forget()
         most = settings.sensed_hopeless
         anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
         found += [anew] if np.isfinite(anew[0]) else []
@@ -175,10 +175,10 @@ def part_by_part(
     """
     if not problem.holds:
         return problem.fit(shared, fields, most=most)
-    problem.place_ridge = settings.sensed_held_ridge
+    problem.prior.place_ridge = settings.sensed_held_ridge
     error, shared, fields = problem.fit(shared, fields, most=most)
-    problem.place_ridge = 0.0
-    problem.forget()
+    problem.prior.place_ridge = 0.0
+    problem.prior.forget()
     if not np.isfinite(error):
         return error, shared, fields
     return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
@@ -194,7 +194,7 @@ def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:
             break
         start = np.zeros(problem.shared)
         start[TERMS.index((1, 3))] = share * settings.sensed_dispersion
-        problem.forget()
+        problem.prior.forget()
         most = settings.sensed_hopeless
         error, *found = problem.fit(start, problem.interpolated(), most=most)
         if error - problem.noise < best[0]:

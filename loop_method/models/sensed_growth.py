@@ -74,7 +74,7 @@ def grown(
             if proposed[2] <= _least_fall(problem, now[0], reached, settings):
                 break
         start, before = start_with(now[1], proposed[:2]), reached
-        problem.forget()
+        problem.prior.forget()
         most = settings.sensed_hopeless
         error, *found = problem.fit(start, problem.interpolated(), most=most)
         now, reached = (error - problem.noise, found[0], found[1]), problem.reached

@@ -9,9 +9,6 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import (
-    COEFFICIENTS,
-    FIRST,
-    SHARED,
     TERMS,
     WAVES,
     Actuators,
@@ -23,6 +20,7 @@ from loop_method.models.sensed import (
     well_posed,
 )
 from loop_method.models.sensed_flow import SensedFlow
+from loop_method.models.sensed_prior import SensedPrior
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # The part of rollouts that the fields of a known equation are fitted to before the whole.
@@ -49,7 +47,6 @@ class SensedProblem:
         target: Array,
         distances: Array,
         settings: FieldModelSettings = DEFAULTS,
-        place_ridge: float = 0.0,
         least: float = 0.0,
     ) -> None:
         self.y, self.a, self._actuators, self._settings = y, a, actuators, settings
@@ -58,18 +55,15 @@ class SensedProblem:
         self._open = open_unknowns(np.zeros(self.shared))
         self._size = max(float(np.sqrt(np.mean(y * y))), least) or 1.0
         self.noise: float = (noise / self._size) ** 2
-        self.place_ridge = place_ridge
-        """That of the shifts, widths and differences of actuators."""
+        self.prior = SensedPrior(len(y), len(actuators.centres), self._size, settings)
         self.holds = bool(noise and actuators.declared)
         """True if noise would move actuators from where they are declared."""
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
         self._sizes = settings.sensed_margin * windows.max(axis=1)
         self._clip = settings.sensed_clip * float(near.max())
-        self._precision = np.zeros(self.shared)
         self.reached = 0
         """Steps of the rollouts that the last fit was over when it ended."""
-        self.spread: Array | None = None
         sensors = y.shape[2]
         self._n = grid_points(sensors)
         waves = np.arange(self._n // 2 + 1)
@@ -78,7 +72,6 @@ class SensedProblem:
         twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
         phase = 2 * np.pi * waves[:, None] * places
         self._read = np.vstack([np.cos(phase), -np.sin(phase)]) * np.tile(twice, 2)[:, None]
-        self._waves = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
         self._mean_square = np.tile(twice, 2)
         aim = np.fft.rfft(interpolated(target)) / self._n
         self._target = np.concatenate([aim.real, aim.imag])
@@ -126,17 +119,10 @@ class SensedProblem:
             if np.isfinite(self._error(*moved, following)):
                 shared, fields = moved
             if not known:
-                self._precision = self._relevant(shared, fields, steps)
+                self.prior.precision = self._relevant(shared, fields, steps)
             if self._error(shared, fields, steps) > most + self.noise:
                 return np.inf, shared, fields
         return self._error(shared, fields, lengths[-1]), shared, fields
-
-    @property
-    def _loose(self) -> list[int]:
-        """Unknowns that nobody knows the size of."""
-        found = [int(i) for i in self._open if len(FIRST) <= i < len(TERMS)]
-        fourth = TERMS.index((1, 4)) in found
-        return [*found, TERMS.index((1, 2))] if fourth else found
 
     def missing(self, shared: Array, fields: Array, steps: int) -> tuple[int, float, float]:
         """The term that promises the largest fall of the error, its coefficient, and the fall.
@@ -149,7 +135,7 @@ class SensedProblem:
             with np.errstate(over="ignore", invalid="ignore"):
                 residual, J = self._linearised(shared, fields, steps, known=False)
             H, g = self._normal(residual, J, steps)
-            g = g + self._ridge(steps) * np.concatenate([shared, fields.ravel()])
+            g = g + self._ridges(steps) * np.concatenate([shared, fields.ravel()])
         finally:
             self._open = own
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
@@ -163,16 +149,12 @@ class SensedProblem:
                 best = i, float(-slope / curvature), float(slope**2 / curvature)
         return best
 
-    def forget(self) -> None:
-        """Take all unknowns for relevant again."""
-        self._precision = np.zeros(self.shared)
-
     def _relevant(self, shared: Array, fields: Array, steps: int) -> Array:
         """Ridges of the shared unknowns, s^2/(x^2 + s^2 H^-1): large where one is not significant."""
-        before = self._precision
+        before = self.prior.precision
         if steps < self.y.shape[1]:
             # What a part does not determine, a longer one may.
-            self.forget()
+            self.prior.forget()
         with np.errstate(over="ignore", invalid="ignore"):
             residual, J = self._linearised(shared, fields, steps, known=False)
         if not np.isfinite(J).all():
@@ -194,16 +176,9 @@ class SensedProblem:
         with np.errstate(over="ignore", invalid="ignore"):
             residual, J = self._linearised(shared, fields, steps, known=True)
         if not np.isfinite(J).all():
-            return np.zeros(len(self._waves))
+            return np.zeros(fields.shape[1])
         inverse = np.linalg.inv(self._normal(residual, J, steps)[0])
         found: Array = self.weight(steps) * np.diag(inverse)
-        return found
-
-    @property
-    def suggested(self) -> Array:
-        """Standard deviations of the coefficients of a field, (33,), from its size alone."""
-        falling = 1.0 + (self._waves / self._settings.sensed_field_wave) ** 2
-        found: Array = self._settings.sensed_field_deviation * self._size / falling
         return found
 
     def error(self, shared: Array, fields: Array) -> float:
@@ -227,7 +202,7 @@ class SensedProblem:
             settings,
         )
         if hold:
-            part.place_ridge = (
+            part.prior.place_ridge = (
                 settings.sensed_held_ridge if self.holds else settings.sensed_place_ridge
             )
         return part
@@ -238,7 +213,8 @@ class SensedProblem:
         Unlike what a fit minimises, it has the same ridges whatever that fit found to be relevant.
         """
         steps, x = self.y.shape[1], np.concatenate([shared, fields.ravel()])
-        return self._error(shared, fields, steps) + float(np.sum(self._prior(steps) * x * x))
+        prior = self.prior.given(self._open, self.weight(steps))
+        return self._error(shared, fields, steps) + float(np.sum(prior * x * x))
 
     def _error(self, shared: Array, fields: Array, steps: int) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -253,7 +229,7 @@ class SensedProblem:
         damping = settings.sensed_damping
         varied = self._open[:0] if known else self._open
         common = len(varied)
-        ridge = self._ridge(steps)[len(self._open) - common :]
+        ridge = self._ridges(steps)[len(self._open) - common :]
         x = np.concatenate([shared[varied], fields.ravel()])
 
         def parts(x: Array) -> tuple[Array, Array]:
@@ -293,26 +269,8 @@ class SensedProblem:
                     break
         return parts(x)
 
-    def _ridge(self, steps: int) -> Array:
-        ridge = self._prior(steps)
-        ridge[: self.shared] += self._precision
-        ridge[COEFFICIENTS + 1 : self.shared] += self.place_ridge**2
-        return np.concatenate([ridge[self._open], ridge[self.shared :]])
-
-    def _prior(self, steps: int) -> Array:
-        """That of all unknowns."""
-        rollouts, weight, settings = len(self.y), self.weight(steps), self._settings
-        shared = np.full(self.shared, weight / settings.sensed_deviation**2)
-        shared[SHARED:] = weight / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
-        shared += settings.sensed_ridge**2
-        shared[self._loose] *= 1e-4
-        rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
-        field = settings.sensed_field_ridge**2 / rollouts * rising
-        if self.spread is None:
-            field += weight / settings.sensed_field_deviation**2 * rising
-        else:
-            field += weight / self.spread**2
-        return np.concatenate([shared, np.tile(field, rollouts)])
+    def _ridges(self, steps: int) -> Array:
+        return self.prior.ridges(self._open, self.weight(steps))
 
     def weight(self, steps: int) -> float:
         """The variance of the noise on a residual."""
@@ -387,9 +345,9 @@ class SensedProblem:
 
         A field moves its own rollout alone.
         """
-        own = len(self._waves)
+        own = 1 + 2 * WAVES
         common = J.shape[1] - own
-        ridge = self._ridge(steps)[len(self._open) - common :]
+        ridge = self._ridges(steps)[len(self._open) - common :]
         H, g = np.diag(ridge), np.zeros(len(ridge))
         for m, (r, part) in enumerate(zip(residual, J, strict=True)):
             rows = np.r_[:common, common + m * own : common + (m + 1) * own]

@@ -81,7 +81,7 @@ class Smoothing:
             found = [p.refined(self.shared, x) for p, x in zip(problems, fields, strict=True)]
         spread = self.spread
         if spread is None:
-            spread = np.mean([problem.suggested for problem in problems], axis=0)
+            spread = np.mean([problem.prior.suggested for problem in problems], axis=0)
         settings = self.settings
         for _ in range(settings.sensed_learning):
             before = spread
@@ -92,7 +92,7 @@ class Smoothing:
             told = np.maximum(told, settings.sensed_least_told * len(problems))
             spread = _falling(size, told, settings.sensed_least_spread)
             for i, problem in enumerate(problems):
-                problem.spread = spread
+                problem.prior.spread = spread
                 found[i] = problem.refined(self.shared, found[i])
             if settled(spread, before, settings):
                 break
@@ -111,7 +111,7 @@ class Smoothing:
             self.settings,
             least=first,
         )
-        problem.spread = self.spread
+        problem.prior.spread = self.spread
         return problem
 
 

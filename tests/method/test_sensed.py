@@ -270,7 +270,7 @@ def test_what_a_part_of_a_rollout_does_not_determine_may_come_back_over_a_longer
     dispersion = TERMS.index((1, 3))
 
     def ridges(steps: int, before: float) -> Array:
-        problem._precision = np.full(len(shared), before)
+        problem.prior.precision = np.full(len(shared), before)
         return problem._relevant(shared, problem.interpolated(), steps)
 
     assert same_bits(ridges(6, 0.0), ridges(6, 1e6))
@@ -419,7 +419,7 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
     np.testing.assert_allclose(last[SHARED:], [0.0, 3.0, -3.0], atol=1.0)
     fits = len(found)
     given_up = part_by_part(problem, shared, problem.interpolated(), DEFAULTS, -1.0)
-    assert np.isinf(given_up[0]) and len(found) == fits + 1 and not problem.place_ridge
+    assert np.isinf(given_up[0]) and len(found) == fits + 1 and not problem.prior.place_ridge
 
 
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
@@ -442,7 +442,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     ridges, guess = [], sensed_fit._first_guess
 
     def guessed(problem: SensedProblem, *given: Any) -> Found:
-        ridges.append(problem.place_ridge)
+        ridges.append(problem.prior.place_ridge)
         return guess(problem, *given)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
@@ -488,6 +488,6 @@ def test_the_likeliest_unknowns_are_so_whatever_a_fit_found_relevant() -> None:
     # With errors as shares of the readings' mean square, each of the readings counts 1 / number.
     variance = 0.5**2 / np.sum(readings**2)
     assert moved - before == pytest.approx(variance * (3.0 / 10.0) ** 2, rel=1e-3)
-    problem.place_ridge = 7.0
+    problem.prior.place_ridge = 7.0
     problem.fit(shared, fields, lengths=[4])
     assert problem.implausibility(shared, fields) == moved
