@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from loop_interfaces.arrays import Array
@@ -18,6 +21,31 @@ def indicator_centres(points: int, n_a: int) -> list[int]:
     """
     spacing = points // n_a
     return [int((j + 0.5) * spacing) for j in range(n_a)]
+
+
+def indicators(points: int, n_a: int, width: float) -> list[tuple[int, int]]:
+    """The grid indices left <= i < right on which n_a indicators of this width act, in grid points.
+
+    The middle of one is up to a grid spacing away from its centre (`indicator_centres`).
+
+    >>> indicators(8, 2, 2.0), indicators(9, 3, 3.0)
+    ([(1, 3), (5, 7)], [(0, 2), (2, 5), (5, 8)])
+    """
+    half = 0.5 * width
+    return [(int(c - half), int(c + half)) for c in indicator_centres(points, n_a)]
+
+
+def placed_indicators(
+    points: int, positions: Sequence[float], width: float
+) -> list[tuple[int, int]]:
+    """The same around the grid points nearest to given shares of the axis, not yet modulo `points`.
+
+    >>> placed_indicators(10, [0.2, 0.0], 3.0)
+    [(0, 3), (-2, 1)]
+    """
+    half = 0.5 * width
+    centres = [math.floor(share * points + 0.5) for share in positions]
+    return [(math.floor(c - half), math.floor(c + half)) for c in centres]
 
 
 def extents(supports: Array) -> tuple[Array, Array]:

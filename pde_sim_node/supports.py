@@ -1,12 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The support of each actuator on the grid."""
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.actuators import indicator_centres
+from loop_interfaces.actuators import indicators, placed_indicators
 
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
@@ -26,10 +24,8 @@ def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
             f"width * n_a must not exceed 1, got {width:g} * {n_a} = {width * n_a:g}: "
             f"take a width of at most {1 / n_a:g}"
         )
-    half = 0.5 * width * n_z
     supports = np.zeros((n_z, n_a))
-    for j, centre in enumerate(indicator_centres(n_z, n_a)):
-        left, right = int(centre - half), int(centre + half)
+    for j, (left, right) in enumerate(indicators(n_z, n_a, width * n_z)):
         if not 0 <= left < right <= n_z:
             raise ValueError(
                 f"width {width:g} gives actuator {j} no grid point of its own "
@@ -66,9 +62,7 @@ def placed_supports(
         distance = np.minimum(distance, 1.0 - distance)
         shapes: NDArray[np.float64] = np.exp(-0.5 * (distance / width) ** 2)
         return shapes
-    half = 0.5 * width * n_x
     supports = np.zeros((n_x, len(centres)))
-    for j, centre in enumerate(np.floor(centres * n_x + 0.5).astype(int).tolist()):
-        points = np.arange(math.floor(centre - half), math.floor(centre + half))
-        supports[points % n_x, j] = 1.0
+    for j, ends in enumerate(placed_indicators(n_x, centres.tolist(), width * n_x)):
+        supports[np.arange(*ends) % n_x, j] = 1.0
     return supports

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.actuators import indicator_centres
+from loop_interfaces.actuators import indicators, placed_indicators
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
 from loop_interfaces.model_rows import unpack
@@ -141,7 +141,15 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
     centres, width = list(values["actuator_positions"]), float(values["actuator_width"])
     if values["actuator_shape"] == "gaussian":
         return centres, n_a * [math.sqrt(12.0) * width]
-    return centres or [centre / n_z for centre in indicator_centres(n_z, n_a)], n_a * [width]
+    # As an indicator is on the grid: up to a spacing away from where its parameters say.
+    ends = (
+        placed_indicators(n_z, centres, width * n_z)
+        if centres
+        else indicators(n_z, n_a, width * n_z)
+    )
+    return [0.5 * (left + right - 1) / n_z % 1.0 for left, right in ends], [
+        (right - left) / n_z for left, right in ends
+    ]
 
 
 def build_training(values: Mapping[str, Any]) -> Training:
