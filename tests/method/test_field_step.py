@@ -10,7 +10,7 @@ from loop_method.adapt import field_step
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.trajectories import Records
 from loop_method.models.linear import LinearModel
-from tests.method.test_gauss_newton import N_Z, Plant
+from tests.support.lifted_plant import N_Z, Plant
 
 
 def model(plant: Plant) -> LinearModel:

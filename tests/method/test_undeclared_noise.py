@@ -24,7 +24,7 @@ from loop_method.models.undeclared_noise import fit_undeclared_noise
 from loop_method.models.whiteness import correlations, is_white
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
-from tests.method.test_gauss_newton import N_Z, Plant, make, measure
+from tests.support.lifted_plant import N_Z, Plant, make, measure
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import warnings

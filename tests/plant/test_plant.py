@@ -1,23 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant: against controlgym, exact solutions, conservation laws, and itself to the last bit."""
 
+from __future__ import annotations
+
 import hashlib
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pde_sim_node.equations import (
-    AllenCahn,
-    Burgers,
-    ConvectionDiffusionReaction,
-    Equation,
-    KortewegDeVries,
-    Schrodinger,
-    load_equation,
-)
+from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries, Schrodinger
 from pde_sim_node.plant import DIVERGED_COST
 from pde_sim_node.plants import SpectralPlant
 from pdeloop.training_run import load_compiled, resolve
@@ -25,37 +18,10 @@ from spectral_solver import workers
 from spectral_solver.kernel import fine_length
 from spectral_solver.reference import ReferenceStep
 from tests.support.interpreter import python
-from tests.support.plants import plant_of
 from tests.support.small import SMALL
+from tests.support.spectral_plants import P1, P2, P3, P10, PROBLEMS, make, unforced
 
 DATA = Path(__file__).parents[1] / "data"
-
-P1 = {"n_z": 128, "n_a": 6, "width": 0.15, "sample_time": 0.05, "integration_time": 0.0025}
-P2 = {"n_z": 256, "n_a": 12, "width": 0.05, "sample_time": 0.01, "integration_time": 0.01}
-P3 = {"n_z": 256, "n_a": 10, "width": 0.05, "sample_time": 0.01, "integration_time": 0.001}
-P9 = {"n_z": 200, "n_a": 8, "width": 0.1, "sample_time": 0.1, "integration_time": 0.1}
-P10 = {"n_z": 256, "n_a": 8, "width": 0.1, "sample_time": 0.001, "integration_time": 0.001}
-PROBLEMS = pytest.mark.parametrize(
-    ("equation", "grid"),
-    [
-        (Burgers(), P1),
-        (AllenCahn(), P2),
-        (KortewegDeVries(), P3),
-        (ConvectionDiffusionReaction(), P9),
-        (Schrodinger(), P10),
-    ],
-    ids=["burgers", "allen-cahn", "kdv", "convection-diffusion-reaction", "schrodinger"],
-)
-
-
-def make(equation: Equation, **values: Any) -> SpectralPlant:
-    return plant_of(equation, **({"horizon": 50} | values))
-
-
-def unforced(plant: SpectralPlant, steps: int) -> np.ndarray:
-    action = np.zeros((1, plant.n_a))
-    plant.reset([-1])
-    return np.array([plant.step(action)[0].copy() for _ in range(steps)])
 
 
 # Against controlgym 1.0.0
@@ -372,210 +338,6 @@ def test_unusable_actions_are_refused_and_change_nothing(actions: np.ndarray, wo
     assert np.array_equal(plant.states, before)
     assert plant.step_index == 0
     assert plant.episode_costs().total.tolist() == [0.0, 0.0]
-
-
-# A user's equation
-
-FISHER = """
-from dataclasses import dataclass
-import numpy as np
-from pde_sim_node.equations import Equation, parameter
-
-STRENGTH = 1.0
-
-@dataclass(frozen=True, kw_only=True)
-class Fisher(Equation):
-    name = "fisher"
-    order = 2.0
-    rate: float = parameter(2.0, "growth rate", 0.0, 10.0, "1/time")
-
-    def linear_operator(self, k):
-        return self.rate - 0.01 * k**2
-
-    def multiplier(self, k):
-        return np.full_like(k, -self.rate)
-
-    @staticmethod
-    def nonlinearity(u):
-        return STRENGTH * u**2
-
-    def initial_field(self, x, rng):
-        return np.full_like(x, 0.1)
-
-    def target(self, x):
-        return np.ones_like(x)
-"""
-FISHER_GRID = {"n_z": 32, "n_a": 1, "width": 0.5, "sample_time": 0.5, "integration_time": 0.01}
-
-
-GAUSSIAN = """
-    def supports(self, x, n_a, width):
-        centres = self.length * np.array([0.2, 0.7])
-        away = (x[:, None] - centres + self.length / 2) % self.length - self.length / 2
-        return np.exp(-0.5 * (away / (width * self.length)) ** 2)
-"""
-
-
-def test_actuators_of_any_shape_at_any_place(tmp_path: Path) -> None:
-    """From rest a short step gives dt Phi a."""
-    path = tmp_path / "fisher.py"
-    path.write_text(FISHER + GAUSSIAN)
-    grid = FISHER_GRID | {"n_a": 2, "width": 0.1, "sample_time": 1e-6, "integration_time": 1e-6}
-    plant = make(load_equation(f"{path}:Fisher")(), **grid)
-    z, _ = plant.evaluate(np.zeros((1, 32)), np.array([[1.0, -2.0]]))
-    away = np.abs(np.arange(32)[:, np.newaxis] / 32 - [0.2, 0.7])
-    shapes = np.exp(-0.5 * (np.minimum(away, 1 - away) / 0.1) ** 2)
-    np.testing.assert_allclose(z[0], 1e-6 * (shapes @ [1.0, -2.0]), rtol=1e-4, atol=1e-12)
-
-
-TEN = {"n_z": 10, "n_a": 3, "sample_time": 0.01}
-
-
-def test_indicators_stand_where_their_centres_say() -> None:
-    """Two of ten points each; 0.31 is nearest to point 3, 0 is at the end and the beginning."""
-    plant = make(Burgers(), **TEN, width=0.2, positions=[0.31, 0.0, 0.85])
-    points = [[2, 3], [9, 0], [8, 9]]
-    expected = np.zeros((10, 3))
-    for j, own in enumerate(points):
-        expected[own, j] = 1.0
-    assert np.array_equal(plant.supports, expected)
-    assert np.array_equal(
-        make(Burgers(), **TEN, width=0.2, positions=[0.31, 1.0, 0.85]).supports, expected
-    )
-
-
-def test_gaussians_stand_where_their_centres_say() -> None:
-    """Of standard deviation 0.1 around 0.1, point 1 has 1, its neighbours exp(-1/2), and so on."""
-    plant = make(Burgers(), **TEN, width=0.1, positions=[0.1, 0.5, 0.55], shape="gaussian")
-    at = np.exp(-0.5 * np.arange(6) ** 2)
-    np.testing.assert_allclose(plant.supports[:, 0], at[[1, 0, 1, 2, 3, 4, 5, 4, 3, 2]])
-    np.testing.assert_allclose(plant.supports[:, 1], np.roll(plant.supports[:, 0], 4))
-    between = np.exp(-0.5 * np.array([0.5, 1.5]) ** 2)
-    np.testing.assert_allclose(plant.supports[[5, 6, 4, 7], 2], between[[0, 0, 1, 1]])
-    spaced = make(Burgers(), **TEN, width=0.1, shape="gaussian")
-    np.testing.assert_allclose(spaced.supports[:, 1], np.roll(plant.supports[:, 0], 4))
-
-
-@PROBLEMS
-def test_the_places_of_equally_spaced_actuators_may_be_written_out(
-    equation: Equation, grid: dict
-) -> None:
-    plant = make(equation, **grid)
-    n_x = len(plant.x)
-    centres = [int((j + 0.5) * (n_x // plant.n_a)) / n_x for j in range(plant.n_a)]
-    for placed in ({"positions": centres}, {"shape": "indicator"}):
-        assert np.array_equal(make(equation, **grid, **placed).supports, plant.supports)
-
-
-def test_an_action_forces_the_field_where_its_actuator_was_placed() -> None:
-    """From rest a short step gives dt Phi a."""
-    plant = make(Burgers(), **TEN | {"sample_time": 1e-6}, width=0.2, positions=[0.3, 0.5, 0.9])
-    z, _ = plant.evaluate(np.zeros((1, 10)), np.array([[1.0, -2.0, 3.0]]))
-    expected = np.array([0.0, 0.0, 1.0, 1.0, -2.0, -2.0, 0.0, 0.0, 3.0, 3.0])
-    np.testing.assert_allclose(z[0], 1e-6 * expected, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"positions": [0.1, 0.2]}, "for each of the n_a = 3 actuators, got 2"),
-        ({"positions": [0.1, 0.2, 1.1]}, "from 0 to 1, got [0.1, 0.2, 1.1]"),
-        ({"positions": [0.1, 0.2, np.nan]}, "from 0 to 1, got [0.1, 0.2, nan]"),
-        ({"shape": "square"}, "must be equation, indicator or gaussian, got 'square'"),
-        ({"shape": "gaussian", "width": 0.01}, "at least half a grid spacing, 0.05 at 10"),
-    ],
-)
-def test_actuators_that_cannot_be_placed_are_refused(options: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(words)):
-        make(Burgers(), **{**TEN, "width": 0.2, **options})
-
-
-def test_actuators_of_an_equations_own_are_not_moved_without_a_shape(tmp_path: Path) -> None:
-    path = tmp_path / "fisher.py"
-    path.write_text(FISHER + GAUSSIAN)
-    own = load_equation(f"{path}:Fisher")()
-    grid = FISHER_GRID | {"n_a": 2, "width": 0.1}
-    with pytest.raises(ValueError, match="fisher has actuators of its own"):
-        make(own, **grid, positions=[0.2, 0.7])
-    placed = make(own, **grid, positions=[0.2, 0.7], shape="gaussian")
-    np.testing.assert_allclose(placed.supports, make(own, **grid).supports, rtol=1e-12)
-
-
-def test_an_equation_of_the_users_own(tmp_path: Path) -> None:
-    """u' = r u (1 - s u): u(t) = 1 / (s + (1/u0 - s) exp(-r t)); an edit of s must not go unnoticed."""
-    path = tmp_path / "fisher.py"
-    for strength in (1.0, 2.0):
-        path.write_text(FISHER.replace("1.0", str(strength), 1))
-        z = unforced(make(load_equation(f"{path}:Fisher")(), **FISHER_GRID), 1)
-        exact = 1 / (strength + (10 - strength) * np.exp(-1.0))
-        np.testing.assert_allclose(z, exact, atol=1e-8)
-
-
-def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> None:
-    path = tmp_path / "fisher.py"
-    program = (
-        "import sys; from pde_sim_node.equations import load_equation;"
-        "from spectral_solver.pointwise import pointwise_loop;"
-        "pointwise_loop(load_equation(sys.argv[1]).nonlinearity)"
-    )
-
-    def compiles() -> bool:
-        cache = tmp_path / "cache"
-        before = set(cache.rglob("*.nbc"))
-        python("-c", program, f"{path}:Fisher", NUMBA_CACHE_DIR=str(cache))
-        return set(cache.rglob("*.nbc")) != before
-
-    path.write_text(FISHER)
-    assert [compiles(), compiles()] == [True, False]
-    path.write_text(FISHER.replace("1.0", "3.0", 1))
-    assert compiles()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("return STRENGTH * u**2", "return open(u)", r"Numba .*flawed.py, line \d+: .*open"),
-        (
-            "return STRENGTH * u**2",
-            "return np.linalg.qq(u)",
-            r"Numba .*flawed.py, line 22: Attr.* 'qq'",
-        ),
-        (
-            "nonlinearity(u)",
-            "nonlinearity(self, u)",
-            r"function u -> g\(u\) .*flawed.py, line 20: Type",
-        ),
-        ("np.full_like(k, -self.rate)", "-self.rate", "multiplier of the equation must return"),
-        (
-            "np.full_like(k, -self.rate)",
-            "np.full_like(k, np.nan)",
-            "17 finite .* got NaN or infinity$",
-        ),
-        ("np.full_like(k, -self.rate)", "k[:3]", r"got shape \(3,\)$"),
-        (
-            "np.full_like(k, -self.rate)",
-            "k[99]",
-            r"multiplier .* fails: .*flawed.py, line 18: Index",
-        ),
-        ("self.rate - 0.01 * k**2", "k / 0 * 1j", "linear_operator of the equation must return"),
-        ("self.rate - 0.01 * k**2", "1e6 + k", "growth rate"),
-        ("np.ones_like(x)", "np.ones(3)", "target of the equation must return"),
-        ("np.ones_like(x)", "x @ 'a'", r"target of the equation fails: .*flawed.py, line 28: UF"),
-        (
-            "def target(self, x)",
-            "def supports(self, *_): ...\n    def target(self, x)",
-            "supports of the",
-        ),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:(divide|invalid):RuntimeWarning")
-def test_a_flawed_equation_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
-    path = tmp_path / "flawed.py"
-    assert old in FISHER
-    path.write_text(FISHER.replace(old, new))
-    with pytest.raises(ValueError, match=words) as refused:
-        make(load_equation(f"{path}:Fisher")(), **FISHER_GRID)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_second_plant_does_not_compile_again() -> None:

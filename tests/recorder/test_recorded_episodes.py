@@ -14,7 +14,7 @@ from loop_interfaces.topics import ACTION, COST, MODEL, POLICY, START, STATE, TA
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import Report, verify
 from recorder_node.recording import Recording
-from tests.recorder.test_bag import BY_TOPIC, RUN, SECOND, WHAT, encode, frame, recorded_episode
+from tests.support.written_bag import BY_TOPIC, RUN, SECOND, WHAT, encode, frame, recorded_episode
 
 ROWS = np.array([(3.0, 4.0, 0.1, 0.0)])
 ENDED = Frame(RUN, 7, 5, 0.0, np.array([(1.0, 5.0, -1.0)]), 99)

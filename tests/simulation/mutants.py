@@ -43,7 +43,13 @@ SEEDS = 8
 LIMIT = 60.0
 """Seconds that a mutant has, however busy the machine: one that takes longer waits for ever."""
 _SIGNATURE = "interfaces/test_signature.py"
-_TUNER = ("tuner/test_dispatch.py", "tuner/test_session.py", _SIGNATURE)
+_TUNER = (
+    "tuner/test_dispatch.py",
+    "tuner/test_contradictions.py",
+    "tuner/test_pauses.py",
+    "tuner/test_session.py",
+    _SIGNATURE,
+)
 _PLANT = ("plant/test_lockstep.py", "plant/test_taken_actions.py", _SIGNATURE)
 _CONTROLLER = ("controller/test_responder.py", "controller/test_answered_steps.py", _SIGNATURE)
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,54 +11,20 @@ import pytest
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START, VOID
+from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START
+from tests.support.dispatching import (
+    EXPLORATION,
+    RUN,
+    batch,
+    costs_of,
+    dispatcher,
+    model_of,
+    starts,
+    void_of,
+)
 from tests.support.small import dispatcher_of, same_bits
-from tuner_node import targets
 from tuner_node.batch import Batch
-from tuner_node.dispatch import Dispatcher
 from tuner_node.errors import DispatchError
-from tuner_node.pair import FOREIGN_PLANT_GRACE, REMEMBERED
-from tuner_node.targets import MAX_TARGET_BYTES, MAX_TARGETS
-
-RUN = 42
-EXPLORATION = Batch(np.array([[3.0, 4.0, 0.1, 0.0]]), None)
-
-
-def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
-    made = dispatcher_of(
-        **({"run": RUN, "pairs": pairs, "max_batch": 4, "incarnation": 1} | settings)
-    )
-    for pair in range(pairs):
-        made.presence(pair, (), 0.0)
-    return made
-
-
-def batch(count: int) -> Batch:
-    rows = np.column_stack(
-        [np.arange(count), np.full(count, -1), np.zeros(count), np.zeros(count)]
-    ).astype(float)
-    return Batch(rows, np.arange(count, dtype=float)[:, None, None] * np.ones((1, 2, 4)))
-
-
-def starts(publications):
-    return [(pair, send.frame) for pair, send in publications if send.topic is START]
-
-
-def costs_of(frame: Frame) -> Frame:
-    """What a plant answers here: a cost that tells which row it belongs to."""
-    values = np.column_stack(
-        [frame.values[:, 0] ** 2, frame.values[:, 0], np.full(len(frame.values), COMPLETED)]
-    )
-    return Frame(frame.run, frame.episode, 30, 1.0, values.astype(float))
-
-
-def void_of(frame: Frame) -> Frame:
-    values = np.tile([0.0, 0.0, VOID], (len(frame.values), 1))
-    return Frame(frame.run, frame.episode, 3, 1.0, values)
-
-
-def model_of(frame: Frame, gain: float = 1.0, plant: int = 0) -> Frame:
-    return Frame(RUN, frame.episode, 0, 1.0, np.full((1, 9, 2), gain), plant)
 
 
 @pytest.mark.parametrize("pairs", [1, 2, 3, 5])
@@ -131,181 +96,6 @@ def test_trajectories_are_complete_with_the_last_sample_or_the_cost(cost_first):
     result = served.result()
     assert result is not None and result.trajectories is not None
     assert [t.states[:, 0].tolist() for t in result.trajectories] == [list(range(31))] * 2
-
-
-def test_two_different_costs_of_one_episode_end_the_run():
-    served = dispatcher()
-    ((_, first),) = starts(served.assign(batch(1), 0.0))
-    cost = replace(costs_of(first), plant=5)
-    served.cost(0, cost, 0.0)
-    assert served.cost(0, cost, 0.0) == []
-    assert served.cost(0, void_of(first), 0.0) == []  # gave up what another one has done
-    assert served.cost(0, replace(cost, plant=6, values=2 * cost.values), 0.0) == []
-    with pytest.raises(DispatchError, match=r"two different messages on episode/cost answer"):
-        served.cost(0, replace(cost, values=np.nextafter(cost.values, 9.0)), 0.0)
-
-
-def test_answers_of_the_last_16_episodes_can_be_contradicted_and_of_none_before():
-    assert REMEMBERED == 16
-    served, costs = dispatcher(), []
-    for now in range(20):
-        ((_, start),) = starts(served.assign(batch(1), float(now)))
-        costs.append(costs_of(start))
-        served.cost(0, costs[-1], float(now))
-        assert served.result() is not None
-    others = [replace(cost, values=cost.values + 1.0) for cost in costs]
-    for forgotten in others[:4]:
-        assert served.cost(0, forgotten, 20.0) == []
-    for known in others[4:]:
-        with pytest.raises(DispatchError, match=r"two different messages on episode/cost answer"):
-            served.cost(0, known, 20.0)
-
-
-def test_two_different_targets_of_the_run_s_plant_end_the_run():
-    served = dispatcher(plant=5)
-    target = Frame(0, 0, 0, 0.0, np.arange(3.0), 5)
-    other = replace(target, values=target.values + 1e-9)
-    assert served.target(0, target, 0.0) == served.target(0, target, 1.0) == []
-    assert served.target(0, replace(other, plant=6), 0.0) == []
-    assert served.target(0, replace(target, plant=6), 0.0) == []  # not this run's plant
-    with pytest.raises(DispatchError, match="two different targets arrived for the plant 5"):
-        served.target(0, other, 2.0)
-
-
-def test_targets_of_ever_new_plants_fill_no_memory():
-    served, values = dispatcher(), np.zeros(2**22)
-    refused = 0
-    tracemalloc.start()
-    for plant in range(30):
-        try:
-            served.target(0, Frame(0, 0, 0, 0.0, values, plant), 0.0)
-        except FrameError as error:
-            assert "expected the targets of at most" in str(error)
-            refused += 1
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert refused and peak < 1.1 * MAX_TARGET_BYTES
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.cost(0, replace(costs_of(start), plant=3), 1.0)  # the run's plant is known from now on
-    for plant in range(30):
-        assert served.target(0, Frame(0, 0, 0, 0.0, values, plant), 2.0) == []
-
-
-def test_targets_of_just_the_bytes_that_are_allowed_are_remembered(monkeypatch):
-    monkeypatch.setattr(targets, "MAX_TARGET_BYTES", 32)
-    served = dispatcher()
-    for plant in (1, 2):
-        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), plant), 0.0)
-    with pytest.raises(FrameError, match="expected the targets of at most"):
-        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), 3), 0.0)
-
-
-def test_a_start_is_signed_and_a_policy_is_of_the_plant_that_it_does_not_know():
-    served = dispatcher()
-    sends = {send.topic: send.frame for _, send in served.assign(batch(1), 0.0)}
-    assert sends[POLICY].plant == 0 != sends[START].plant
-
-
-def test_the_target_of_the_run_s_plant_has_room_as_soon_as_that_is_known():
-    served = dispatcher()
-    for plant in range(MAX_TARGETS):
-        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), plant), 0.0)
-    own = Frame(0, 0, 0, 0.0, np.ones(2), 99)
-    with pytest.raises(FrameError, match="expected the targets of at most 64 plants"):
-        served.target(0, own, 0.0)
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.cost(0, replace(costs_of(start), plant=99), 1.0)
-    assert served.target(0, own, 2.0) == []
-    result = served.result()
-    assert result is not None and result.target is not None
-    assert result.target.tolist() == [1.0, 1.0]
-
-
-def test_another_plant_ends_the_run_only_where_that_of_the_run_never_was():
-    for there in (True, False):
-        served = dispatcher(plant=5)
-        ((_, start),) = starts(served.assign(batch(1), 0.0))
-        if there:
-            served.target(0, Frame(0, 0, 0, 0.0, np.arange(3.0), 5), 0.0)
-        foreign = replace(costs_of(start), plant=6)
-        for now in np.arange(1.0, 40.0, 0.5):
-            late = now > 1.0 + FOREIGN_PLANT_GRACE and not there
-            with pytest.raises(DispatchError if late else FrameError, match="other parameters"):
-                served.cost(0, foreign, now)
-        served.cost(0, replace(foreign, plant=5), 40.0)
-        assert served.result() is not None
-
-
-def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
-    served = dispatcher()
-    ((_, first),) = starts(served.assign(batch(2), 0.0))
-    served.cost(0, costs_of(first), 0.0)
-    assert served.result() is not None
-    ((_, second),) = starts(served.assign(batch(2), 1.0))
-    with pytest.raises(
-        DispatchError, match=f"withdrew the cost of episode {episode_name(first.episode)}"
-    ):
-        served.cost(0, replace(void_of(first), step=costs_of(first).step), 1.0)
-    served.cost(0, costs_of(second), 1.0)
-    with pytest.raises(DispatchError, match=r"two different messages on episode/cost"):
-        served.cost(0, replace(costs_of(first), values=costs_of(first).values + 1.0), 2.0)
-
-
-@pytest.mark.parametrize("paused", [False, True])
-def test_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_taken_back(paused):
-    served = dispatcher()
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    if paused:
-        served.pause()
-    cost = costs_of(start)
-    served.cost(0, cost, 1.0)
-    assert served.cost(0, void_of(start), 2.0) == []
-    with pytest.raises(DispatchError, match="withdrew the cost of episode"):
-        served.cost(0, replace(void_of(start), step=cost.step), 3.0)
-
-
-def test_two_different_models_of_one_episode_end_the_run():
-    served = dispatcher()
-    ((_, first),) = starts(served.assign(EXPLORATION, 0.0))
-    model = Frame(RUN, first.episode, 0, 1.0, np.ones((1, 7)))
-    served.model(0, model, 0.0)
-    served.model(0, model, 0.0)
-    served.cost(0, costs_of(first), 0.0)
-    assert served.result() is not None
-    assert served.model(0, model, 0.0) == []
-    with pytest.raises(DispatchError, match=r"two different messages on model/identified answer"):
-        served.model(0, replace(model, values=2 * model.values), 0.0)
-
-
-def test_a_model_of_another_plant_is_refused_and_that_of_the_run_s_is_taken():
-    served = dispatcher(plant=5)
-    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
-    with pytest.raises(FrameError, match="expected a model of plant 5, got one of 6"):
-        served.model(0, model_of(start, plant=6), 0.0)
-    served.cost(0, replace(costs_of(start), plant=5), 0.0)
-    assert served.result() is None
-    served.model(0, model_of(start, plant=5), 0.0)
-    assert served.result() is not None
-
-
-@pytest.mark.parametrize("first", ["cost", "model"])
-def test_no_result_of_an_attempt_that_failed_is_used(first):
-    served = dispatcher()
-    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
-    if first == "cost":
-        served.cost(0, costs_of(start), 0.0)
-        failure = ModelFailure(RUN, start.episode, True, "a state was lost")
-        ((_, again),) = starts(served.failure(0, failure, 0.0))
-        served.model(0, model_of(again, 2.0), 0.0)
-    else:
-        served.model(0, model_of(start), 0.0)
-        ((_, again),) = starts(served.cost(0, void_of(start), 0.0))
-        served.cost(0, costs_of(again), 0.0)
-    assert served.result() is None
-    served.cost(0, costs_of(again), 0.0)
-    served.model(0, model_of(again, 2.0), 0.0)
-    result = served.result()
-    assert result is not None and same_bits(result.models, model_of(again, 2.0).values)
 
 
 def diverged(frame: Frame) -> Frame:
@@ -513,95 +303,3 @@ def test_costs_of_a_plant_with_other_parameters_are_refused():
     assert served.result() is None
     served.cost(0, replace(costs_of(second), plant=5), 0.0)
     assert served.result() is not None
-
-
-def said(value: float, plant: int = 0) -> Frame:
-    return Frame(RUN, 1, 3, 1.0, np.array([value]), plant)
-
-
-def test_a_paused_plant_is_not_silent_as_long_as_it_says_so():
-    served = dispatcher()
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    for now in np.arange(1.0, 200.0, 1.0):  # an episode_timeout is 10 s
-        served.plant_paused(0, said(1.0), now)
-        for _, frame in starts(served.tick(now + 0.5)):
-            assert frame.episode == start.episode  # asks again, which keeps the plant for this run
-    assert served.paused_pairs(199.0) == [0]
-    assert served.notes == []
-    served.plant_paused(0, said(0.0), 200.0)
-    assert served.paused_pairs(200.0) == []
-    served.cost(0, costs_of(start), 205.0)
-    assert served.result() is not None
-
-
-def test_a_paused_plant_that_says_nothing_more_is_silent_in_the_end():
-    served = dispatcher()
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.plant_paused(0, said(1.0), 1.0)
-    served.tick(10.9)
-    served.tick(20.0)
-    ((_, again),) = starts(served.tick(21.1))
-    assert again.episode == start.episode + 1
-
-
-def test_a_paused_pair_gets_no_new_episode_and_loses_none():
-    served = dispatcher(pairs=2)
-    (left, right) = starts(served.assign(batch(2), 0.0))
-    served.plant_paused(left[0], said(1.0), 1.0)
-    assert starts(served.cost(right[0], costs_of(right[1]), 2.0)) == []  # not taken from it
-    served.cost(left[0], costs_of(left[1]), 3.0)
-    assert served.result() is not None
-    ((pair, _), *more) = starts(served.assign(batch(2), 4.0))
-    assert pair == right[0]
-    assert more == []
-    ((pair, _),) = starts(served.plant_paused(left[0], said(0.0), 5.0))
-    assert pair == left[0]
-
-
-def test_a_plant_that_left_in_a_pause_is_not_paused_when_it_is_back():
-    served = dispatcher()
-    served.plant_paused(0, said(1.0), 1.0)
-    served.presence(0, ("plant",), 2.0)
-    served.presence(0, (), 3.0)
-    assert served.paused_pairs(3.0) == []
-
-
-def test_the_only_pair_gets_its_next_episode_in_a_pause_too_so_that_it_can_be_stepped_through():
-    served = dispatcher()
-    served.plant_paused(0, said(1.0), 1.0)
-    ((_, first),) = starts(served.assign(batch(1), 1.5))
-    served.cost(0, costs_of(first), 2.0)
-    served.result()
-    assert len(starts(served.assign(batch(1), 2.5))) == 1
-
-
-@pytest.mark.parametrize("values", [[], [0.5], [1.0, 1.0]])
-def test_a_word_about_a_pause_that_is_neither_yes_nor_no_is_refused(values):
-    served = dispatcher()
-    with pytest.raises(FrameError, match="0 or 1"):
-        served.plant_paused(0, Frame(RUN, 1, 0, 0.0, np.array(values)), 0.0)
-
-
-def test_what_another_plant_says_of_a_pause_does_not_count():
-    served = dispatcher()
-    ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.cost(0, replace(costs_of(start), plant=5), 0.0)
-    served.result()
-    served.plant_paused(0, said(1.0, plant=6), 1.0)
-    assert served.paused_pairs(1.0) == []
-
-
-def test_a_held_dispatcher_ends_what_is_under_way_hands_out_nothing_and_keeps_the_plant():
-    served = dispatcher(max_batch=1)
-    ((_, first),) = starts(served.assign(batch(2), 0.0))
-    served.pause()
-    assert served.cost(0, costs_of(first), 1.0) == []
-    for now in np.arange(2.5, 100.0, 2.5):
-        ((_, kept),) = served.tick(now)
-        assert kept.frame.episode == first.episode
-    assert served.episodes() == []
-    assert served.notes == []
-    ((_, second),) = starts(served.resume(100.0))
-    assert second.episode == first.episode + 1
-    served.cost(0, costs_of(second), 101.0)
-    assert served.result().costs[:, 0].tolist() == [0.0, 1.0]

@@ -11,7 +11,7 @@ import pytest
 
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
-from tests.tuner.test_dispatch import RUN, batch, costs_of, dispatcher, starts
+from tests.support.dispatching import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
 from tuner_node.errors import DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector, cut
