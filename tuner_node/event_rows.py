@@ -15,18 +15,21 @@ from tuner_node.void_exploration import variance
 Row = dict[str, Any]
 
 
-def diverged(settings: TrainingSettings, m: int, void: int, step: int, paid: int) -> Row:
+def diverged(
+    settings: TrainingSettings, m: int, void: int, step: int, paid: int, *, again: bool
+) -> Row:
     """A void exploration of the m-th seed, also a row of the history.
 
     void: how many the seed has had with this one; step: the one at which the plant diverged; paid:
-    rollouts of the seed so far.
+    rollouts of the seed so far; again: whether it explores once more.
     """
+    following = {"next_variance": variance(settings, void)} if again else {}
     return {
         "event": "diverged",
         "seed": settings.all_seeds[m],
         "step": step,
         "variance": variance(settings, void - 1),
-        "next_variance": variance(settings, void),
+        **following,
         "rollouts": paid,
     }
 

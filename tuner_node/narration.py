@@ -68,11 +68,7 @@ class Narration:
         elif event == "excitation":
             lines.append(f"  seed {row['seed']}: {row['remark']}")
         elif event == "diverged":
-            lines.append(
-                f"  seed {row['seed']}: the plant diverged under exploration at step {row['step']}; "
-                f"exploring again with variance {row['next_variance']:.3g} instead of "
-                f"{row['variance']:.3g}"
-            )
+            lines.append(_diverged(row))
         elif event == "repeated":
             lines.append(f"  {row['reason']}")
         return lines
@@ -292,6 +288,20 @@ def failed(summary: Row) -> bool:
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     none, adapted = (sum(summary["costs"][name]) for name in ("none", "adapted"))
     return lost["adapted"] == rollouts or (lost["lqt"] == rollouts and not adapted < none)
+
+
+def _diverged(row: Row) -> str:
+    """The line of an exploration in which the plant diverged."""
+    told = f"  seed {row['seed']}: the plant diverged under exploration at step {row['step']}"
+    if "next_variance" not in row:
+        return (
+            f"{told}, and no other exploration is left; going on with the model from before, whose "
+            "law was no better than no control"
+        )
+    return (
+        f"{told}; exploring again with variance {row['next_variance']:.3g} instead of "
+        f"{row['variance']:.3g}"
+    )
 
 
 def _spread(costs: Sequence[float | None]) -> str:

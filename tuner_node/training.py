@@ -232,9 +232,10 @@ class Training:
         rows, warm = [], self.warm_starts()
         for m, own in zip(self.pending, models, strict=True):
             model = self._unpacked(own)
-            # What was kept ran without control, whose policy has the shape of the model's.
-            zero = np.zeros_like(warm[m])
-            self.measured[m] = [replace(kept, policy=zero) for kept in self.measured[m]]
+            # Laws of the basis that is given up mean nothing on this one. Of no control, the policy has
+            # the shape of the model's.
+            unlike, zero = [k for k in self.measured[m] if not k.policy.any()], np.zeros_like(warm[m])
+            self.measured[m] = [replace(kept, policy=zero) for kept in unlike]
             seed = self.settings.all_seeds[m]
             rows.append(event_rows.designed(seed, self.attempts[m] + 1, own, model.A))
         self.phase = "check"
@@ -246,20 +247,26 @@ class Training:
         """Explore again, more weakly for the seeds whose plant diverged, at these steps.
 
         The others run once more as they were: which of them have models depends on how the batch was
-        cut into episodes. ValueError where a seed has no other attempt.
+        cut into episodes. A seed without another attempt goes on with the model that it has from
+        before; ValueError where it has none.
         """
         settings, rows = self.settings, []
         for m, step in lost.items():
             self.void[m] += 1
             self.budget.count("identify", [m] * settings.explorations)
             affordable = self._can_pay_for_exploration(m)
-            if self.void[m] > void_exploration.MOST or not affordable:
+            again = self.void[m] <= void_exploration.MOST and affordable
+            if not again and not self.attempts[m]:
                 raise ValueError(
                     void_exploration.no_model(settings, self.void[m], step, paid_up=not affordable)
                 )
+            if not again:
+                self.pending.remove(m)
             paid = int(self.budget.paid[m])
-            rows.append(event_rows.diverged(settings, m, self.void[m], step, paid))
+            rows.append(event_rows.diverged(settings, m, self.void[m], step, paid, again=again))
         self.history += rows
+        if not self.pending:
+            self._start_adapting()
         return rows
 
     def _given(self, identified: Array) -> list[dict[str, Any]]:
@@ -300,8 +307,6 @@ class Training:
             self.worse[m] = not good
             if again:
                 self.attempts[m] += 1
-                # Laws of the basis that is given up mean nothing on the next one.
-                self.measured[m] = [k for k in self.measured[m] if not k.policy.any()]
                 failed.append(m)
         self.pending = failed
         if failed:

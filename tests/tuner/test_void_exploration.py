@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.topics import StartColumn
+from loop_interfaces.topics import CostColumn, StartColumn
 from pdeloop.finished_run import load_run
 from pdeloop.in_process import LocalPair, train
 from pdeloop.report import data
@@ -112,6 +113,34 @@ def test_a_budget_without_room_for_another_exploration_ends_the_training():
     with pytest.raises(ValueError, match="no rollouts are left for another exploration"):
         explore_until_the_end(training, LocalPair(values))
     assert training.budget.paid.tolist() == [4]  # 4 more are left, of 2 and 1 + 3
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_seed_with_a_model_goes_on_with_it_where_the_plant_diverges_later(seeds):
+    values = parameters(optimizer="two_point", rollouts=20, seeds=seeds)
+    training, pair = build_training(values), LocalPair(values)
+    training.finish(pair.run(training.next_batch()))
+    pair.follow(training)
+    models = training.models.copy()
+    check = pair.run(training.next_batch())
+    worse = np.flatnonzero(np.arange(len(check.costs)) % 2 == 1)[:1]  # the first law of seed 0
+    costs = check.costs.copy()
+    costs[worse, CostColumn.MEAN] = 1e6
+    training.finish(replace(check, costs=costs))
+    assert training.phase == "identify" and training.pending == [0]
+    rows = []
+    while training.phase == "identify":
+        explored = pair.run(training.next_batch())
+        costs = explored.costs.copy()
+        costs[:, CostColumn.ENDED] = 3.0
+        rows += training.finish(replace(explored, costs=costs, models=None))
+    assert training.phase == "adapt" and same_bits(training.models, models)
+    assert training.worse == [True] + [False] * (seeds - 1)
+    assert not training.starts()[0].any() and training.void[0] == len(rows)
+    assert "going on with the model from before" in Narration(0, 1).lines(rows[-1])[0]
+    pair.follow(training)
+    train(training, pair, lambda row: None)
+    assert training.phase == "done" and training.budget.paid.max() <= 20
 
 
 def test_one_sentence_says_so():
