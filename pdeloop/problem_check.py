@@ -1,15 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop check FILE`: whether a training can work with a problem's numbers.
 
-Four findings: the integration step, by halving it; the actuators, by the plant linearised at the
-target; the exploration, the order and the first law, by one exploratory episode.
+Findings: the integration step, by halving it; the actuators, by the plant linearised at the target;
+whether the plant diverges without control; the exploration, the order and the first law, by one
+exploratory episode.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from tuner_node.build import build_training
 
-__all__ = ["Finding", "Reach", "check", "draw", "linearisation", "reach"]
+__all__ = ["Finding", "Reach", "check", "field_plant", "linearisation", "reach"]
 
 STEP_ERROR = 1e-2
 """Largest change of a sample by a halved integration step, relative to the sample's own change."""
@@ -64,26 +64,42 @@ class Finding:
 
 def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     """The findings about a problem's resolved parameters, one after the other."""
-    plant = _field_plant(values)
+    plant = field_plant(values)
     explored = _explore(plant, values)
     if values["plant"]:
         yield _repeatable(plant, explored)
     yield _halving(plant, values, explored)
     yield _actuators(plant)
+    lost = _without_control(plant)
+    if len(lost):
+        yield Finding(
+            "no control",
+            True,
+            f"the plant diverges without control from {len(lost)} of {DRAWN + 1} initial fields, the "
+            f"first at step {lost.min()} of {plant.horizon}: there, no control has no cost to compare "
+            "a law with",
+            note=True,
+        )
     diverged = explored.costs.diverged_step[explored.costs.diverged_step >= 0]
     if len(diverged):
+        remedy = "lower exploration_variance" + ("" if values["plant"] else " or integration_time")
+        if len(lost):
+            shorter = f"set a horizon of {lost.min()} steps or fewer, or " * bool(lost.min())
+            remedy = (
+                "weaker inputs do not help where the plant diverges without control; "
+                f"{shorter}draw initial fields nearer to the target"
+            )
         yield Finding(
             "exploration",
             False,
             f"{len(diverged)} of {len(explored.costs.mean)} explorations under inputs of variance "
-            f"{_variance(values):.3g} diverge, the first at step {diverged.min()}: lower "
-            "exploration_variance" + ("" if values["plant"] else " or integration_time"),
+            f"{_variance(values):.3g} diverge, the first at step {diverged.min()}: {remedy}",
         )
         return
     yield from _identification(values)
 
 
-def _field_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
+def field_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
     """The plant without noise, limits and sensors."""
     ideal = {spec.name: spec.default for spec in INSTRUMENTS}
     return build_plant({**values, **ideal}, compiled=compiled)
@@ -100,6 +116,14 @@ def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
         scale=np.sqrt(_variance(values)), size=(len(seeds), plant.horizon, plant.n_a)
     )
     return rollout(plant, lambda k, states: inputs[:, k], seeds, np.arange(len(seeds)))
+
+
+def _without_control(plant: Plant) -> NDArray[np.int64]:
+    """The steps at which the plant diverges without control, from the explored fields where it does."""
+    seeds = [MEAN_FIELD, *range(DRAWN)]
+    nothing = np.zeros((len(seeds), plant.n_a))
+    costs = rollout(plant, lambda k, z: nothing, seeds, np.arange(len(seeds)), keep=False).costs
+    return costs.diverged_step[costs.diverged_step >= 0]
 
 
 def _drawn_fields_cost(plant: Plant, law: Law | None = None) -> float:
@@ -353,44 +377,3 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         "" if good else ": the adaptation begins with a law that does not help; try another order"
     )
     yield Finding("first law", good, f"mean stage cost of {DRAWN} drawn fields {told}{hint}")
-
-
-def draw(values: Mapping[str, Any], path: Path) -> None:
-    """A picture of the initial fields, the target and the actuators' supports."""
-    from matplotlib.figure import Figure
-
-    plant = _field_plant(values, compiled=False)
-    fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
-    grid = plant.grid
-    if len(grid.axes) > 1:
-        from pdeloop.report import planes
-
-        figure = planes.fields(plant, fields[0], fields[1])
-        figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")
-        return
-    names, axis = grid.components, grid.line
-    figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
-    actuated = 0
-    for i, (ax, name) in enumerate(
-        zip(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names, strict=True)
-    ):
-        own, x = grid.part(i), axis.points
-        ax.plot(x, fields[1:, own].T, color="0.7", linewidth=0.8)
-        ax.plot(x, fields[0, own], color="0.35", label="initial field: mean, and five drawn")
-        ax.plot(x, plant.field_target[own], color="black", linestyle="--", label="target")
-        if own == plant.forced and plant.supports is not None:
-            actuated = i
-            below = ax.get_xaxis_transform()
-            for j, support in enumerate(plant.supports.T):
-                height = 0.12 * support / max(float(np.abs(support).max()), 1e-300)
-                label = "supports of the actuators" if j == 0 else None
-                ax.fill_between(
-                    x, height, transform=below, color="#d55e00", alpha=0.45, label=label
-                )
-        ax.set_ylabel(f"{name}(x)")
-        ax.set_xlim(0, axis.length)
-    ax.set_xlabel(axis.label)
-    known = figure.axes[actuated].get_legend_handles_labels()
-    figure.legend(*known, loc="outside upper center", ncols=3, frameon=False)
-    # Without a format a folder would become the name of a file next to it.
-    figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")

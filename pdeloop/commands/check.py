@@ -39,11 +39,11 @@ def add(commands: Commands) -> None:
         _check,
         help="check a problem before training, or a node of your own against the protocol",
         description="Check a problem before training on it: halve the integration step, see "
-        "whether the actuators reach the modes that are unstable at the target, explore once, "
-        "report the order that the data support and the cost of the first law, and draw fields and "
-        "supports. The exit code is 1 if a check fails. With plant, controller or tuner instead of a "
-        "FILE, check that a node of your own, alone in this ROS_DOMAIN_ID, conforms to "
-        "docs/stand-in.md.",
+        "whether the actuators reach the modes that are unstable at the target and the plant diverges "
+        "without control, explore once, report the order that the data support and the cost of the "
+        "first law, and draw fields and supports. The exit code is 1 if a check fails. With plant, "
+        "controller or tuner instead of a FILE, check that a node of your own, alone in this "
+        "ROS_DOMAIN_ID, conforms to docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
     check.add_argument(
@@ -98,7 +98,8 @@ def _check(options: argparse.Namespace) -> int:
 
         found = check_node(options.problem, **given)
     else:
-        from pdeloop.problem_check import check, draw
+        from pdeloop.problem_check import check
+        from pdeloop.problem_picture import draw
         from pdeloop.training_run import load_compiled, resolve
 
         values = resolve(options.problem, allow_own_code(options))

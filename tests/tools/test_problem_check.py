@@ -128,6 +128,12 @@ def test_the_small_problem_is_good_and_a_coarse_step_is_not() -> None:
     assert "take 0.025 s or less" in coarse["integration step"][1]
 
 
+def test_inputs_that_are_too_strong_for_a_plant_are_told() -> None:
+    found = named(exploration_variance=1000.0, divergence_bound=3.2)
+    assert "no control" not in found
+    assert found["exploration"][1].endswith(": lower exploration_variance or integration_time")
+
+
 def test_an_exploration_that_diverges_is_told() -> None:
     found = named(divergence_bound=0.5)
     assert found["exploration"][0] is False
@@ -175,6 +181,30 @@ def test_one_drawn_state_whose_exploration_diverges_is_told() -> None:
     good, text = findings_of(SometimesFar())["exploration"]
     assert not good
     assert "1 of 6 explorations" in text
+
+
+class Unstable(Around):
+    """z+ = 1.2 z + a/10, which leaves the bound of 5 after about ten steps, whatever the inputs are."""
+
+    divergence_bound = 5.0
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return 1.2 * z + 0.1 * a
+
+
+def test_a_plant_that_diverges_without_control_is_told_and_weaker_inputs_are_not_advised() -> None:
+    plant = Unstable()
+    drawn = [plant.initial_state(np.random.default_rng(seed)) for seed in range(5)]
+    largest = max(np.abs(z).max() for z in drawn)
+    first = int(np.argmax(largest * 1.2 ** np.arange(1, 41) > 5.0))
+    found = findings_of(plant)
+    assert found["no control"][0]
+    assert f"without control from 5 of 6 initial fields, the first at step {first} of 40" in (
+        found["no control"][1]
+    )
+    good, text = found["exploration"]
+    assert not good and "lower exploration_variance" not in text
+    assert f"a horizon of {first} steps or fewer" in text
 
 
 @pytest.mark.parametrize(
