@@ -234,7 +234,10 @@ class Training:
             model = self._unpacked(own)
             # Laws of the basis that is given up mean nothing on this one. Of no control, the policy has
             # the shape of the model's.
-            unlike, zero = [k for k in self.measured[m] if not k.policy.any()], np.zeros_like(warm[m])
+            unlike, zero = (
+                [k for k in self.measured[m] if not k.policy.any()],
+                np.zeros_like(warm[m]),
+            )
             self.measured[m] = [replace(kept, policy=zero) for kept in unlike]
             seed = self.settings.all_seeds[m]
             rows.append(event_rows.designed(seed, self.attempts[m] + 1, own, model.A))

@@ -5,8 +5,7 @@ The cost is a sum of squares of measured quantities; only its sensitivity to the
 model, and that is fitted to the rollouts as they come in. So a model error affects the direction of a
 step, never the cost, and every step is judged by rollouts.
 
-The law is a = K_a s + b with s = U^T z and theta = [K_a b]: K_b acts only through b = K_b s_r. A
-step
+The law is a = K_a s + b, s = U^T z, theta = [K_a b]: K_b acts only through b = K_b s_r. A step
 
 1. fits local models to the remembered trajectories (`fit`) and keeps those that predict measured
    differences of trajectories (`selection`),
@@ -80,8 +79,7 @@ class GaussNewton(Optimizer):
     context : Context
         Basis, target, weights, horizon and the exploratory trajectory.
     settings : GaussNewtonSettings
-        `fields`: more fit the distribution better, at M rollouts a step. One is added after each
-        accepted step that gains little, as fields then differ by more than is left to gain.
+        `fields`: more fit the distribution better, at M rollouts a step.
     first_field : int
         Number of the first of these fields: a law can have been made on those before.
     verdict : bool
@@ -373,7 +371,9 @@ class GaussNewton(Optimizer):
         if not np.isfinite(self._mean_cost(now.incumbents)):
             # Nothing to improve on: halve the gains until the rollouts come to their end.
             start = now.policy if now.accepted else now.candidate
-            now.candidate, now.fall, now.proposed = 0.5 * start, 0.0, True
+            now.candidate, now.fall, now.proposed = 0.5 * start, 0.0, bool(start.any())
+            if not now.proposed:
+                now.reason = row["reason"] = "no step can start where no control diverges"
             return
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         count = self._records.count

@@ -24,7 +24,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State, part_of
 from loop_method.adapt.gauss_newton import GaussNewton
 from loop_method.adapt.settings import GaussNewtonSettings, ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of_pairs
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of_pairs, is_cheaper
 from loop_method.seeds import field_seed
 
 COMPARING, SEARCHING, CONFIRMING, ENDED = "comparing", "searching", "confirming", "ended"
@@ -105,7 +105,7 @@ class LocalSearch:
         if self.stage == COMPARING:
             self._none_costs = costs
             first = np.array([record.cost for record in self._records[: len(costs)]])
-            if not np.mean(first) < np.mean(costs):
+            if not is_cheaper(first, costs):
                 self._from_none = True
                 self.policy = np.zeros_like(self._first)
                 row["reason"] = "the first law is no better than no control, which is the start"

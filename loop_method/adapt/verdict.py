@@ -114,6 +114,24 @@ def size_of(name: str, base: str, change: float, deviation: float) -> str:
     return f"{law} costs {abs(change):.4g} (standard error {deviation:.2g}) {more} than {other}"
 
 
+def is_cheaper(own: Array, other: Array) -> bool:
+    """True if a law diverges from fewer fields than another one, or from as many and costs less.
+
+    own, other: costs from the same fields, infinite where the law diverges; those from which neither
+    does are compared.
+
+    >>> is_cheaper(np.array([np.inf, 9.0]), np.array([np.inf, np.inf]))
+    True
+    >>> is_cheaper(np.array([np.inf, 9.0, 1.0]), np.array([2.0, np.inf, 0.5]))
+    False
+    """
+    came, back = np.isfinite(own), np.isfinite(other)
+    if came.sum() != back.sum():
+        return bool(came.sum() > back.sum())
+    both = came & back
+    return bool(own[both].sum() < other[both].sum())
+
+
 def evidence_of(
     loop: ClosedLoop,
     laws: Mapping[str, Array],

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -117,3 +118,26 @@ def test_a_step_that_is_never_found_leaves_the_law_that_was_better(
     judged, row = carried_out(found, costs(5.0, 0.0))
     assert not judged and row["chosen"] == NONE and not found.policy.any()
     assert row["early"] == "no model gives a finite step that gains anything"
+
+
+def test_a_first_law_that_diverges_from_fewer_fields_than_no_control_is_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Means are infinite where one rollout diverges, and then tell the two apart no more."""
+    found = search(4, 14, monkeypatch)
+    found._records[0] = replace(found._records[0], cost=np.inf)
+    found.tell([RolloutResult(1e9, True, trajectory(i)) for i in range(2)])
+    assert np.array_equal(found.policy, FIRST_LAW)
+
+
+def test_no_step_is_tried_from_no_control_under_which_the_plant_diverges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Halved, no control is itself: its rollouts would use up the budget."""
+    found = search(4, 14, monkeypatch)
+    found._records[0] = replace(found._records[0], cost=np.inf)
+    found._records[1] = replace(found._records[1], cost=np.inf)
+    found.tell([RolloutResult(10.0, False, trajectory(i)) for i in range(2)])
+    row = dict(found.tell([RolloutResult(1e9, True, trajectory(i)) for i in range(3)]))
+    assert found.ask() == [] and row["chosen"] == NONE
+    assert row["early"] == "no step can start where no control diverges"

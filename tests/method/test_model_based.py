@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
+from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory, model_based
+from loop_method.adapt.belief import believe
+from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO, Estimate, mean_of
 from loop_method.adapt.renewal import choose_fraction, held_out_fraction
 from loop_method.adapt.settings import ModelBasedSettings
@@ -224,6 +226,29 @@ def test_a_first_law_that_leads_to_where_no_model_follows_is_no_obstacle() -> No
     assert rows[0]["mismatch"] < 1e-6
     assert rows[-1]["chosen"] == ADAPTED
     assert wild.cost(optimizer.policy) <= 1.05 * wild.cost(wild.best)
+
+
+@pytest.mark.parametrize(
+    ("first", "none", "safe"),
+    [
+        ([3.0, np.inf, 2.0], [np.inf, np.inf, 1.0], True),
+        ([5.0, np.inf, 2.0], [4.0, 9.0, np.inf], False),
+        ([np.inf] * 3, [np.inf] * 3, True),
+    ],
+)
+def test_a_first_law_is_left_only_where_no_control_diverges_from_fewer_fields_or_is_cheaper(
+    first: list[float], none: list[float], safe: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    optimizer = make(Plant())
+    monkeypatch.setattr(
+        ClosedLoop, "costs", lambda _, theta, fields: np.array(first if theta.any() else none)
+    )
+    monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
+    monkeypatch.setattr(model_based, "is_chaotic", lambda *_: False)
+    belief = believe(optimizer._context, optimizer._before)
+    assert belief is not None
+    optimizer._improve(belief, {}, True)
+    assert optimizer._progress.safe is safe
 
 
 def test_a_large_budget_ends_once_the_fields_are_known() -> None:

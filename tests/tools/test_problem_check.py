@@ -199,8 +199,9 @@ def test_a_plant_that_diverges_without_control_is_told_and_weaker_inputs_are_not
     first = int(np.argmax(largest * 1.2 ** np.arange(1, 41) > 5.0))
     found = findings_of(plant)
     assert found["no control"][0]
-    assert f"without control from 5 of 6 initial fields, the first at step {first} of 40" in (
-        found["no control"][1]
+    assert (
+        f"without control from 5 of 6 initial fields, the first at step {first} of 40"
+        in (found["no control"][1])
     )
     good, text = found["exploration"]
     assert not good and "lower exploration_variance" not in text
