@@ -152,7 +152,7 @@ class GaussNewton(Optimizer):
     @property
     def early(self) -> str:
         """Why rollouts are left over at the end."""
-        return self._now.reason or "what is left is too little for a step or the verdict"
+        return self._now.reason or "what is left is too little for a step and its verdict"
 
     @property
     def next_field(self) -> int:
@@ -373,7 +373,7 @@ class GaussNewton(Optimizer):
             start = now.policy if now.accepted else now.candidate
             now.candidate, now.fall, now.proposed = 0.5 * start, 0.0, bool(start.any())
             if not now.proposed:
-                now.reason = row["reason"] = "no step can start where no control diverges"
+                now.reason = row["reason"] = "no step starts from no control, which diverges"
             return
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         count = self._records.count

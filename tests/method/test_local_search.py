@@ -140,4 +140,4 @@ def test_no_step_is_tried_from_no_control_under_which_the_plant_diverges(
     found.tell([RolloutResult(10.0, False, trajectory(i)) for i in range(2)])
     row = dict(found.tell([RolloutResult(1e9, True, trajectory(i)) for i in range(3)]))
     assert found.ask() == [] and row["chosen"] == NONE
-    assert row["early"] == "no step can start where no control diverges"
+    assert row["early"] == "no step starts from no control, which diverges"
