@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The best affine law and the limit of any controller, for the table of `python -m benchmarks general`.
+"""The best affine law and the limit of any controller: `python -m benchmarks optimum` and `general`.
 
 Both are those of a training's closed loop with the plant itself in place of its model, so that action
 limits and measurement noise count, and with exact derivatives:
@@ -14,7 +14,7 @@ limits and measurement noise count, and with exact derivatives:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +22,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import pdeloop
-from benchmarks.descent import descend
+from benchmarks.descent import Descent, descend
 from benchmarks.families.cases import Case
-from benchmarks.optimum import TRAINING_SEED, evaluation_seeds
 from benchmarks.true_model import TrueModel
 from benchmarks.warm_start import warm_start
 from loop_interfaces.arrays import Array
@@ -32,17 +31,33 @@ from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.settings import ImprovementSettings
+from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
 
-__all__ = ["best_inputs", "best_law", "bounds_of", "inputs_cost", "loop_of"]
+__all__ = [
+    "TRAINING_SEED",
+    "best_inputs",
+    "best_law",
+    "bounds_of",
+    "closed_loop",
+    "evaluation_seeds",
+    "initial_fields",
+    "inputs_cost",
+    "law_costs",
+    "loop_of",
+]
 
-COARSE = ImprovementSettings(iterations=300, least_gain=1e-2)
-"""Descents on some of the fields."""
-FINE = ImprovementSettings(iterations=300, least_gain=1e-3)
-"""Descents on all of them."""
+TRAINING_SEED = 7000
+"""Draws the fields that a law is optimised on: no evaluation uses it."""
+ITERATIONS = 300
+"""Of one descent to a law at most."""
+LAW_TOLERANCE = 1e-3
+"""Gain, relative to the cost, below which a law is not improved further."""
+COARSER = 10.0
+"""The same on some of the fields, per tolerance."""
 HORIZONS = (8, 4, 2)
 """Divisors of the horizon."""
 ROUNDS = 6
@@ -51,31 +66,39 @@ INPUTS_TOLERANCE = 2e-3
 """Of `descend`, for the inputs."""
 
 
+def evaluation_seeds(seed: int, fields: int) -> list[int]:
+    """The initial fields of a closing evaluation."""
+    return [derive(seed, Purpose.EVALUATION_FIELD, i) for i in range(fields)]
+
+
 def bounds_of(case: Case, seed: int, held_out: Sequence[int]) -> dict[str, Array]:
     """The costs from each held-out field of the best affine law and of the best inputs.
 
     seed: of the training whose basis and first law are taken; held_out: seeds of the fields.
     """
+    values = dict(pdeloop.problem(case.base or None, seed=seed, **case.parameters()).values)
     with threadpool_limits(limits=1), np.errstate(all="ignore"):
-        plant, loop, first = loop_of(case, seed)
+        plant, loop, first = loop_of(values, values["optimizer"])
         own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, case.law_fields))
         theta = best_law(loop, first, own)
-        K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
-        noise = np.arange(len(held_out))
-        episode = rollout(plant, lambda _, z: z @ K.T + b, held_out, noise, keep=False)
-        inputs = best_inputs(loop, theta, initial_fields(plant, held_out))
-    return {"affine": episode.costs.mean, "limit": inputs}
+        affine = law_costs(plant, loop, theta, held_out)
+        inputs, _ = best_inputs(loop, theta, initial_fields(plant, held_out))
+    return {"affine": affine, "limit": inputs}
 
 
-def loop_of(case: Case, seed: int) -> tuple[Plant, ClosedLoop, Array]:
-    """The plant of a case, the closed loop of the training with this seed, and its first law."""
-    given = case.parameters()
-    values: dict[str, Any] = dict(pdeloop.problem(case.base or None, seed=seed, **given).values)
+def loop_of(values: Mapping[str, Any], optimizer: str) -> tuple[Plant, ClosedLoop, Array]:
+    """The plant of a training with this optimiser, its closed loop, and its first law."""
     plant = build_plant(values)
+    training = warm_start(values, LocalPair(values, plant), optimizer)
+    loop = closed_loop(values, training.laws()[0].model.U)
+    return plant, loop, loop.theta(training.warm_starts()[0])
+
+
+def closed_loop(values: Mapping[str, Any], U: Array) -> ClosedLoop:
+    """That of laws of U^T z with the plant that has these parameters."""
     ideal = build_plant({**values, **{spec.name: spec.default for spec in INSTRUMENTS}})
-    training = warm_start(values, LocalPair(values, plant), values["optimizer"])
-    loop = ClosedLoop(
-        training.laws()[0].model.U,
+    return ClosedLoop(
+        U,
         ideal.target,
         ideal.state_weight,
         ideal.action_weight,
@@ -84,7 +107,13 @@ def loop_of(case: Case, seed: int) -> tuple[Plant, ClosedLoop, Array]:
         model=TrueModel(ideal),
         noise=values["measurement_noise"],
     )
-    return plant, loop, loop.theta(training.warm_starts()[0])
+
+
+def law_costs(plant: Plant, loop: ClosedLoop, theta: Array, held_out: Sequence[int]) -> Array:
+    """The costs of a law from the fields with these seeds, on the plant itself."""
+    K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
+    noise = np.arange(len(held_out))
+    return rollout(plant, lambda _, z: z @ K.T + b, held_out, noise, keep=False).costs.mean
 
 
 def initial_fields(plant: Plant, seeds: Sequence[int]) -> Array:
@@ -93,7 +122,9 @@ def initial_fields(plant: Plant, seeds: Sequence[int]) -> Array:
     return plant.states.copy()
 
 
-def best_law(loop: ClosedLoop, first: Array, fields: Array) -> Array:
+def best_law(
+    loop: ClosedLoop, first: Array, fields: Array, tolerance: float = LAW_TOLERANCE
+) -> Array:
     """The law of least mean cost, from the best of some laws to begin with.
 
     Descents on a quarter of the fields say which leads furthest: that from the first law, or that from
@@ -101,14 +132,18 @@ def best_law(loop: ClosedLoop, first: Array, fields: Array) -> Array:
     that of a short one few.
     """
     few = fields[: -(-len(fields) // 4)]
+    coarse, fine = (
+        ImprovementSettings(iterations=ITERATIONS, least_gain=gain)
+        for gain in (COARSER * tolerance, tolerance)
+    )
     zero = grown = np.zeros_like(first)
     for part in HORIZONS:
         short = replace(loop, horizon=max(loop.horizon // part, 1))
-        grown = descended(short, grown, few, COARSE)
-    near = [descended(loop, theta, few, COARSE) for theta in (first, grown)]
+        grown = descended(short, grown, few, coarse)
+    near = [descended(loop, theta, few, coarse) for theta in (first, grown)]
     even = np.full(len(fields), 1.0 / len(fields))
     start = cheapest(loop, [first, zero, *near], fields, even)
-    return descended(loop, start, fields, FINE)
+    return descended(loop, start, fields, fine)
 
 
 def descended(
@@ -126,8 +161,13 @@ def descended(
     return theta
 
 
-def best_inputs(loop: ClosedLoop, theta: Array, fields: Array) -> Array:
-    """The cost of the best inputs from each of the fields, known and without noise, (F,)."""
+def best_inputs(
+    loop: ClosedLoop, theta: Array, fields: Array, tolerance: float = INPUTS_TOLERANCE
+) -> tuple[Array, Descent]:
+    """The cost of the best inputs from each of the fields, known and without noise, (F,).
+
+    And the descent of their mean, from the inputs of a law.
+    """
     loop = replace(loop, noise=0.0)
     start = np.zeros((loop.horizon, len(fields), loop.model.n_a))
     if loop.action_limit:
@@ -136,10 +176,10 @@ def best_inputs(loop: ClosedLoop, theta: Array, fields: Array) -> Array:
     found = descend(
         lambda v: _mean(*inputs_cost(loop, theta, v, fields)),
         start,
-        tolerance=INPUTS_TOLERANCE,
+        tolerance=tolerance,
         limit=loop.action_limit,
     )
-    return inputs_cost(loop, theta, found.x, fields)[0]
+    return inputs_cost(loop, theta, found.x, fields)[0], found
 
 
 def _mean(costs: Array, gradient: Array) -> tuple[float, Array]:

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 
 import pdeloop
 from benchmarks import local_choices
+from benchmarks.bounds import evaluation_seeds
 from benchmarks.families.cases import CASES, Case
 from benchmarks.local_choices import Pairs, pairs_of
-from benchmarks.optimum import evaluation_seeds
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
 from loop_method.adapt.belief import Belief

@@ -5,7 +5,7 @@ A law of the whole field acts on the estimate of an extended Kalman filter that 
 the distribution of initial fields. What is lost against the law on the field itself is the price of the
 sensors and of their noise, and no model's. Costs are those of a closing evaluation.
 
-The law is the best affine one by exact gradients: without noise (`benchmarks.optimum`), whose gains in
+The law is the best affine one by exact gradients: without noise (`benchmarks.bounds`), whose gains in
 directions that no field takes are anything, or with some noise on what it sees; of these the one that
 costs least with the estimator on other fields.
 
@@ -30,6 +30,7 @@ Anderson, Moore, "Optimal Filtering", 1979, section 8.2 (extended Kalman filter)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -37,11 +38,16 @@ import numpy as np
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from benchmarks.optimum import TRAINING_SEED, evaluation_seeds, optimise_law
-from benchmarks.true_model import TrueModel
+from benchmarks.bounds import (
+    TRAINING_SEED,
+    best_law,
+    evaluation_seeds,
+    initial_fields,
+    law_costs,
+    loop_of,
+)
 from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
-from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.settings import ModelBasedSettings
 from pde_sim_node.build import build_plant
@@ -194,28 +200,21 @@ def _whole(
     problem: str, seed: int, fields: int, seeds: Sequence[int]
 ) -> tuple[Plant, list[Law], dict[str, Any]]:
     """The plant, laws of the whole field, and their costs on held-out fields."""
-    found = optimise_law(problem, seed, fields=fields, evaluations={0: seeds}, tolerance=1e-3)
-    _, (U, theta), costs = found
-    true = build_plant(load_parameters(problem, {}))
-    initial = true.reset(np.array(evaluation_seeds(TRAINING_SEED, fields))).copy()
+    values = load_parameters(problem, {"seed": seed})
+    true, loop, first = loop_of(values, "gauss_newton")
+    initial = initial_fields(true, evaluation_seeds(TRAINING_SEED, fields))
+    theta = best_law(loop, first, initial)
+    whole = float(law_costs(true, loop, theta, seeds).mean())
     laws: list[Law] = []
     for noise in SEEN_NOISE:
-        loop = ClosedLoop(
-            U,
-            true.target,
-            true.state_weight,
-            true.action_weight,
-            true.horizon,
-            model=TrueModel(true),
-            noise=noise,
-        )
+        loop = replace(loop, noise=noise)
         if noise:
             every = np.full(fields, 1.0 / fields)
             better = improve(loop, theta, initial, every, curvature_of(loop), ModelBasedSettings())
             theta = theta if better is None else better.theta
-        laws.append(partial(_affine, K=theta[:, :-1] @ U.T, b=loop.constant_feature * theta[:, -1]))
+        K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
+        laws.append(partial(_affine, K=K, b=b))
     none = partial(_affine, K=np.zeros((true.n_a, true.n_z)), b=np.zeros(true.n_a))
-    whole = float(np.mean(costs["optimum"][0]))
     return true, laws, {"problem": problem, "none": _cost(true, none, seeds), "whole": whole}
 
 

@@ -152,8 +152,7 @@ def trained(case: Case, **settings: Any) -> Any:
 
 def bound(name: str) -> dict[str, float]:
     """Costs of the best affine law and of the best inputs on the held-out fields of the table."""
-    from benchmarks.bounds import bounds_of
-    from benchmarks.optimum import evaluation_seeds
+    from benchmarks.bounds import bounds_of, evaluation_seeds
 
     costs = bounds_of(CASES[name], TABLE_SEEDS, evaluation_seeds(EVALUATION, 10))
     return {key: float(f"{own.mean():.5g}") for key, own in costs.items()}

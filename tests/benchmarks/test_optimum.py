@@ -9,6 +9,15 @@ import pytest
 
 from benchmarks import optimum
 from benchmarks.__main__ import parser
+from benchmarks.bounds import (
+    TRAINING_SEED,
+    best_inputs,
+    best_law,
+    evaluation_seeds,
+    initial_fields,
+    law_costs,
+    loop_of,
+)
 from benchmarks.descent import descend
 from benchmarks.limits import FOLDER, find
 from loop_interfaces.problem import load_parameters
@@ -94,25 +103,32 @@ def test_the_limits_are_optima(limits):
     _, result = limits
     assert all(result["converged"])
     gradients = Gradients(build_plant(values_of()))
-    fields = optimum.evaluation_seeds(optimum.TRAINING_SEED, 4)
+    fields = evaluation_seeds(TRAINING_SEED, 4)
     for seed, costs in enumerate(result["costs"]):
         given = {"fields": 4, "evaluations": {}, "tolerance": 1e-6}
-        found, (U, theta), _ = optimum.optimise_law(str(SMALL), seed, **given)
-        assert found.gradient_norm < 1e-2
+        cost, (U, theta), _ = optimum.law_of(seed, values_of(), **given)
+        found = gradients.of_law(U, theta, fields)
+        assert found.cost == pytest.approx(cost, rel=1e-9)
+        assert np.linalg.norm(theta) * np.linalg.norm(found.gradient) < 1e-2 * cost
         rng = np.random.default_rng(seed)
         for _ in range(10):
             step = 0.02 * rng.standard_normal(theta.shape) * np.abs(theta).max()
-            assert gradients.of_law(U, theta + step, fields)[0] > found.cost
+            assert gradients.of_law(U, theta + step, fields)[0] > cost
         assert np.mean(costs["optimum"][0]) < np.mean(costs["lqt"][0])
         assert (np.array(result["open_loop"]["0"]) < np.array(costs["optimum"][0])).all()
 
 
 def test_the_limits_from_zero_are_the_same(limits):
-    (again,) = optimum.run([str(SMALL)], **GIVEN, seeds=1, evaluation_fields=FIELDS, from_zero=True)
     _, result = limits
-    law, other = (np.mean(found["costs"][0]["optimum"][0]) for found in (result, again))
-    assert other == pytest.approx(law, rel=5e-3)
-    assert again["open_loop"]["0"] == pytest.approx(result["open_loop"]["0"], rel=1e-3)
+    plant, loop, first = loop_of(values_of(), "gauss_newton")
+    zero = np.zeros_like(first)
+    theta = best_law(loop, zero, initial_fields(plant, evaluation_seeds(TRAINING_SEED, 4)), 1e-6)
+    held_out = evaluation_seeds(0, FIELDS)
+    law = np.mean(result["costs"][0]["optimum"][0])
+    assert law_costs(plant, loop, theta, held_out).mean() == pytest.approx(law, rel=5e-3)
+    for cost, seed in zip(result["open_loop"]["0"], held_out, strict=True):
+        (again,), _ = best_inputs(loop, zero, initial_fields(plant, [seed]), 1e-6)
+        assert again == pytest.approx(cost, rel=1e-3)
 
 
 def test_limits_hold_for_their_plant_only(limits):
@@ -148,9 +164,8 @@ def test_the_kept_limits_hold_for_the_shipped_problems():
 def test_a_law_has_the_order_that_is_asked_for():
     given = {"fields": 2, "evaluations": {}, "tolerance": 1e-2}
     for order in (2, 3):
-        _, (U, theta), _ = optimum.optimise_law(
-            str(SMALL), 0, **given, given={"reduced_order": order, "dmdc_order": order}
-        )
+        values = values_of(reduced_order=order, dmdc_order=order)
+        _, (U, theta), _ = optimum.law_of(0, values, **given)
         assert U.shape[1] == order and theta.shape[1] == order + 1
 
 
