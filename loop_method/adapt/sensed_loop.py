@@ -151,18 +151,19 @@ def sensed_from(
         return None
     actuators = context.actuators(n_a)
     start, spread = (None, None) if before is None else (before.shared, before.spread)
-    spread = spread if context.noise else None
-    found = fit_rollouts(problem, chosen, actuators, context.noise, start, settings, spread)
+    readings, actions, distances = of_rollouts(problem, chosen)
+    size = float(np.mean([np.mean(own**2) for own in readings]))
+    # Else what the grid does not resolve would be taken for fields and actuators.
+    declared = float(np.hypot(context.noise, settings.sensed_unresolved * np.sqrt(size)))
+    found = fit_rollouts(problem, chosen, actuators, declared, start, settings, spread)
     if found is None:
         return None
     shared, fields, error = found
-    readings, actions, distances = of_rollouts(problem, chosen)
     known = list(zip(readings, actions, distances.tolist(), strict=True))
-    size = float(np.mean([np.mean(own**2) for own in readings]))
 
     def learned() -> tuple[Smoothing, Array]:
         # The unpredicted part of a reading is noise to a filter.
-        noise = float(np.sqrt(context.noise**2 + error * size))
+        noise = float(np.sqrt(declared**2 + error * size))
         smoothing = Smoothing(shared, actuators, noise, context.target, spread, settings)
         smoothing = smoothing.learned(known, fields)
         assert smoothing.spread is not None
@@ -170,14 +171,14 @@ def sensed_from(
 
     smoothing, likely = learned()
     # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
-    for _ in range(settings.sensed_again if context.noise else 0):
+    for _ in range(settings.sensed_again):
         if spread is not None and settled(likely, spread, settings):
             break
         again = fit_sensed(
             readings,
             actions,
             actuators,
-            context.noise,
+            declared,
             start=shared,
             target=context.target,
             distances=distances,

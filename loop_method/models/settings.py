@@ -168,6 +168,9 @@ class FieldModelSettings(Settings):
     sensed_hopeless: float = setting(
         0.1, "error over any part of the rollouts at which a start of the fit is abandoned", 0, 10
     )
+    sensed_unresolved: float = setting(
+        0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
+    )
     sensed_enough: float = setting(
         1e-5, "error at which no other dispersion is tried as a start", 0, 1
     )
