@@ -174,11 +174,11 @@ def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str, *shape: int
     return checked_array(arrays, name, "f", shape)
 
 
-def steps_of(arrays: Mapping[str, NDArray[np.generic]]) -> int:
+def steps_of(arrays: Mapping[str, NDArray[np.generic]], least: int = 1) -> int:
     """The internal steps of a sampling time among arrays; ValueError for none or too many."""
     steps = int(checked_array(arrays, "substeps", "i", ()))
-    if not 1 <= steps <= MAX_SUBSTEPS:
-        raise ValueError(f"a model has {steps} internal steps; expected 1 to {MAX_SUBSTEPS}")
+    if not least <= steps <= MAX_SUBSTEPS:
+        raise ValueError(f"a model has {steps} internal steps; expected {least} to {MAX_SUBSTEPS}")
     return steps
 
 

@@ -10,6 +10,9 @@ own where that shows. Time is in sampling times, each of equal Runge-Kutta steps
 
 On one axis the factors of M_f may be of neighbours, each at a distance of its own from x: products that
 are no difference of any monomial, such as those of chains and rings of oscillators or species.
+
+Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
+its numbers, has products of any of them.
 """
 
 from __future__ import annotations
@@ -96,7 +99,7 @@ class FiniteDifferenceModel:
     constant : (n_z,) array
         c.
     substeps : int
-        Runge-Kutta steps of a sampling time.
+        Runge-Kutta steps of a sampling time; 0: it is a map.
     shape : tuple of int
         Grid points of each axis, the last one fastest; of several axes their product is n_x. Empty:
         there is one axis.
@@ -203,7 +206,7 @@ class FiniteDifferenceModel:
             coefficients,
             numbers_of(arrays, "B", components * n_x, None),
             numbers_of(arrays, "constant", components * n_x),
-            steps_of(arrays),
+            steps_of(arrays, least=0),
             shape,
         )
 

@@ -77,7 +77,12 @@ def largest_of(samples: Samples) -> float:
 def substeps_of(
     model: FiniteDifferenceModel, size: float, reach: float, settings: FieldModelSettings
 ) -> int:
-    """Enough internal steps for a field of that size, of `reach` over its fastest rate each."""
+    """Enough internal steps for a field of that size, of `reach` over its fastest rate each.
+
+    None for a map.
+    """
+    if not model.substeps:
+        return 0
     growth = np.array(
         [len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j, _ in model.features]
     )

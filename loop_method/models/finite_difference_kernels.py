@@ -174,6 +174,19 @@ def runge_kutta(
             z[c, i] += h / 6.0 * (k[0, c, i] + 2.0 * k[1, c, i] + 2.0 * k[2, c, i] + k[3, c, i])
 
 
+@jit
+def mapped(
+    z: Array, table: Table, shape: Table, C: Array, force: Array, ring: Array, value: Array,
+    change: Array,
+) -> None:  # fmt: skip
+    """The step of a map in place."""
+    components, n_x = z.shape
+    rate(z, table, shape, C, force, ring, value, change)
+    for c in range(components):
+        for i in range(n_x):
+            z[c, i] += change[c, i]
+
+
 @cached_njit()
 def advance(
     states: Array, actions: Array, table: Table, axes: Table, C: Array, B: Array, constant: Array,
@@ -188,6 +201,8 @@ def advance(
         copy(states[m], after[m])
         z = after[m].reshape(shape)
         forcing(actions[m], B, constant, force)
+        if substeps == 0:
+            mapped(z, table, axes, C, force, ring, value, k[0])
         for _ in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
 
@@ -199,7 +214,7 @@ def pull_back(
 ) -> None:  # fmt: skip
     """Write the transposed products."""
     components, n_x = C.shape[1], C.shape[2]
-    shape, h = (components, n_x), 1.0 / substeps
+    shape, h = (components, n_x), 1.0 / max(substeps, 1)
     force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
     tape, k = np.empty((substeps, 4, components, n_x)), np.empty((4, components, n_x))
     z, on_m, on_force = np.empty(shape), np.empty(n_x), np.empty(shape)
@@ -212,6 +227,12 @@ def pull_back(
             runge_kutta(z, table, axes, C, force, h, tape[n], k, ring, value)
         copy(covectors[m], flat_own)
         on_force[:] = 0.0
+        if substeps == 0:
+            copy(flat_own, on_force.reshape(on_force.size))
+            transposed_rate(z, on_force, table, axes, C, ring, value, on_m, g)
+            for c in range(components):
+                for i in range(n_x):
+                    own[c, i] += g[c, i]
         for n in range(substeps - 1, -1, -1):
             g[:] = 0.0
             copy(flat_own, total.reshape(total.size))
@@ -253,6 +274,8 @@ def mean_features(
         copy(states[m], flat)
         copy(flat, path[0].reshape(z.size))
         forcing(actions[m], B, constant, force)
+        if substeps == 0:  # its features are those of its beginning
+            mapped(z, table, axes, C, force, ring, value, k[0])
         for n in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
             copy(flat, path[n + 1].reshape(z.size))
@@ -261,8 +284,10 @@ def mean_features(
             miss[m, i] = after[m, i] - flat[i]
         found[m] = 0.0
         for n in range(substeps + 1):
-            weight = (0.5 if n in (0, substeps) else 1.0) / substeps
-            share = n / substeps
+            weight, share = 1.0, 0.0
+            if substeps > 0:
+                weight = (0.5 if n in (0, substeps) else 1.0) / substeps
+                share = n / substeps
             for c in range(components):
                 for i in range(n_x):
                     bent[c, i] = path[n, c, i] + share * (end[c, i] - z[c, i])

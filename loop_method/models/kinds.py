@@ -18,6 +18,7 @@ from loop_method.models.low_rank import fit_low_rank
 from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.noisy_fit import fit_noisy
 from loop_method.models.settings import FieldModelSettings
+from loop_method.models.sparse_fit import fit_sparse
 from loop_method.models.spectral_fit import fit_spectral
 from loop_method.models.symbols import Form
 
@@ -36,6 +37,7 @@ FORMS = (
 POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
 NEAR_RIDGES = {"near-shared": None, "near1e-9": 1e-9}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
+SPARSE = {"sparse-map": True, "sparse": False}
 LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
@@ -93,7 +95,7 @@ def kinds_of(
         several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
         return kinds + _linear(n_z, settings) + several
     if not line:
-        return kinds + _linear(n_z, settings)
+        return kinds + _linear(n_z, settings) + _sparse(n_z, settings)
     if components == 1 and n_z >= settings.fewest_points:
         kinds += [
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
@@ -106,7 +108,7 @@ def kinds_of(
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
         near += _neighbours(n_z, 2, settings, "two-")
-    return kinds + _linear(n_z, settings) + near
+    return kinds + _linear(n_z, settings) + near + _sparse(n_z, settings)
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
@@ -164,6 +166,21 @@ def _neighbours(
         own = 0.0 if ridge is None else count
         kinds.append(Kind(prefix + name, fit, (own, count), needed=settings.near_needed))
     return kinds
+
+
+def _sparse(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+    """Few products of any numbers of a small state."""
+    if n_z > settings.sparse_numbers:
+        return []
+    return [
+        Kind(
+            name,
+            partial(fit_sparse, kind=name, settings=settings, is_map=is_map),
+            (n_z + settings.sparse_terms, 0),
+            needed=settings.near_needed,
+        )
+        for name, is_map in SPARSE.items()
+    ]
 
 
 def _finite_difference(

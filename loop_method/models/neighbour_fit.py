@@ -60,13 +60,13 @@ def fit_neighbours(
     for reach in (1, 2) if components > 1 else (2,):
         features = neighbour_features(components, reach)
         empty = replace(nothing(kind, features, samples, components), substeps=1)
-        found = _fitted(empty, samples, ridge, settings)
+        found = fitted(empty, samples, ridge, settings)
         if found is not None:
             return found
     return None
 
 
-def _fitted(
+def fitted(
     model: FiniteDifferenceModel,
     samples: Samples,
     ridge: float | None,

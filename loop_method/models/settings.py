@@ -95,6 +95,16 @@ class FieldModelSettings(Settings):
     near_negligible: float = setting(
         1e-12, "squared error that counts as none there, as a share of the squared change", 0, 1
     )
+    sparse_numbers: int = setting(
+        40, "largest state for models of few products of any of its numbers", 1, 64
+    )
+    sparse_products: int = setting(
+        2500, "products above which those of three different numbers are not tried", 1, 100_000
+    )
+    sparse_terms: int = setting(8, "maximum number of products for each number", 1, 100)
+    sparse_left: float = setting(
+        0.5, "share of the squared change left over that another product may leave", 0, 1
+    )
     coarse_points: int = setting(
         256,
         "maximum number of grid points of finite-difference models on several axes; every n-th "
