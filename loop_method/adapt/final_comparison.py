@@ -38,6 +38,7 @@ from loop_method.adapt.verdict import (
     evidence_against_none,
     evidence_of,
     evidence_of_pairs,
+    is_safe,
     size_of,
 )
 from loop_method.seeds import field_seed
@@ -223,9 +224,7 @@ def on_model(
     """
     loop, fields = belief.loop(context), initial_fields(known)
     theta = {name: loop.theta(law) for name, law in laws.items()}
-    means = {name: float(loop.costs(own, fields).mean()) for name, own in theta.items()}
-    # A first law that is worse than no control is nothing to stay near to.
-    base = FIRST if means[FIRST] < means[NONE] else NONE
+    base = FIRST if is_safe(loop, theta[FIRST], fields) else NONE
     law, fraction, change = laws[ADAPTED], 0.0, ZERO
     if not np.array_equal(law, laws[base]):
         left_out = fields
@@ -244,8 +243,8 @@ def on_model(
         if fraction < 1.0:
             moved = theta[base] + fraction * (theta[ADAPTED] - theta[base])
             law = loop.policy(moved, laws[base]) if fraction else laws[base].copy()
-    own = float(loop.costs(loop.theta(law), fields).mean())
-    close = base == FIRST and means[NONE] <= (1.0 + settings.close) * own
+    none, own = (loop.costs(loop.theta(one), fields).mean() for one in (laws[NONE], law))
+    close = base == FIRST and bool(none <= (1.0 + settings.close) * own)
     count = len(numbers)
     names = [ADAPTED if fraction else base] * (count - close) + [NONE] * close
     if (not fraction and not close) or count <= close:

@@ -69,7 +69,7 @@ def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
     before = still.costs(none, fields)
     after = still.costs(none, fields + _MOVED * (np.roll(fields, 1, axis=0) - fields))
     known = np.isfinite(before) & np.isfinite(after)
-    change = float(np.sum(np.abs(after - before)[known]))
+    change = float(np.sum(np.abs(after[known] - before[known])))
     return change > _CHANGED * float(np.sum(before[known]))
 
 

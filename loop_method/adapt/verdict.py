@@ -132,6 +132,16 @@ def is_cheaper(own: Array, other: Array) -> bool:
     return bool(own[both].sum() < other[both].sum())
 
 
+def is_safe(loop: ClosedLoop, first: Array, fields: Array) -> bool:
+    """True if a law is cheaper than no control on the model; where that says nothing, if it is another.
+
+    A first law that is not is nothing to stay near to.
+    """
+    none = loop.no_control
+    costs = [loop.costs(theta, fields) for theta in (first, none)]
+    return is_cheaper(*costs) if np.isfinite(costs).any() else not np.array_equal(first, none)
+
+
 def evidence_of(
     loop: ClosedLoop,
     laws: Mapping[str, Array],
@@ -181,7 +191,7 @@ def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Eviden
     evidence = {}
     for name, own in costs.items():
         known = np.isfinite(own) & np.isfinite(costs[base])
-        difference = mean_of((own - costs[base])[known]) if known.any() else ZERO
+        difference = mean_of(own[known] - costs[base][known]) if known.any() else ZERO
         evidence[name] = Evidence(difference, own[np.isinf(own)])
     return evidence
 

@@ -47,6 +47,12 @@ def test_a_linear_plant_is_never_chaotic_however_far_its_fields_are_from_each_ot
     assert not is_chaotic(loop, np.array([field, -field]))
 
 
+def test_fields_from_which_the_plant_diverges_say_nothing() -> None:
+    """z' = 3.9 z (1 - z) tends to minus infinity from outside of 0 .. 1."""
+    loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(3.9))  # type: ignore[arg-type]
+    assert not is_chaotic(loop, np.full((2, N_Z), 3.0))
+
+
 def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:
     rng = np.random.default_rng(1)
     one, two = (rng.normal(size=(21, N_Z)) for _ in range(2))

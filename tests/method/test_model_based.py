@@ -25,6 +25,7 @@ from loop_method.adapt.verdict import (
     Evidence,
     choose,
     evidence_of,
+    evidence_of_pairs,
 )
 from loop_method.design.lqt import track
 from loop_method.models.settings import FieldModelSettings
@@ -366,6 +367,12 @@ def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, exc
     known = evidence_of(loop, laws, base, seen, fields, Estimate(held_out, 0.1, 20.0))
     favoured = held_out < 0.0 and held_out + excess < 0.0
     assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
+
+
+def test_fields_from_which_both_laws_diverge_are_left_out_of_their_difference() -> None:
+    costs = {FIRST: np.array([np.inf, 3.0, 4.0]), ADAPTED: np.array([np.inf, 2.0, 2.0])}
+    found = evidence_of_pairs(costs, FIRST)[ADAPTED]
+    assert found.change.value == -1.5 and np.array_equal(found.excess, [np.inf])
 
 
 def test_the_reason_says_by_how_much() -> None:
