@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import importlib.util
 import itertools
 import json
@@ -28,6 +27,7 @@ from loop_interfaces.parameters import flags, table
 from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import ALLOWED
 from pdeloop import cli
+from tests.house.test_house import imports
 from tests.support.colcon_workspace import ROOT, Workspace, build
 from tests.support.small import SMALL
 
@@ -56,11 +56,7 @@ def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
     packages = {name.split(".")[0] for name in PROJECT["tool"]["setuptools"]["packages"]}
     for package in (*packages, "launch"):
         for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom) and node.module:
-                    names = [node.module]
-                used |= {name.split(".")[0] for name in names}
+            used |= {name.split(".")[0] for name in imports(path)}
     needed = {name for name in used if ros.fullmatch(name)} - {"loop_interfaces"}
     assert {"rclpy", "std_msgs", "launch_ros"} <= needed
     assert needed <= declared

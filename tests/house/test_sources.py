@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 
 from tests.support.interpreter import ROOT
@@ -22,14 +23,15 @@ def test_every_source_file_of_our_own_has_the_copyright_statement() -> None:
 
 
 def test_calls_name_their_arguments_one_by_one() -> None:
-    """f(*(a, b)) is f(a, b)."""
+    """f(*(a, b)) is f(a, b). Only a file with such characters is parsed."""
     listed = subprocess.check_output(["git", "ls-files", "*.py"], cwd=ROOT, text=True)
     files = [ROOT / name for name in listed.splitlines()]
+    texts = {file: file.read_text() for file in files if file.exists()}
     found = [
         f"{file.relative_to(ROOT)}:{node.lineno}"
-        for file in files
-        if file.exists()
-        for node in ast.walk(ast.parse(file.read_text()))
+        for file, text in texts.items()
+        if re.search(r"(?<!\*)\*[(\[]", text)
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Call)
         for given in node.args
         if isinstance(given, ast.Starred) and isinstance(given.value, ast.Tuple | ast.List)

@@ -55,22 +55,32 @@ def trees() -> dict[Path, ast.Module]:
     return {file: ast.parse(file.read_text()) for file in sorted((ROOT / "tests").rglob("*.py"))}
 
 
+@cache
 def functions(tree: ast.AST) -> list[Function]:
     return [node for node in ast.walk(tree) if isinstance(node, Function)]
 
 
+def dotted(function: ast.expr) -> str:
+    """a.b.c of a function, as in the source; (...).c of what begins with no name."""
+    if isinstance(function, ast.Attribute):
+        return f"{dotted(function.value)}.{function.attr}"
+    return function.id if isinstance(function, ast.Name) else "(...)"
+
+
+@cache
 def checks(node: ast.AST) -> bool:
     """True if something in it compares or fails by itself."""
     return any(
         isinstance(part, ast.Assert | ast.Raise)
-        or (isinstance(part, ast.Call) and CHECKS.match(ast.unparse(part.func)))
+        or (isinstance(part, ast.Call) and CHECKS.match(dotted(part.func)))
         for part in ast.walk(node)
     )
 
 
+@cache
 def called(node: ast.AST) -> set[str]:
     """The names of functions and methods that it calls, or enters as a context, or asks for."""
-    names = {ast.unparse(c.func).split(".")[-1] for c in ast.walk(node) if isinstance(c, ast.Call)}
+    names = {dotted(c.func).split(".")[-1] for c in ast.walk(node) if isinstance(c, ast.Call)}
     arguments = node.args.args if isinstance(node, Function) else []
     return names | {argument.arg for argument in arguments}
 
@@ -113,7 +123,7 @@ def reasons(tree: ast.Module) -> list[str]:
     """Why its tests may be skipped, as far as the source says it."""
     found = []
     for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
-        name = ast.unparse(call.func)
+        name = dotted(call.func)
         if name == "pytest.skip":
             found.append(ast.unparse(call.args[0]))
         elif name == "pytest.mark.skipif":

@@ -20,7 +20,7 @@ from pdeloop.bags.verify import verify
 from pdeloop.cli import main
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagError
-from tests.support.interpreter import python
+from tests.support.converted import convert
 from tests.support.written_bag import written
 
 
@@ -69,13 +69,11 @@ def test_bags_of_another_storage_are_refused_with_what_converts_them(tmp_path):
 def test_what_rosbags_convert_makes_of_a_sqlite3_bag_is_read(tmp_path):
     """The command that the refusal names."""
     source, converted = tmp_path / "sqlite", tmp_path / "sqlite-mcap"
-    convert = ("-m", "rosbags.convert")
-    python(*convert, "--src", written(tmp_path), "--dst", source, "--dst-storage", "sqlite3")
+    files = ("--src", str(written(tmp_path)), "--dst", str(source))
+    convert("rosbags-convert", *files, "--dst-storage", "sqlite3")
     with pytest.raises(BagError, match="sqlite3") as refused:
         Bag(source)
-    words = str(refused.value).split("Convert it: ")[1].split()
-    assert words[0] == "rosbags-convert"
-    python(*convert, *words[1:])
+    convert(*str(refused.value).split("Convert it: ")[1].split())
     assert [e.missing for e in Bag(converted).episodes()] == [[], []]
 
 

@@ -21,8 +21,13 @@ REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "8")
 """What a small reproduction is asked for."""
 RECORDED = {"iterations": "6", "seeds": "2"}
 """What the small recorded run is asked for."""
-FEW_FITS = {"field_model_settings.folds": 2, "field_model_settings.largest_degree": 2}
-"""For trainings whose model does not matter: the choice among all kinds is most of their time."""
+FEW_FITS = {
+    "field_model_settings.folds": 2,
+    "field_model_settings.largest_degree": 2,
+    "field_model_settings.sensed_iterations": 1,
+    "field_model_settings.sensed_last_iterations": 1,
+}
+"""For trainings whose model does not matter: fits of all kinds would be most of their time."""
 
 
 def paced(folder: Path, factor: float) -> Path:
