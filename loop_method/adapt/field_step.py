@@ -16,7 +16,7 @@ from loop_method.adapt.base import Context, Record
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.adapt.undeclared_noise import believe_in_noise
@@ -59,7 +59,8 @@ def propose(
     """The best law on the model near to a policy, or None where that gains nothing."""
     loop = belief.loop(context)
     fields, first = initial_fields(data), loop.theta(policy)
-    if whole and not is_chaotic(loop, fields):
+    states = measured_states(data, settings.chaotic_fields)
+    if whole and not any_state_serves(loop, first, fields, states):
         chosen = extrapolated_fields(fields[-settings.newest :], settings.extrapolation)
         found = improved(loop, first, chosen, damping, settings)
     else:

@@ -23,7 +23,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, Rollout, State
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.estimate import ZERO, Estimate, mean_of
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
 from loop_method.adapt.progress import fraction_and_change, held_out
 from loop_method.adapt.renewal import confirmed_fraction
 from loop_method.adapt.settings import GaussNewtonSettings, ImprovementSettings
@@ -227,10 +227,9 @@ def on_model(
     base = FIRST if is_safe(loop, theta[FIRST], fields) else NONE
     law, fraction, change = laws[ADAPTED], 0.0, ZERO
     if not np.array_equal(law, laws[base]):
-        left_out = fields
-        if is_chaotic(loop, fields):
-            left_out = measured_states(known, settings.chaotic_fields)
-            settings = replace(settings, mixtures=0)
+        left_out, states = fields, measured_states(known, settings.chaotic_fields)
+        if any_state_serves(loop, theta[base], fields, states):
+            left_out, settings = states, replace(settings, mixtures=0)
         fraction, change = confirmed_fraction(
             loop,
             theta[base],

@@ -73,6 +73,21 @@ def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
     return change > _CHANGED * float(np.sum(before[known]))
 
 
+def any_state_serves(loop: ClosedLoop, law: Array, fields: Array, states: Array) -> bool:
+    """True if measured states may take the place of initial fields: the plant is chaotic.
+
+    One that runs away is as sensitive to where it begins, but then states that were measured late are
+    not where episodes lead that a law controls: on the model it diverges under the law from more of
+    them than of the fields. A chaotic one stays where it is.
+
+    law: that episodes are to stay near to.
+    """
+    if not is_chaotic(loop, fields):
+        return False
+    lost = [np.mean(np.isinf(loop.costs(law, each))) for each in (fields, states)]
+    return bool(lost[1] <= lost[0])
+
+
 def mixtures(
     fields: Array,
     most: int,

@@ -36,7 +36,7 @@ from loop_method.adapt.base import (
     require_results,
 )
 from loop_method.adapt.belief import Belief, also_in_pieces, also_near, believe, largest_error
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic
+from loop_method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch
 from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
@@ -294,9 +294,10 @@ class ModelBased(Optimizer):
         self._progress.safe = safe
         improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
-        if not belief.whole or is_chaotic(loop, fields):
+        data = self._data()
+        states = measured_states(data, self._settings.chaotic_fields)
+        if not belief.whole or any_state_serves(loop, base, fields, states):
             row["chaotic"] = True
-            data = self._data()
             found = renew_from_states(loop, base, improved, data, rng, self._settings, final=final)
         else:
             found = renew(

@@ -10,7 +10,12 @@ import pytest
 
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.initial_fields import (
+    any_state_serves,
+    initial_fields,
+    is_chaotic,
+    measured_states,
+)
 
 N_Z = 12
 
@@ -51,6 +56,28 @@ def test_fields_from_which_the_plant_diverges_say_nothing() -> None:
     """z' = 3.9 z (1 - z) tends to minus infinity from outside of 0 .. 1."""
     loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(3.9))  # type: ignore[arg-type]
     assert not is_chaotic(loop, np.full((2, N_Z), 3.0))
+
+
+@dataclass
+class Falling:
+    """z' = 1.1 z + z^3: small changes grow, as of a chaotic plant, and from far it falls for good."""
+
+    n_a = 1
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return 1.1 * states + states**3
+
+
+def test_states_of_a_plant_that_runs_away_do_not_serve_as_initial_fields() -> None:
+    near = np.random.default_rng(0).uniform(0.006, 0.012, (4, N_Z))
+    falls = ClosedLoop(np.eye(N_Z, 3), np.zeros(N_Z), 1.0, 1.0, 40, model=Falling())  # type: ignore[arg-type]
+    none = falls.no_control
+    assert is_chaotic(falls, near)
+    assert not any_state_serves(falls, none, near, np.concatenate([near, 30.0 * near]))
+    stays = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(3.9))  # type: ignore[arg-type]
+    fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
+    states = 3.9 * fields * (1.0 - fields)
+    assert any_state_serves(stays, stays.no_control, fields, states)
 
 
 def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:

@@ -245,7 +245,7 @@ def test_a_first_law_is_left_only_where_no_control_diverges_from_fewer_fields_or
         ClosedLoop, "costs", lambda _, theta, fields: np.array(first if theta.any() else none)
     )
     monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
-    monkeypatch.setattr(model_based, "is_chaotic", lambda *_: False)
+    monkeypatch.setattr(model_based, "any_state_serves", lambda *_: False)
     belief = believe(optimizer._context, optimizer._before)
     assert belief is not None
     optimizer._improve(belief, {}, True)
