@@ -220,7 +220,8 @@ def designed(
     Raises
     ------
     ValueError
-        The data allow or determine no model of this order, or the model no stabilising gains.
+        The data allow or determine no model of this order, or the model no stabilising gains and,
+        for "field", that of the whole field no law.
     """
     weights: dict[str, Any] = {
         "state_weight": settings.state_weight,
@@ -248,9 +249,17 @@ def designed(
         channels=channels,
         settings=settings.method,
     )
-    gains = lqt.track(model, **weights)
+    unsolved: ValueError | None = None
+    try:
+        gains = lqt.track(model, **weights)
+        K_a, K_b = gains.K_a, gains.K_b
+    except ValueError as error:  # which a law over the horizon alone does not need
+        if settings.identification != "field":
+            raise
+        unsolved, K_a = error, np.zeros(model.B.T.shape)
+        K_b = K_a
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
-    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
+    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=K_a, K_b=K_b, s_r=s_r)
     if settings.identification != "field":
         return Designed(
             lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows
@@ -266,6 +275,10 @@ def designed(
             models=settings.field_models,
             **weights,
         )
+    if unsolved is not None:
+        found = replace(found, other_cost=np.inf)
+        if not found.better:
+            raise unsolved
     chosen = found.rows if found.better and found.rows else rows
     return Designed(
         lqg.with_filter(chosen, trajectories, settings=settings.method) if filtered else chosen,

@@ -121,6 +121,29 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_stands_alone_where_the_regression_has_no_stabilising_gains(
+    noise: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A regression may have unstable modes that no input reaches, if an episode ran away."""
+    true, target = plant(), np.zeros(N_Z)
+    expected = law(true, target)
+
+    def unsolved(*_: object, **__: object) -> None:
+        raise ValueError("not stabilisable")
+
+    monkeypatch.setattr("loop_method.design.lqt.track", unsolved)
+    if noise:  # no model of the whole field either
+        with pytest.raises(ValueError, match="not stabilisable"):
+            designed([episode(true, noise)], target, settings("field", **FEW_FITS))
+        return
+    found = designed([episode(true)], target, settings("field"))
+    assert np.array_equal(found.rows.policy, expected.policy)
+    assert found.field is not None and "its law is used" in found.field.text()[-1]
+    with pytest.raises(ValueError, match="not stabilisable"):
+        design([episode(true)], target, settings("regression"))
+
+
 def test_two_explorations_give_one_law_for_the_fields_of_both() -> None:
     """Each begins with a wave that the other does not have; the law of both senses both."""
     true, target = plant(), np.zeros(N_Z)
