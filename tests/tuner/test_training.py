@@ -82,7 +82,9 @@ def test_of_a_basis_that_is_given_up_only_rollouts_without_control_are_kept():
             result.costs[1, CostColumn.MEAN] = result.costs[0, CostColumn.MEAN] + 1.0
         training.finish(result)
         pair.follow(training)
-    assert training.phase == "identify"
+    assert training.phase == "identify" and len(training.measured[0]) == 2
+    training.finish(pair.run(training.next_batch()))
+    assert training.phase == "check"  # of the law on another basis
     (kept,) = training.measured[0]
     assert not kept.actions.any()
 
