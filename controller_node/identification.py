@@ -20,6 +20,7 @@ from loop_interfaces.signature import CONSTANTS
 from loop_interfaces.spec import IDENTIFICATION_SETTINGS
 from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
+from loop_method.design.lqt import DesignError
 from loop_method.laws.registry import law_kind
 from loop_method.method_settings import field_model_settings
 from loop_method.models import FieldModelSettings
@@ -200,6 +201,8 @@ def designed(
     settings: DesignSettings,
     channels: Channels = NUMBERED,
     further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
+    *,
+    or_no_control: bool = False,
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -216,6 +219,8 @@ def designed(
     further : sequence of (states (N + 1, n_z), actions (N, n_a))
         Other trajectories, for a model of the whole field alone: POD modes of several fields together
         are those of none.
+    or_no_control : bool
+        Gains of 0 where there are no stabilising ones.
 
     Raises
     ------
@@ -249,12 +254,12 @@ def designed(
         channels=channels,
         settings=settings.method,
     )
-    unsolved: ValueError | None = None
+    unsolved: DesignError | None = None
     try:
         gains = lqt.track(model, **weights)
         K_a, K_b = gains.K_a, gains.K_b
-    except ValueError as error:  # which a law over the horizon alone does not need
-        if settings.identification != "field":
+    except DesignError as error:
+        if settings.identification != "field" and not or_no_control:
             raise
         unsolved, K_a = error, np.zeros(model.B.T.shape)
         K_b = K_a
@@ -276,8 +281,10 @@ def designed(
             **weights,
         )
     if unsolved is not None:
-        found = replace(found, other_cost=np.inf)
-        if not found.better:
+        found = replace(
+            found, other_cost=np.inf
+        )  # a law over the horizon needs no stabilising gains
+        if not (found.better or or_no_control):
             raise unsolved
     chosen = found.rows if found.better and found.rows else rows
     return Designed(
@@ -295,7 +302,8 @@ def design_each(
 ) -> NDArray[np.float64]:
     """A design for each environment of an exploratory episode, as rows (M, rows, n_s); see `design`.
 
-    Environments of one model have one design in common.
+    Environments of one model have one design in common. A model without stabilising gains has gains of
+    0: a training can explore again, or begin from no control.
 
     states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
     to.
@@ -305,5 +313,6 @@ def design_each(
         if number not in found:
             own = [m for m, other in enumerate(numbers) if other == number]
             first, *further = [(states[:, m], actions[:, m]) for m in own]
-            found[number] = pack(design([first], target, settings, further=further))
+            rows = designed([first], target, settings, further=further, or_no_control=True).rows
+            found[number] = pack(rows)
     return np.stack([found[number] for number in numbers])

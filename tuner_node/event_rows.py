@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
 from loop_method.adapt import RolloutResult
 from tuner_node.batch import TrainingSettings
@@ -34,14 +35,15 @@ def diverged(
     }
 
 
-def designed(seed: int, attempt: int, model: Array, A: Array) -> Row:
-    """A reduced model was identified, and a law designed for it."""
+def designed(seed: int, attempt: int, model: Array, own: ModelRows) -> Row:
+    """A reduced model was identified, and a law designed for it, if it has stabilising gains."""
     return {
         "event": "designed",
         "seed": seed,
         "attempt": attempt,
         "reduced_order": model.shape[1],
-        "spectral_radius": float(np.abs(np.linalg.eigvals(A)).max()),
+        "spectral_radius": float(np.abs(np.linalg.eigvals(own.A)).max()),
+        "stabilised": bool(own.K_a.any()),
     }
 
 

@@ -88,7 +88,11 @@ class Narration:
         if event == "designed":
             orders = span([row["reduced_order"] for row in rows])
             radius = span((row["spectral_radius"] for row in rows), ".4f")
-            return [f"  {who}: reduced model of order {orders}, spectral radius {radius}"]
+            told = f"  {who}: reduced model of order {orders}, spectral radius {radius}"
+            if lost := sum(not row.get("stabilised", True) for row in rows):
+                count = "" if self._seeds == 1 else f" for {lost} of them"
+                told += f"; it has no stabilising gains{count}, so that no control is the first law"
+            return [told]
         if event == "evaluated":
             costs = f"cost {cost('none')} without control, {cost('lqt')} with LQT, "
             return [f"  {who}: {costs}{cost('adapted')} adapted"]

@@ -240,7 +240,7 @@ class Training:
             )
             self.measured[m] = [replace(kept, policy=zero) for kept in unlike]
             seed = self.settings.all_seeds[m]
-            rows.append(event_rows.designed(seed, self.attempts[m] + 1, own, model.A))
+            rows.append(event_rows.designed(seed, self.attempts[m] + 1, own, model))
         self.phase = "check"
         if self.settings.identification_attempts == 1:
             self._start_adapting()

@@ -12,6 +12,7 @@ from controller_node.identification import DesignSettings, design, design_each, 
 from loop_interfaces.model_rows import ModelRows, unpack
 from loop_method.design.field_law import FieldLaw, field_law, states_under
 from loop_method.design.finite_horizon import finite_horizon
+from loop_method.design.lqt import DesignError
 from loop_method.models import affine_law
 from loop_method.models.spectral import SpectralModel
 from loop_method.reduce.settings import IdentificationSettings
@@ -130,17 +131,17 @@ def test_stands_alone_where_the_regression_has_no_stabilising_gains(
     expected = law(true, target)
 
     def unsolved(*_: object, **__: object) -> None:
-        raise ValueError("not stabilisable")
+        raise DesignError("not stabilisable")
 
     monkeypatch.setattr("loop_method.design.lqt.track", unsolved)
     if noise:  # no model of the whole field either
-        with pytest.raises(ValueError, match="not stabilisable"):
+        with pytest.raises(DesignError, match="not stabilisable"):
             designed([episode(true, noise)], target, settings("field", **FEW_FITS))
         return
     found = designed([episode(true)], target, settings("field"))
     assert np.array_equal(found.rows.policy, expected.policy)
     assert found.field is not None and "its law is used" in found.field.text()[-1]
-    with pytest.raises(ValueError, match="not stabilisable"):
+    with pytest.raises(DesignError, match="not stabilisable"):
         design([episode(true)], target, settings("regression"))
 
 
