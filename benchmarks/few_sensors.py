@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,8 @@ def run(
     """
     own = range(first, first + seeds)
     tasks = list(itertools.product(problems, sensors, noise, laws, own))
-    return rows_of(tasks, train, line, rollouts=rollouts, jobs=jobs, folder=folder)
+    work = partial(train, rollouts=rollouts)
+    return rows_of(tasks, work, line, jobs=jobs, folder=folder)
 
 
 def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:

@@ -24,7 +24,8 @@ import numpy as np
 
 import pdeloop
 from benchmarks.families.cases import CASES, Case
-from loop_interfaces.files import make_folder, read_json
+from benchmarks.kept import kept_row, rows_of
+from loop_interfaces.files import read_json
 from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]
@@ -90,24 +91,14 @@ def run(
         for budget in budgets
         for seed in range(first, first + seeds)
     ]
-    make_folder(folder)
-    rows, began = [], time.monotonic()
-    with processes(jobs) as pool:
-        if bounds:
+    if bounds:
+        with processes(jobs) as pool:
             for name, found in zip(chosen, pool.map(bound, chosen), strict=True):
                 keep_bound(name, found)
                 said = ", ".join(f"{key} {number(cost)}" for key, cost in found.items())
                 print(f"{name}: {said}", file=sys.stderr, flush=True)
-        work = partial(train, fields=fields, evaluation=evaluation, folder=folder.resolve())
-        for task, row in zip(tasks, pool.map(work, tasks), strict=True):
-            rows.append(row)
-            print(
-                f"{task[0]}, {task[1]} rollouts, seed {task[2]}: "
-                f"{row.get('error') or number(row['adapted'])} "
-                f"({len(rows)} of {len(tasks)}, {time.monotonic() - began:.0f} s)",
-                file=sys.stderr,
-                flush=True,
-            )
+    work = partial(train, fields=fields, evaluation=evaluation)
+    rows = rows_of(tasks, work, line, jobs=jobs, folder=folder)
     known = read_json(BOUNDS) if BOUNDS.exists() and not tuning else {}
     result = {"rows": rows, "bounds": {name: known[name] for name in chosen if name in known}}
     if save is not None:
@@ -122,27 +113,24 @@ def train(
     name, budget, seed = task
     label = f"{name}, {budget}, {seed}, {evaluation}, {fields}"
     path = folder / f"{hashlib.sha256(label.encode()).hexdigest()[:16]}.json"
-    if path.exists():
-        found: dict[str, Any] = read_json(path)
-        return found
-    row: dict[str, Any] = {"case": name, "budget": budget, "seed": seed}
-    began = time.process_time()
-    try:
-        done = trained(
-            CASES[name],
-            rollouts=budget,
-            seed=seed,
-            evaluation_fields=fields,
-            evaluation_seed=evaluation,
-        )
-        row |= {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
-        row["by_field"] = {key: done.costs[key][0].tolist() for key in ("lqt", "adapted")}
-        row["spent"] = done.rollouts[0]
-    except (ValueError, RuntimeError) as error:
-        row["error"] = " ".join(str(error).split())
-    row["seconds"] = time.process_time() - began
-    path.write_text(json.dumps(row))
-    return row
+
+    def costs() -> dict[str, Any]:
+        began = time.process_time()
+        given = {"rollouts": budget, "seed": seed, "evaluation_fields": fields}
+        done = trained(CASES[name], evaluation_seed=evaluation, **given)
+        means = {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
+        by_field = {key: done.costs[key][0].tolist() for key in ("lqt", "adapted")}
+        seconds = time.process_time() - began
+        return {**means, "by_field": by_field, "spent": done.rollouts[0], "seconds": seconds}
+
+    return kept_row(path, {"case": name, "budget": budget, "seed": seed}, costs)
+
+
+def line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What is said of a training."""
+    (row,) = rows
+    cost = row.get("error") or number(row["adapted"])
+    return f"{row['case']}, {row['budget']} rollouts, seed {row['seed']}: {cost}"
 
 
 def trained(case: Case, **settings: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,21 +23,20 @@ def rows_of(
     train: Callable[..., Row],
     line: Callable[[Sequence[Row]], str],
     *,
-    rollouts: int,
     jobs: int | None,
     folder: Path,
 ) -> list[Row]:
     """The row of each task, in their order; each is printed as a line once it is there.
 
-    train: of a task, with `rollouts` and `folder`; line: of one or more rows; jobs: processes, one a
-    core if not given.
+    train: of a task, with `folder`; line: of one or more rows; jobs: processes, one a core if none.
     """
     make_folder(folder)
-    rows = []
+    rows, began = [], time.monotonic()
     with processes(jobs) as pool:
-        for row in pool.map(partial(train, rollouts=rollouts, folder=folder.resolve()), tasks):
+        for row in pool.map(partial(train, folder=folder.resolve()), tasks):
             rows.append(row)
-            print(f"{line([row])} ({len(rows)} of {len(tasks)})", file=sys.stderr, flush=True)
+            done = f"({len(rows)} of {len(tasks)}, {time.monotonic() - began:.0f} s)"
+            print(f"{line([row])} {done}", file=sys.stderr, flush=True)
     return rows
 
 

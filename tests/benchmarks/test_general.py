@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import general
+from benchmarks import general, kept
 from benchmarks.families import plants
 from benchmarks.families.cases import CASES
 from pdeloop import Problem, problem
@@ -139,7 +139,7 @@ def test_a_name_is_that_case_and_a_beginning_all_that_have_it(
         def __exit__(self, *_: object) -> None: ...
 
     monkeypatch.setattr(general, "train", row)
-    monkeypatch.setattr(general, "processes", lambda _: Here())
+    monkeypatch.setattr(kept, "processes", lambda _: Here())
     given = {"seeds": 1, "budgets": (20,), "folder": tmp_path}
 
     def trained(*cases: str) -> list[str]:
