@@ -11,7 +11,15 @@ rollout is as informative as many without it. The fields of that mean are the sa
 difference of two laws has little variance; for the final law, which was computed from these fields,
 the mean is over held-out fields.
 
-The rule accounts for how well the error of few rollouts is known (`estimate`).
+Where no model predicts rollouts, they alone count, by one of two rules:
+
+- the mean over pairs from the same fields (`evidence_of_pairs`), in which cancels what a field costs
+  with either law,
+- against no control of which further rollouts are known, the difference of two means
+  (`evidence_against_none`): its costs vary from field to field, where those of a law hardly do, so that
+  the error of a pair is that of a single rollout of no control, however many others there are.
+
+The rule of choice accounts for how well the error of few rollouts is known (`estimate`).
 
 A first law was designed for the plant, and is given up only for one that is better by more than chance.
 No control was not: what chance may explain is settled there by the expected cost, if all that is known
@@ -184,7 +192,7 @@ def evidence_of(
 
 
 def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
-    """The evidence of rollouts alone, of all laws from the same initial fields.
+    """The evidence of rollouts alone: means over pairs from the same initial fields.
 
     costs: those of each law, field by field, infinite where it diverged; base: the law to stay with.
     """
@@ -199,10 +207,7 @@ def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Eviden
 def evidence_against_none(
     costs: Mapping[str, Array], others: Array, known: Mapping[str, Sequence[Estimate]]
 ) -> dict[str, Evidence]:
-    """The evidence of rollouts alone against no control, all of whose rollouts count.
-
-    Its costs vary from field to field, and those of a law that controls the plant hardly do: the error
-    of a pair is that of a single rollout of no control, however many others there are.
+    """The evidence of rollouts alone against no control: differences of means, of all its rollouts.
 
     costs: as of `evidence_of_pairs`, and after those of the other laws' fields further ones of no
     control; others: its costs from before; known: what else is known of the change by a law.
