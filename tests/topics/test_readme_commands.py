@@ -26,7 +26,7 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
     loop: Processes, tmp_path
 ):
     run, model = tmp_path / "run", tmp_path / "model.npz"
-    options = ("--optimizer", "two-point", "--rollouts", 26, "--seed", 1)
+    options = ("--optimizer", "two-point", "--rollouts", 26, "--seed", 1, "--evaluation-fields", 2)
     text = pdeloop(loop, "train", "burgers", "--record", *options, "--out", run)
     assert f"recorded in {run / 'bag'}" in text
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
@@ -35,14 +35,15 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
     assert "no difference, to the bit" in text
     assert "not followed" not in text and "incomplete" not in text
     (policies,) = re.findall(r"(\d+) policies", text)
-    assert int(policies) >= 30  # the closing evaluation alone has three on ten fields
+    # All rollouts but the two explorations, and three controllers on two fields at the end.
+    assert int(policies) == 26 - 2 + 3 * 2
 
     text = pdeloop(loop, "identify", "--bag", run, "--environment", 0, "--out", model)
     assert "reduced model of order" in text
     with np.load(model) as identified, np.load(run / "policy.npz") as adapted:
         assert identified["K_a"].shape[0] == adapted["policy"].shape[1]
 
-    costs = json.loads(pdeloop(loop, "evaluate", run, "--json"))
+    costs = json.loads(pdeloop(loop, "evaluate", run, "--fields", 2, "--json"))
     result = json.loads((run / "result.json").read_text())
     assert costs["adapted"] == result["costs_by_field"]["adapted"]
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import pytest
 
 from tests.support.loop_harness import Processes, until
-from tests.support.small import parameters, train_here
+from tests.support.small import FEW_FITS, parameters, train_here
 from tests.support.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
 
 pytestmark = pytest.mark.topics
-ROLLOUTS = 27
+ROLLOUTS = 15
 
 
 def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Processes, tmp_path):
@@ -19,7 +19,7 @@ def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Proces
     plant = start_pair(loop, real_time_factor=20.0)["plant"]  # so that the stranger keeps up
     stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
     until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
-    options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
+    options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2, **FEW_FITS}
     loop.wait(start_tuner(loop, out, **options, max_attempts=50), LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
     until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
@@ -33,7 +33,7 @@ def test_a_law_from_two_explorations_and_fresh_fields_is_that_of_one_process(
     """Although at most one environment fits into an episode otherwise."""
     out = tmp_path / "run"
     start_pair(loop)
-    options = {"rollouts": 10, "optimizer": "model_based"}
+    options = {"rollouts": 10, "optimizer": "model_based", **FEW_FITS}
     loop.wait(start_tuner(loop, out, **options, max_batch=1), LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
 

@@ -28,6 +28,7 @@ QUICK: dict[str, Any] = {
     "exploration_variance": 1.0,
     "identification": "field",
     "field_model_settings": {"folds": 2, "passes": 4, "largest_degree": 3},
+    "optimizer_settings": {"iterations": 3},
 }
 SIGMA = 0.05
 
