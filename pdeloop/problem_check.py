@@ -84,7 +84,7 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     if len(diverged):
         remedy = "lower exploration_variance" + ("" if values["plant"] else " or integration_time")
         if len(lost):
-            shorter = f"set a horizon of {lost.min()} steps or fewer, or " * bool(lost.min())
+            shorter = f"set a horizon of {lost.min()} steps or fewer, or " if lost.min() else ""
             remedy = (
                 "weaker inputs do not help where the plant diverges without control; "
                 f"{shorter}draw initial fields nearer to the target"
