@@ -242,7 +242,8 @@ def warnings(summary: Row) -> list[str]:
         which = (
             "" if summary["seeds"] == 1 else f" for seed{'s' * (len(worse) > 1)} {_listed(worse)}"
         )
-        found.append(f"after adaptation the cost is not below that without control{which}")
+        why = f"; {lost['adapted']} of {rollouts} rollouts diverged" if lost["adapted"] else ""
+        found.append(f"after adaptation the cost is not below that without control{which}{why}")
     return found
 
 

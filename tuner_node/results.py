@@ -128,10 +128,12 @@ def summarise(training: Training) -> dict[str, Any]:
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
     one it began with; noise: the measurement noise that was declared, what each optimiser found in its
     place, 0 where nothing else, and what readings seem to have where it found none; outcome: what came
-    of each seed, and why, as its optimiser says, also why it left rollouts over.
+    of each seed, and why, as its optimiser says, also why it left rollouts over; its difference from
+    LQT only if no rollout of either diverged, as the cost of such a one is a penalty.
     """
     assert training.evaluation is not None and training.ended is not None
-    diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
+    lost = training.ended != COMPLETED
+    diverged, comparable = lost.sum(axis=(0, 2)), ~lost[:, [LQT, ADAPTED]].any(axis=(1, 2))
     costs = training.evaluation
     mean = costs.mean(axis=2)
     none, lqt, adapted = (mean[:, EVALUATED.index(name)] for name in EVALUATED)
@@ -164,7 +166,11 @@ def summarise(training: Training) -> dict[str, Any]:
                 "verdict": verdict(*mean[m].tolist(), changed=moved),
                 "reason": last_reason(training.history, training.settings.seed + m),
                 "early": early_end(training, m),
-                "against_lqt": difference(costs[m, LQT], costs[m, ADAPTED]) if moved else None,
+                "against_lqt": (
+                    difference(costs[m, LQT], costs[m, ADAPTED])
+                    if moved and comparable[m]
+                    else None
+                ),
             }
             for m, moved in enumerate(changed)
         ],

@@ -24,7 +24,7 @@ from tuner_node.narration import (
     warnings,
 )
 from tuner_node.results import difference, summarise
-from tuner_node.rollouts import CHECK
+from tuner_node.rollouts import CHECK, EVALUATED
 
 
 def phase(name: str, rollouts: list[int], budget: int = 20) -> dict[str, Any]:
@@ -198,6 +198,8 @@ def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():
         "after adaptation the cost is not below that without control for seed 1"
     ]
     assert not failed(worse)
+    lost = summary(costs=worse["costs"], diverged={"none": 0, "lqt": 0, "adapted": 1})
+    assert warnings(lost)[0].endswith(" for seed 1; 1 of 4 rollouts diverged")
 
 
 def test_a_law_that_costs_more_than_no_control_has_an_exit_code_of_its_own():
@@ -291,6 +293,21 @@ def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_l
     outcome = [own | {"early": ""}, own]
     lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
     assert f"  seed 1: {why}" in lines
+
+
+def test_a_rollout_that_diverged_is_compared_with_nothing() -> None:
+    """Its cost is a penalty, and so would the difference and its interval be."""
+    values = parameters(rollouts=8, optimizer="two_point")
+    training = build_training(values)
+    train(training, LocalPair(values), lambda row: None)
+    assert training.ended is not None and training.evaluation is not None
+    assert summarise(training)["outcome"][0]["against_lqt"] is not None
+    for name in ("lqt", "adapted"):
+        i = EVALUATED.index(name)
+        before = training.ended[0, i, 0]
+        training.ended[0, i, 0] = 7  # the step at which it did
+        assert summarise(training)["outcome"][0]["against_lqt"] is None
+        training.ended[0, i, 0] = before
 
 
 def test_every_optimiser_that_leaves_rollouts_over_says_so_in_the_results() -> None:
