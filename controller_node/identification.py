@@ -281,9 +281,8 @@ def designed(
             **weights,
         )
     if unsolved is not None:
-        found = replace(
-            found, other_cost=np.inf
-        )  # a law over the horizon needs no stabilising gains
+        # A law over the horizon needs no stabilising gains.
+        found = replace(found, other_cost=np.inf)
         if not (found.better or or_no_control):
             raise unsolved
     chosen = found.rows if found.better and found.rows else rows
