@@ -98,9 +98,11 @@ def fit_sensed(
         known = None if near is None else coefficients_of(near)
         found = _refined(problem, start, fields, known, settings)
     else:
-        attempts = (_from_few(problem, pair, settings) for pair in few_rollouts(y, a))
-        found = next(attempts)
-        for own in attempts if found[0] > settings.sensed_reproduced else ():
+        calm, *driven = few_rollouts(y, a)
+        found = _from_few(problem, calm, settings, np.inf)
+        for pair in driven if found[0] > settings.sensed_reproduced else ():
+            # A fit to all rollouts takes long: only from what is an equation of these two.
+            own = _from_few(problem, pair, settings, settings.sensed_reproduced)
             found = min(found, own, key=lambda each: each[0])
     error, shared, fields = found
     return shared, field_of(fields, n), max(error, 0.0)
@@ -119,12 +121,17 @@ def few_rollouts(y: Array, a: Array) -> list[list[int]]:
     return pairs if set(pairs[1]) != set(pairs[0]) else pairs[:1]
 
 
-def _from_few(problem: SensedProblem, pair: list[int], settings: FieldModelSettings) -> Found:
-    """The fit to all rollouts from what a pair of them suggests, and with further terms."""
+def _from_few(
+    problem: SensedProblem, pair: list[int], settings: FieldModelSettings, most: float
+) -> Found:
+    """The fit to all rollouts from what a pair of them suggests, and with further terms.
+
+    most: the error on the pair from which on there is none, of infinite error.
+    """
     problem.prior.forget()
     fields = problem.interpolated()
     error, shared, fields[pair] = _first_guess(problem.part(pair, hold=True), settings)
-    if not np.isfinite(error):
+    if not np.isfinite(error) or error > most:
         return np.inf, shared, fields
     found = _refined(problem, shared, fields, None, settings, first=True)
     shared = further_terms(problem, found, settings)
