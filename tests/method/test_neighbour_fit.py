@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models import FieldModelSettings, Measured, fit_field_model
+from loop_method.models import FieldModelSettings, fit_field_model
 from loop_method.models.base import Samples
 from loop_method.models.kinds import NEAR_RIDGES, kinds_of
 from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.prediction import errors
+from tests.support.ordinary import rolled_out
 
 N_X, DT = 12, 0.1
 SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)
@@ -21,22 +22,14 @@ def neighbour(z, by):
     return np.roll(z, -by, axis=-1)
 
 
-def rolled_out(rate, count, n_z, steps=60, variance=1.0, start=1.0):
+def explored(rate, count, n_z, steps=60, variance=1.0, start=1.0):
     """Rollouts of dz/dt = rate(z) + B a in fine steps, white inputs acting on the last cells."""
-    rng, h = np.random.default_rng(0), DT / 20
+    rng = np.random.default_rng(0)
     actions = np.sqrt(variance) * rng.normal(size=(count, steps, B.shape[1]))
-    states = [start + 0.5 * rng.normal(size=(count, n_z))]
-    for k in range(steps):
-        z, force = states[-1], np.zeros((count, n_z))
-        force[:, n_z - N_X :] = actions[:, k] @ B.T
-        for _ in range(20):  # the classical method of order 4
-            k1 = rate(z) + force
-            k2 = rate(z + h / 2 * k1) + force
-            k3 = rate(z + h / 2 * k2) + force
-            k4 = rate(z + h * k3) + force
-            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        states.append(z)
-    return [Measured(z, a) for z, a in zip(np.stack(states, axis=1), actions, strict=True)]
+    force = np.zeros((count, steps, n_z))
+    force[..., n_z - N_X :] = actions @ B.T
+    first = start + 0.5 * rng.normal(size=(count, n_z))
+    return rolled_out(rate, first, force, actions, DT / 20, 20)
 
 
 def chain(z):
@@ -55,7 +48,7 @@ CHAIN = {
 
 
 def test_a_plant_of_products_of_neighbours_is_recovered_to_1e_6_without_other_terms():
-    rollouts = rolled_out(chain, 2, N_X)
+    rollouts = explored(chain, 2, N_X)
     model = fit_neighbours(Samples.of(rollouts), kind="near-shared", settings=SETTINGS)
     found = {
         (f.factors, f.shifts): C for f, C in zip(model.features, model.coefficients, strict=True)
@@ -74,7 +67,7 @@ def lorenz(z):
 
 def test_whole_rollouts_of_a_chaotic_plant_are_predicted():
     """Errors of the path's means alone, 1e-4 of a step, would be as large as the plant at the end."""
-    rollouts = rolled_out(lorenz, 4, N_X, steps=50, variance=4.0, start=4.0)
+    rollouts = explored(lorenz, 4, N_X, steps=50, variance=4.0, start=4.0)
     fitted = fit_field_model(rollouts[:3], np.zeros(N_X), settings=SETTINGS, first="near-shared")
     assert fitted is not None
     assert fitted.model.kind == "near-shared" and fitted.error < 1e-4
@@ -118,7 +111,7 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
     The layers': both values, and two products in each.
     """
     n_z, start = components * N_X, 1.0 if rate is species else 0.0
-    rollouts = rolled_out(rate, 4, n_z, variance=variance, start=start)
+    rollouts = explored(rate, 4, n_z, variance=variance, start=start)
     model = fit_neighbours(
         Samples.of(rollouts[:3]),
         kind="k",
@@ -137,7 +130,7 @@ def test_pairs_of_components_need_not_be_declared(components, prefix):
 
 
 def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():
-    rollouts = rolled_out(lambda z: 0.2 * (neighbour(z, 1) - 2 * z + neighbour(z, -1)) - z, 3, N_X)
+    rollouts = explored(lambda z: 0.2 * (neighbour(z, 1) - 2 * z + neighbour(z, -1)) - z, 3, N_X)
     settings = FieldModelSettings(reproduced=0.0, largest_degree=2, passes=2, folds=2)
     fitted = fit_field_model(rollouts, np.zeros(N_X), settings=settings)
     assert fitted is not None and fitted.error < settings.near_needed

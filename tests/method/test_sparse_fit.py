@@ -13,6 +13,7 @@ from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
 from loop_method.models.kinds import SPARSE, kinds_of
 from loop_method.models.prediction import errors
 from loop_method.models.sparse_fit import chosen, fit_sparse, products
+from tests.support.ordinary import rolled_out
 
 SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)
 N_Z, DT, LATE = 9, 0.1, 3
@@ -30,20 +31,11 @@ def rate(z):
 
 def network(count=3, steps=60):
     """Rollouts under white inputs, in fine steps."""
-    rng, h = np.random.default_rng(0), DT / 10
+    rng = np.random.default_rng(0)
     actions = rng.normal(size=(count, steps, 2))
-    states = [rng.normal(size=(count, N_Z))]
-    for k in range(steps):
-        z, force = states[-1], np.zeros((count, N_Z))
-        force[:, [0, 4]] = actions[:, k]
-        for _ in range(10):
-            k1 = rate(z) + force
-            k2 = rate(z + h / 2 * k1) + force
-            k3 = rate(z + h / 2 * k2) + force
-            k4 = rate(z + h * k3) + force
-            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        states.append(z)
-    return [Measured(z, a) for z, a in zip(np.stack(states, axis=1), actions, strict=True)]
+    force = np.zeros((count, steps, N_Z))
+    force[..., [0, 4]] = actions
+    return rolled_out(rate, rng.normal(size=(count, N_Z)), force, actions, DT / 10, 10)
 
 
 def late(count=3, steps=80):
