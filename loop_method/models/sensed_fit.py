@@ -100,9 +100,10 @@ def fit_sensed(
     else:
         calm, *driven = few_rollouts(y, a)
         found = _from_few(problem, calm, settings, np.inf)
-        for pair in driven if found[0] > settings.sensed_reproduced else ():
+        enough = settings.sensed_reproduced
+        if driven and found[0] > enough:
             # A fit to all rollouts takes long: only from what is an equation of these two.
-            own = _from_few(problem, pair, settings, settings.sensed_reproduced)
+            own = _from_few(problem, driven[0], settings, enough)
             found = min(found, own, key=lambda each: each[0])
     error, shared, fields = found
     return shared, field_of(fields, n), max(error, 0.0)

@@ -39,10 +39,10 @@ def add(commands: Commands) -> None:
         _check,
         help="check a problem before training, or a node of your own against the protocol",
         description="Check a problem before training on it: halve the integration step, see "
-        "whether the actuators reach the modes that are unstable at the target and the plant diverges "
-        "without control, explore once, report the order that the data support and the cost of the "
-        "first law, and draw fields and supports. The exit code is 1 if a check fails. With plant, "
-        "controller or tuner instead of a FILE, check that a node of your own, alone in this "
+        "whether the actuators reach the modes that are unstable at the target and whether the plant "
+        "diverges without control, explore once, report the order that the data support and the cost "
+        "of the first law, and draw fields and supports. The exit code is 1 if a check fails. With "
+        "plant, controller or tuner instead of a FILE, check that a node of your own, alone in this "
         "ROS_DOMAIN_ID, conforms to docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
