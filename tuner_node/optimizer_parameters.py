@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.parameters import OPTIMIZER
+from loop_interfaces.parameters import LAW, OPTIMIZER, POINTS
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
 from loop_method.adapt import Optimizer
@@ -63,14 +63,29 @@ def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The given parameters with the defaults that optimiser and, of few sensors, law prefer.
+    """The given parameters with the defaults that the optimiser prefers, and of few sensors the law.
 
     The optimiser's name may be written as the command line writes words: gauss-newton.
     """
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")
-    preferences = dict(kind_of({"optimizer": name}).preferences)
-    readings = law_of(given).from_readings
-    if readings and str(given.get("sensors", 0)) != "0":
+    kind = kind_of({"optimizer": name})
+    preferences = dict(kind.preferences)
+    # One at every point measures the whole state.
+    few = (
+        0 < _number(given, "sensors") < _number({POINTS.name: POINTS.default, **given}, POINTS.name)
+    )
+    if few and kind.with_noisy_sensors and _number(given, "measurement_noise") > 0:
+        preferences[LAW.name] = kind.with_noisy_sensors
+    readings = law_of({**preferences, **given}).from_readings
+    if few and readings:
         preferences["identification"] = readings
     return {**preferences, **given, "optimizer": name}
+
+
+def _number(given: Mapping[str, Any], name: str) -> float:
+    """A parameter as a number; 0 if it is not given, or is none, which is refused elsewhere."""
+    try:
+        return float(given.get(name, 0))
+    except (TypeError, ValueError):
+        return 0.0
