@@ -69,14 +69,14 @@ def etdrk4_coefficients(linear: Spectrum, dt: float) -> Coefficients:
     radius = np.where(np.abs(y) < 1, 2.0, 0.5)
     r = y[:, None] + radius[:, None] * np.exp(1j * angles)
     with np.errstate(over="ignore", invalid="ignore"):
-        exp = np.exp(r)
+        exp, square, cube = np.exp(r), r**2, r**3
         values: tuple[Spectrum, ...] = (
             np.exp(y),
             np.exp(y / 2),
             dt * np.mean((np.exp(r / 2) - 1) / r, axis=1),
-            dt * np.mean((-4 - r + exp * (4 - 3 * r + r**2)) / r**3, axis=1),
-            dt * np.mean((2 + r + exp * (r - 2)) / r**3, axis=1),
-            dt * np.mean((-4 - 3 * r - r**2 + exp * (4 - r)) / r**3, axis=1),
+            dt * np.mean((-4 - r + exp * (4 - 3 * r + square)) / cube, axis=1),
+            dt * np.mean((2 + r + exp * (r - 2)) / cube, axis=1),
+            dt * np.mean((-4 - 3 * r - square + exp * (4 - r)) / cube, axis=1),
         )
     if not np.isfinite(values).all():
         raise ValueError(

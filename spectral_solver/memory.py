@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -89,10 +90,10 @@ class Constants:
 
     def add(self, values: ArrayLike) -> int:
         """Append an array, filled up to whole lanes, and return its offset."""
-        own = np.asarray(values)
-        # By hand: there are many, and np.pad takes ten times as long.
-        part = np.zeros(whole_lanes(own.size), dtype=np.complex128)
-        part[: own.size] = own.ravel()
+        return self._append(filled_up(np.asarray(values).ravel()))
+
+    def _append(self, part: NDArray[np.complex128]) -> int:
+        """The same with whole lanes, which stay as they are until `planes`."""
         self._parts.append(part)
         offset = self._size
         self._size += part.size
@@ -100,21 +101,12 @@ class Constants:
 
     def add_spectra(self, rows: NDArray[Any]) -> int:
         """Append spectra (..., modes), each filled up to whole lanes, and return their offset."""
-        modes = rows.shape[-1]
-        filled = np.zeros((*rows.shape[:-1], whole_lanes(modes)), dtype=np.complex128)
-        filled[..., :modes] = rows
-        return self.add(filled)
+        return self._append(filled_up(rows).ravel())
 
     def add_transform(self, length: int, modes: int) -> tuple[int, int, int, int]:
         """Append what a transform of that complex length needs; its entry in a plan."""
-        radices = sum(radix << 4 * i for i, radix in enumerate(radices_of(length)))
-        half_turns = np.arange(max(length, whole_lanes(modes))) / length
-        return (
-            length,
-            radices,
-            self.add(twiddles_of(length)),
-            self.add(-1j * np.exp(-1j * np.pi * half_turns)),
-        )
+        radices, twiddles, split = transform_constants(length, max(length, whole_lanes(modes)))
+        return length, radices, self._append(twiddles), self._append(split)
 
     def add_grid(self, plan: Any, n_x: int) -> None:
         """Append what leads from a field on n_x points to its spectrum and back, into the plan."""
@@ -132,6 +124,29 @@ class Constants:
         planes = aligned(2 * parts.size)
         planes[: parts.size], planes[parts.size :] = parts.real, parts.imag
         return planes
+
+
+def filled_up(rows: NDArray[Any]) -> NDArray[np.complex128]:
+    """Rows (..., n), each filled up to whole lanes."""
+    # By hand: there are many, and np.pad takes ten times as long.
+    n = rows.shape[-1]
+    filled = np.zeros((*rows.shape[:-1], whole_lanes(n)), dtype=np.complex128)
+    filled[..., :n] = rows
+    return filled
+
+
+@lru_cache(maxsize=16)  # a fit makes thousands of steps on one grid
+def transform_constants(
+    length: int, split: int
+) -> tuple[int, NDArray[np.complex128], NDArray[np.complex128]]:
+    """Radices, twiddle factors and so many T_k of a transform of that complex length."""
+    radices = sum(radix << 4 * i for i, radix in enumerate(radices_of(length)))
+    half_turns = np.arange(split) / length
+    return (
+        radices,
+        filled_up(twiddles_of(length)),
+        filled_up(-1j * np.exp(-1j * np.pi * half_turns)),
+    )
 
 
 def lay_out(plan: Any, sizes: Mapping[str, int]) -> int:

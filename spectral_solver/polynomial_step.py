@@ -2,6 +2,7 @@
 """The step of an equation with polynomial nonlinear parts, made ready, with its adjoint."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
 from spectral_solver.fft import is_transform_length, plane_size
-from spectral_solver.memory import Constants, aligned, lay_out
+from spectral_solver.memory import Constants, aligned, filled_up, lay_out
 from spectral_solver.polynomial import (
     PLAN,
     advance,
@@ -20,6 +21,9 @@ from spectral_solver.polynomial import (
     pull_back,
     synthesised,
 )
+
+COEFFICIENTS = ("e", "e2", "q", "qm", "f1m", "f2m", "f3m", "f")
+WEIGHTS = ("weight_begin", "weight_middle", "weight_end")
 
 
 class Polynomials(NamedTuple):
@@ -72,21 +76,18 @@ class PolynomialStep:
         if self._whole:
             plan["coarse"] = constants.add_transform(n_x // 2, modes)
         plan["fine"] = constants.add_transform(fine, modes)
-        c, m = etdrk4_coefficients(equation.linear, h), 1.0 / (4 * fine)
-        plan["e"], plan["e2"], plan["q"] = rows(c.e), rows(c.e2), rows(c.q)
-        plan["qm"], plan["f1m"] = rows(c.q * m), rows(c.f1 * m)
-        plan["f2m"], plan["f3m"] = rows(2 * c.f2 * m), rows(c.f3 * m)
-        plan["f"] = rows(c.f1 + 4 * c.f2 + c.f3)
+        L = equation.linear
+        for name, spectrum in zip(
+            COEFFICIENTS, coefficients(L.tobytes(), L.dtype, h, fine), strict=True
+        ):
+            plan[name] = rows(spectrum)
         plan["supports"] = rows(np.fft.rfft(supports, axis=0).T / n_x)
         plan["multipliers"] = rows(equation.multipliers)
         plan["polynomials"] = constants.add(equation.polynomials)
         plan["slopes"] = constants.add(equation.polynomials * np.arange(2, degree + 1))
-        # Of the parabola through what is integrated at the ends and in the middle of two steps.
-        phi1, phi2, phi3 = phi_functions(equation.linear * 2 * h)
-        plan["weight_begin"] = rows(2 * h * (phi1 - 3 * phi2 + 4 * phi3))
-        plan["weight_middle"] = rows(2 * h * (4 * phi2 - 8 * phi3))
-        plan["weight_end"] = rows(2 * h * (4 * phi3 - phi2))
-        own = int(plan["modes"])
+        own, self._weighted = int(plan["modes"]), False
+        for name in WEIGHTS:
+            plan[name] = rows(np.zeros(own))
         size = lay_out(
             plan,
             {
@@ -146,10 +147,29 @@ class PolynomialStep:
         """
         if self._equation.steps % 2:
             raise ValueError(f"expected an even number of steps, got {self._equation.steps}")
+        if not self._weighted:
+            self._add_weights()
         begin, end = self.spectra(states), self.spectra(after)
         found = np.empty((self._degree, *begin.shape))
         integrals(begin, _with_constant(actions), end, found, self._plans)
         return _complex(found), _complex(end)
+
+    def _add_weights(self) -> None:
+        """Those of the parabola through what is integrated at the ends and in the middle of two steps.
+
+        Most steps integrate nothing.
+        """
+        h, plan, self._weighted = 1.0 / self._equation.steps, self._plans[0], True
+        phi1, phi2, phi3 = phi_functions(self._equation.linear * 2 * h)
+        weights = (
+            2 * h * (phi1 - 3 * phi2 + 4 * phi3),
+            2 * h * (4 * phi2 - 8 * phi3),
+            2 * h * (4 * phi3 - phi2),
+        )
+        planes = self._constants.reshape(2, -1)
+        for name, weight in zip(WEIGHTS, weights, strict=True):
+            at = slice(plan[name], plan[name] + len(weight))
+            planes[:, at] = weight.real, weight.imag
 
     def spectra(self, states: Array) -> Array:
         """Spectra (M, 2, modes), real and imaginary parts: the real FFT over the number of points."""
@@ -182,7 +202,9 @@ class PolynomialSteps:
 
     def __init__(self, steps: Sequence[PolynomialStep]) -> None:
         self._steps = tuple(steps)  # kept alive: the plans have their addresses
-        self._plans = np.concatenate([step._plans for step in steps])
+        self._plans = np.zeros(len(self._steps), PLAN)
+        for i, step in enumerate(self._steps):
+            self._plans[i : i + 1] = step._plans
 
     def advance(self, spectra: Array, inputs: Array) -> None:
         """As of `PolynomialStep`: the first rows with the first equation, as many with the next."""
@@ -206,6 +228,17 @@ def fine_length(n_x: int, degree: int) -> int:
     while not is_transform_length(length):
         length += 1
     return length
+
+
+@lru_cache(maxsize=64)  # a fit varies the nonlinear parts of an equation, too
+def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> tuple[Spectrum, ...]:
+    """The COEFFICIENTS of steps of this length, for a linear operator of these numbers."""
+    c, m = etdrk4_coefficients(np.frombuffer(linear, kind), h), 1.0 / (4 * fine)
+    found = (
+        *(c.e, c.e2, c.q, c.q * m, c.f1 * m, 2 * c.f2 * m, c.f3 * m),
+        c.f1 + 4 * c.f2 + c.f3,
+    )
+    return tuple(filled_up(spectrum) for spectrum in found)
 
 
 def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
@@ -276,18 +277,16 @@ class SensedEquation:
         actuators: Actuators,
         settings: FieldModelSettings = DEFAULTS,
     ) -> None:
-        waves, self._settings = np.arange(n // 2 + 1), settings
-        derivative = 2j * np.pi * waves
-        derivative[waves == n // 2] = 0.0
+        derivatives, self._settings = _derivatives(n), settings
         used = [i for i in range(len(TERMS)) if shared[i]]
         degree = max(3, *(TERMS[i][0] for i in used), 0)
-        self.symbols: Spectrum = np.zeros((degree, waves.size), dtype=np.complex128)
+        self.symbols: Spectrum = np.zeros((degree, n // 2 + 1), dtype=np.complex128)
         """Of the powers 1, 2, ... of the field."""
         for i in used:
             p, j = TERMS[i]
             wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
             unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
-            self.symbols[p - 1] += unit * shared[i] * derivative**j
+            self.symbols[p - 1] += unit * shared[i] * derivatives[j]
         self._fourth = bool(shared[TERMS.index((1, 4))])
         # What grows faster would overflow within an episode.
         grown = self.symbols[0]
@@ -295,14 +294,9 @@ class SensedEquation:
         self.constant = float(shared[COEFFICIENTS - 1]) / _TIME
         b, x_0, s, w = shared[COEFFICIENTS:SHARED] / _TIME
         self.strengths: Array = b + shared[SHARED:] / _TIME
-        n_a = len(actuators.centres)
-        own = np.arange(n_a)
-        places = actuators.centres + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
-        width = (actuators.known_widths + w / n_a)[:, None]
-        # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
-        shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
-        shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])
-        self.supports: Array = np.fft.irfft(shifted, n).T
+        centres = np.asarray(actuators.centres, dtype=np.float64)
+        where = centres.tobytes(), actuators.known_widths.tobytes()
+        self.supports: Array = _supports(n, *where, float(x_0), float(s), float(w))
         """Of actuators of strength 1, (n, n_a)."""
 
     def substeps(self, sizes: Array) -> NDArray[np.int64]:
@@ -341,6 +335,31 @@ class SensedEquation:
             clip,
         )
         return PolynomialStep(equation)
+
+
+# A fit varies one unknown after the other, most of which do not move the actuators.
+@lru_cache(maxsize=16)
+def _supports(n: int, centres: bytes, widths: bytes, x_0: float, s: float, w: float) -> Array:
+    """Of actuators of strength 1, (n, n_a), with these declared centres and widths."""
+    waves, declared = np.arange(n // 2 + 1), np.frombuffer(centres)
+    n_a = len(declared)
+    places = declared + x_0 + (np.arange(n_a) - 0.5 * (n_a - 1)) * s / n_a
+    width = (np.frombuffer(widths) + w / n_a)[:, None]
+    # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
+    shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
+    shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])
+    found: Array = np.fft.irfft(shifted, n).T
+    found.setflags(write=False)  # it is shared
+    return found
+
+
+@lru_cache(maxsize=16)
+def _derivatives(n: int) -> list[Spectrum]:
+    """The symbols of the derivatives of all orders that a term may have."""
+    waves = np.arange(n // 2 + 1)
+    first = 2j * np.pi * waves
+    first[waves == n // 2] = 0.0
+    return [np.asarray(first**j, np.complex128) for j in range(max(ORDERS) + 1)]
 
 
 def _rates(symbols: Spectrum, sizes: Array) -> Array:
