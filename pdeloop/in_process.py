@@ -24,6 +24,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from tuner_node.batch import Batch, BatchResult, most_environments
+from tuner_node.errors import NoModelError
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
 
@@ -57,7 +58,7 @@ class LocalPair:
         self._law = LawBatch(laws, self.plant.target, self._settings.action_limit)
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
-        """Roll the batch out. ValueError if exploration gives no model though no rollout diverged."""
+        """Roll the batch out. NoModelError if exploration gives no model though no rollout diverged."""
         plant = self.plant
         max_batch = most_environments(max_batch, plant.state_size, plant.horizon)
         most = max(max_batch // batch.together, 1) * batch.together
@@ -97,9 +98,14 @@ class LocalPair:
         if not batch.exploratory or (table[:, CostColumn.ENDED] != COMPLETED).any():
             return BatchResult(table, trajectories=seen)
         numbers = batch.rows[:, StartColumn.MODEL].astype(int).tolist()
-        models = design_each(
-            episode.states, episode.actions, numbers, self.plant.target, self._settings
-        )
+        try:
+            models = design_each(
+                episode.states, episode.actions, numbers, self.plant.target, self._settings
+            )
+        except np.linalg.LinAlgError:
+            raise
+        except ValueError as error:
+            raise NoModelError(f"no reduced model: {error}") from error
         return BatchResult(table, models, trajectories=seen)
 
     def law(self, batch: Batch) -> Law:

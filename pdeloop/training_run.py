@@ -37,6 +37,7 @@ from pdeloop.unused import refuse_unused
 from spectral_solver import polynomial_step
 from tuner_node import narration
 from tuner_node.build import build_training
+from tuner_node.errors import NoModelError
 from tuner_node.optimizer_parameters import kind_of, training_parameters
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
@@ -219,6 +220,9 @@ def _train_here(
         # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
         try:
             train(training, LocalPair(values), report, max_batch=values["max_batch"])
+        except NoModelError as error:
+            writer.fail(str(error))
+            raise
         except OwnCodeError as error:
             raise OwnCodeError(
                 f"{error} (continue with: {resuming(folder)} --in-process)"

@@ -34,7 +34,7 @@ from loop_interfaces.spec import FREE
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
-from tuner_node.errors import ContradictionError, DispatchError
+from tuner_node.errors import ContradictionError, DispatchError, NoModelError
 from tuner_node.narration import Narration
 from tuner_node.optimizer_parameters import setting_specs, with_settings
 from tuner_node.pair import PairPublication
@@ -115,6 +115,8 @@ class TunerNode:
             self._writer.give_up(str(self._failure))
         elif self._writer:
             self._writer.keep(now=self._loop.now(), force=True)
+        if self._writer and isinstance(self._failure, NoModelError):
+            self._writer.fail(str(self._failure))
         if self._failure:
             told = narration.several_publishers(self._all_several_publishers())
             raise ConfigurationError("; ".join([str(self._failure), *told]))

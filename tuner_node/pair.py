@@ -11,7 +11,7 @@ from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, MODEL_FAILED, VOID, CostColumn
 from tuner_node.batch import Batch, less_often
 from tuner_node.chunk import Chunk
-from tuner_node.errors import ContradictionError, DispatchError
+from tuner_node.errors import ContradictionError, DispatchError, NoModelError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 PairPublication = tuple[int, Publication]
@@ -74,11 +74,11 @@ class Pair:
     def release_if_done(self, batch: Batch) -> None:
         """It is free if its chunk has all results.
 
-        DispatchError if an exploration gave no model although the plant did not diverge.
+        NoModelError if an exploration gave no model although the plant did not diverge.
         """
         chunk = self.chunk
         if chunk is not None and chunk.failure and chunk.completed:
-            raise DispatchError(f"no reduced model: {chunk.failure}")
+            raise NoModelError(f"no reduced model: {chunk.failure}")
         if chunk is not None and chunk.done(batch):
             self.chunk = None
 

@@ -4,7 +4,8 @@
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
 run.json           the run's id on the network, how often its tuner was started, whether an
                    operator has paused it, the plant's fingerprint if it was given (0: not),
-                   what defines the training, and why it cannot be continued, if so
+                   what defines the training, and why it cannot be continued, or would fail again
+                   if it were, if so
 progress.jsonl     events, one JSON object per line, in order
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,);
@@ -102,13 +103,21 @@ class RunFolder:
         self.path = path
         self.checkpoint = path / "checkpoint"
 
-    def refuse_another(self) -> None:
-        """RunFolderError where no new training can begin: the folder holds one, or is none."""
+    def refuse_another(self, *, briefly: bool = False) -> None:
+        """RunFolderError where no new training can begin: the folder holds one, or is none.
+
+        briefly: without reading what became of the one that is there.
+        """
         if (self.path / "parameters.yaml").exists():
             begun = f"{self.path} already holds a run; choose another folder, delete this one, or "
             if (self.path / "result.json").exists():  # there is nothing to continue
                 report = f"pdeloop report {shlex.quote(str(self.path))}"
                 raise RunFolderError(f"{begun}see its results: {report}")
+            if ended := "" if briefly else self._ended_early():
+                raise RunFolderError(
+                    f"{self.path} holds a run without results: {ended}; choose another folder, or "
+                    "delete this one"
+                )
             raise RunFolderError(
                 f"{begun}continue it with: {resuming(self.path)} "
                 "(a tuner_node with -p resume:=true)"
@@ -142,7 +151,7 @@ class RunFolder:
 
         RunFolderError if the folder holds one by now, or cannot be written.
         """
-        self.refuse_another()
+        self.refuse_another(briefly=True)  # who has just begun one here waits for the lock
         try:
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             # parameters.yaml comes last and whole: where it is, there is a run.
@@ -158,10 +167,7 @@ class RunFolder:
         try:
             known = read_json(self.path / "run.json")
             if "contradiction" in known:
-                raise RunFolderError(
-                    f"the run in {self.path} cannot be continued, because it used results "
-                    f"that were contradicted later ({known['contradiction']})"
-                )
+                raise RunFolderError(f"the run in {self.path}: {_contradicted(known)}")
             self._check_same(known["parameters"], parameters)
             paused = bool(known.get("paused", False))
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1, paused)
@@ -185,6 +191,31 @@ class RunFolder:
     def give_up(self, reason: str) -> None:
         """Let `reopen` refuse from now on. OSError or FileError where that cannot be written."""
         self._change(contradiction=reason)
+
+    def fail(self, reason: str) -> None:
+        """Remember why the training failed. OSError or FileError where that cannot be written."""
+        self._change(failure=reason)
+
+    def without_results(self) -> str:
+        """Why the training here has no results, and what to do, in words."""
+        if ended := self._ended_early():
+            known = shlex.quote(str(self.path / "parameters.yaml"))
+            return (
+                f"{ended}; a new run with other parameters: pdeloop train {known} --set NAME=VALUE"
+            )
+        return f"the run is not finished; continue it with: {resuming(self.path)}"
+
+    def _ended_early(self) -> str:
+        """Why it is no use to continue the training here, in words; empty: it may be."""
+        try:
+            known = read_json(self.path / "run.json")
+        except FileError:  # `reopen` says so
+            return ""
+        if "contradiction" in known:
+            return _contradicted(known)
+        if "failure" in known:
+            return f"the training failed, and would fail again ({known['failure']})"
+        return ""
 
     def hold(self, paused: bool) -> None:
         """Remember whether an operator has paused it. OSError or FileError where that fails."""
@@ -290,10 +321,7 @@ class RunFolder:
         """
         path = self.path / "policy.npz"
         if not path.exists():
-            raise RunFolderError(
-                f"no results in {self.path}: the run is not finished; "
-                f"continue it with: {resuming(self.path)}"
-            )
+            raise RunFolderError(f"no results in {self.path}: {self.without_results()}")
         values = self.values()
         n_a, seeds = values["n_a"], values["seeds"]
         try:
@@ -339,6 +367,14 @@ class RunFolder:
         }
         write_atomically(self.path / "run.json", json.dumps(content).encode())
         return identity
+
+
+def _contradicted(known: Mapping[str, Any]) -> str:
+    """What run.json says of a training that used results which were contradicted later."""
+    return (
+        "it cannot be continued, because it used results that were contradicted later "
+        f"({known['contradiction']})"
+    )
 
 
 def timestamp() -> str:

@@ -82,6 +82,13 @@ class RunWriter:
                 f"do not continue the run in {self._folder.path}, although it can be: {error}"
             )
 
+    def fail(self, reason: str) -> None:
+        """Remember why the training failed, and would fail again."""
+        try:
+            self._folder.fail(reason)
+        except (OSError, FileError) as error:
+            self._warn(f"the folder does not say that the training failed: {error}")
+
     def hold(self, paused: bool) -> None:
         """Remember whether an operator has paused the training, for its tuner's next process."""
         try:

@@ -72,6 +72,8 @@ class Session:
         training = self.training
         try:
             rows = training.finish(result)
+        except DispatchError:
+            raise
         except ValueError as error:  # a result that the training cannot use: no use in waiting
             raise DispatchError(str(error)) from error
         for row in rows:

@@ -35,6 +35,7 @@ from loop_method.laws.calls import laws_of
 from tuner_node import event_rows, rollouts, void_exploration
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
+from tuner_node.errors import NoModelError
 from tuner_node.law_check import check_law
 from tuner_node.optimizer_context import context_of
 from tuner_node.result_checks import check_excitation, same_steps
@@ -251,7 +252,7 @@ class Training:
 
         The others run once more as they were: which of them have models depends on how the batch was
         cut into episodes. A seed without another attempt goes on with the model that it has from
-        before; ValueError where it has none.
+        before; NoModelError where it has none.
         """
         settings, rows = self.settings, []
         for m, step in lost.items():
@@ -260,8 +261,9 @@ class Training:
             affordable = self._can_pay_for_exploration(m)
             again = self.void[m] <= void_exploration.MOST and affordable
             if not again and not self.attempts[m]:
-                raise ValueError(
-                    void_exploration.no_model(settings, self.void[m], step, paid_up=not affordable)
+                steps = [*void_exploration.steps_before(self.history, settings.all_seeds[m]), step]
+                raise NoModelError(
+                    void_exploration.no_model(settings, steps, paid_up=not affordable)
                 )
             if not again:
                 self.pending.remove(m)
@@ -277,7 +279,7 @@ class Training:
         assert self.settings.model is not None
         own, size = (len(self._unpacked(rows).U) for rows in (self.settings.model, identified[0]))
         if own != size:
-            raise ValueError(
+            raise NoModelError(
                 f"the given model is of a state of {own} numbers, the plant's has {size}; "
                 "identify one of this plant"
             )

@@ -6,7 +6,8 @@ fields with a quarter of the variance. No model is fitted to it: the states befo
 from those of a law, and models that predict both are worse for the law.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from loop_interfaces.topics import COMPLETED, CostColumn
 from tuner_node.batch import BatchResult, TrainingSettings
@@ -32,13 +33,33 @@ def diverged_steps(result: BatchResult, pending: Sequence[int], together: int) -
     }
 
 
-def no_model(settings: TrainingSettings, void: int, step: int, *, paid_up: bool) -> str:
-    """Why a training ends with a void exploration. paid_up: its budget allows no other."""
+def steps_before(history: Sequence[Mapping[str, Any]], seed: int) -> list[int]:
+    """The steps at which the plant diverged under the explorations of a seed so far."""
+    return [
+        row["step"] for row in history if row.get("event") == "diverged" and row["seed"] == seed
+    ]
+
+
+def no_model(settings: TrainingSettings, steps: Sequence[int], *, paid_up: bool) -> str:
+    """Why a training ends with a void exploration.
+
+    steps: those at which the plant diverged, exploration by exploration; paid_up: the budget allows no
+    other.
+    """
+    times = "" if len(steps) == 1 else f" {len(steps)} times, last"
+    told = (
+        f"no reduced model: the plant diverged under exploration{times} at step {steps[-1]} with "
+        f"inputs of variance {variance(settings, len(steps) - 1):.3g}; "
+    )
+    told += "no rollouts are left for another exploration; " if paid_up else ""
+    if len(steps) > 1 and steps[-1] <= steps[0]:
+        shorter = f"set a horizon of {min(steps)} steps or fewer, " if min(steps) else ""
+        return (
+            f"{told}weaker inputs did not delay it, as where it diverges without control: {shorter}"
+            "raise divergence_bound, or begin nearer to the target"
+        )
     noise = ", or measurement_noise, which raises it" if settings.measurement_noise else ""
-    times = "" if void == 1 else f" {void} times, last"
-    budget = "no rollouts are left for another exploration; " if paid_up else ""
     return (
-        f"no reduced model: the plant diverged under exploration{times} at step {step} with inputs "
-        f"of variance {variance(settings, void - 1):.3g}; {budget}lower exploration_variance{noise}, "
-        "or shorten the horizon where the plant diverges without control too"
+        f"{told}lower exploration_variance{noise}, or shorten the horizon where the plant diverges "
+        "without control too"
     )

@@ -66,6 +66,7 @@ def _monitor(options: argparse.Namespace) -> int:
     from loop_interfaces.affinity import lower_priority
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
+    from tuner_node.run_folder import RunFolder
     from viewer_node.web.page import Page
     from viewer_node.web.server import Server
 
@@ -78,10 +79,10 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
     finder = Finder(folder, given_domain())
     if folder is not None and finder.find() is None:
-        way, quoted = "continue it with: pdeloop train --resume", shlex.quote(str(folder))
+        way = RunFolder(folder).without_results()
         if (folder / "result.json").exists():
-            way = "it is finished and is shown by: pdeloop report"
-        raise ParameterError(f"no loop is working on the run in {folder}; {way} {quoted}")
+            way = f"it is finished and is shown by: pdeloop report {shlex.quote(str(folder))}"
+        raise ParameterError(f"no loop is working on the run in {folder}; {way}")
     from pdeloop.monitor.node import show_loops  # here, as it needs ROS
 
     page = Page(options.environment)

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import pytest
 
+from pdeloop.finished_run import load_run
 from tests.support.loop_harness import Processes, until
 from tests.support.small import FEW_FITS, parameters, train_here
 from tests.support.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
+from tuner_node.run_folder import RunFolderError
 
 pytestmark = pytest.mark.topics
 ROLLOUTS = 15
@@ -47,6 +49,15 @@ def test_an_exploration_that_diverges_is_repeated_as_in_one_process(loop: Proces
     there = train_here(parameters(**options, divergence_bound=3.2))
     assert [row["seed"] for row in there.history if row["event"] == "diverged"] == [0]
     assert_same_training(out, there)
+
+
+def test_a_training_without_a_model_leaves_the_reason_in_its_folder(loop: Processes, tmp_path):
+    out = tmp_path / "run"
+    start_pair(loop, divergence_bound=0.1)
+    tuner = start_tuner(loop, out, optimizer="two_point", iterations=1, divergence_bound=0.1)
+    assert "no reduced model: the plant diverged" in loop.wait(tuner, LIMIT, code=1)
+    with pytest.raises(RunFolderError, match=r"would fail again .*the plant diverged"):
+        load_run(out)
 
 
 WRONG_SHAPES = """

@@ -19,7 +19,7 @@ from tuner_node import training_state
 from tuner_node.build import build_training
 from tuner_node.narration import Narration
 from tuner_node.training import Training
-from tuner_node.void_exploration import MOST
+from tuner_node.void_exploration import MOST, no_model
 
 STRONG = {"exploration_variance": 100.0, "divergence_bound": 3.2}
 """Of the seeds 0, 1 and 2 the first and the last diverge; a quarter is not too strong for any."""
@@ -100,11 +100,21 @@ def test_a_plant_that_always_diverges_ends_the_training_with_the_reason(noise):
     with pytest.raises(ValueError, match="no reduced model: the plant diverged under") as ended:
         explore_until_the_end(training, LocalPair(values))
     told = str(ended.value)
-    assert f"{MOST + 1} times, last at step 0" in told and "without control too" in told
+    assert f"{MOST + 1} times, last at step 0" in told
     weakest = training.settings.exploration_variance / 4**MOST
-    assert f"inputs of variance {weakest:.3g}; lower exploration_variance" in told
-    assert ("measurement_noise" in told) == bool(noise)
+    assert f"inputs of variance {weakest:.3g}; weaker inputs did not delay it" in told
+    assert "lower exploration_variance" not in told and "a horizon of" not in told
     assert [row["step"] for row in training.history] == [0] * MOST
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_inputs_that_delay_the_divergence_are_to_be_weaker_still(noise):
+    settings = build_training(parameters(measurement_noise=noise)).settings
+    told = no_model(settings, [3, 5], paid_up=False)
+    assert "lower exploration_variance" in told and ("measurement_noise" in told) == bool(noise)
+    assert "lower exploration_variance" in no_model(settings, [7], paid_up=True)
+    told = no_model(settings, [7, 5, 6], paid_up=False)
+    assert "set a horizon of 5 steps or fewer" in told and "exploration_variance" not in told
 
 
 def test_a_budget_without_room_for_another_exploration_ends_the_training():
