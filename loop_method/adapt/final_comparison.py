@@ -34,11 +34,11 @@ from loop_method.adapt.verdict import (
     NONE,
     Evidence,
     Verdict,
+    beats_no_control,
     choose,
     evidence_against_none,
     evidence_of,
     evidence_of_pairs,
-    is_safe,
     size_of,
 )
 from loop_method.seeds import field_seed
@@ -224,7 +224,7 @@ def on_model(
     """
     loop, fields = belief.loop(context), initial_fields(known)
     theta = {name: loop.theta(law) for name, law in laws.items()}
-    base = FIRST if is_safe(loop, theta[FIRST], fields) else NONE
+    base = FIRST if beats_no_control(loop, theta[FIRST], fields) else NONE
     law, fraction, change = laws[ADAPTED], 0.0, ZERO
     if not np.array_equal(law, laws[base]):
         left_out, states = fields, measured_states(known, settings.chaotic_fields)

@@ -46,7 +46,7 @@ from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.undeclared_noise import believe_in_noise
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of, is_safe
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, beats_no_control, choose, evidence_of
 from loop_method.laws.observer import Observer
 from loop_method.seeds import field_seed
 
@@ -290,7 +290,7 @@ class ModelBased(Optimizer):
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         loop, fields = belief.loop(self._context), self._fields()
         first, none = loop.theta(self._first), loop.theta(self._none)
-        safe = is_safe(loop, first, fields)
+        safe = beats_no_control(loop, first, fields)
         base, near = (first, self._first) if safe else (none, self._none)
         self._progress.safe = safe
         improved = base if self._progress.improved is None else self._progress.improved

@@ -140,7 +140,7 @@ def is_cheaper(own: Array, other: Array) -> bool:
     return bool(own[both].sum() < other[both].sum())
 
 
-def is_safe(loop: ClosedLoop, first: Array, fields: Array) -> bool:
+def beats_no_control(loop: ClosedLoop, first: Array, fields: Array) -> bool:
     """True if a law is cheaper than no control on the model; where that says nothing, if it is another.
 
     A first law that is not is nothing to stay near to.
