@@ -21,7 +21,7 @@ from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
 from loop_interfaces.signature import signature
 from loop_interfaces.topics import ACTION, COMPLETED, COST, STATE, VOID
 from pde_sim_node.fast_path import PlantFastPath
-from tests.plant.test_lockstep import PLANT, RUN, is_void, plant_protocol
+from tests.support.lockstep import PLANT, RUN, is_void, plant_protocol
 
 N_Z, N_S, N_A = 37, 5, 3
 RNG = np.random.default_rng(0)

@@ -26,7 +26,7 @@ from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.build import build_plant
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.real_time import Timing
-from tests.plant.test_lockstep import RUN, answer, plant_protocol, run_episode, start
+from tests.support.lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.support.small import parameters
 from tests.tuner.test_session import ITERATIONS, Loop, values
 from tuner_node.build import build_training

@@ -28,7 +28,7 @@ from loop_interfaces.topics import (
     CostColumn,
     Topic,
 )
-from tests.plant.test_lockstep import is_void, plant_protocol
+from tests.support.lockstep import is_void, plant_protocol
 from tests.support.small import dispatcher_of
 from tuner_node.batch import Batch
 from tuner_node.errors import DispatchError

@@ -50,7 +50,13 @@ _TUNER = (
     "tuner/test_session.py",
     _SIGNATURE,
 )
-_PLANT = ("plant/test_lockstep.py", "plant/test_taken_actions.py", _SIGNATURE)
+_PLANT = (
+    "plant/test_lockstep.py",
+    "plant/test_lockstep_pauses.py",
+    "plant/test_lockstep_contradictions.py",
+    "plant/test_taken_actions.py",
+    _SIGNATURE,
+)
 _CONTROLLER = ("controller/test_responder.py", "controller/test_answered_steps.py", _SIGNATURE)
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")
 TESTS: dict[str, tuple[str, ...]] = {

@@ -27,7 +27,7 @@ from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
 from pdeloop.conformance.probing import FAILED, Check, Message
 from pdeloop.conformance.tuner import TunerCheck
-from tests.plant.test_lockstep import plant_protocol
+from tests.support.lockstep import plant_protocol
 from tests.support.small import parameters
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher
