@@ -23,6 +23,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,6 +32,8 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
 from pde_sim_node.action_set import ActionSet
 
+SPELT_ALIKE = 0.83
+"""Similarity of names, of difflib, from which one is taken for a misspelt other one."""
 MEAN_DRAWS = 100
 """Initial states whose average stands for the mean of their distribution."""
 
@@ -204,6 +207,18 @@ class Dynamics(ABC):
             None where there is no step to halve.
         """
         return None
+
+
+def refuse_misspelt(kind: type[Dynamics]) -> None:
+    """ValueError where a class sets a name close to one that it could set and does not."""
+    known = {name for name in (*vars(Dynamics), *Dynamics.__annotations__) if name[0] != "_"}
+    own = {name for cls in kind.__mro__ if cls not in Dynamics.__mro__ for name in vars(cls)}
+    for name in sorted(name for name in own - known if name[0] != "_"):
+        for meant in get_close_matches(name, known - own, n=1, cutoff=SPELT_ALIKE):
+            raise ValueError(
+                f"{kind.__qualname__} sets '{name}', which a plant does not have; did you mean "
+                f"'{meant}'? An attribute of your own may begin with _"
+            )
 
 
 def signature_of(maker: Callable[..., Any]) -> inspect.Signature:

@@ -120,9 +120,9 @@ def above(costs: Array, base: Array) -> dict[str, Any] | None:
     """By how many percent the mean of costs (S, fields) is above that of `base`, on the same fields.
 
     With the percentile bootstrap over the fields, each with its cost in both; None where a rollout
-    diverged.
+    diverged, or `base` is 0.
     """
-    if max(float(costs.max()), float(base.max())) >= DIVERGED_COST:
+    if max(float(costs.max()), float(base.max())) >= DIVERGED_COST or not base.any():
         return None
     pair = costs.mean(axis=0), base.mean(axis=0)
     found = interval(pair, _percent_above)

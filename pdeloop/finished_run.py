@@ -194,10 +194,11 @@ class Reduction:
 
 
 def reduction(costs: Array, lqt: Array) -> Reduction | None:
-    """The reduction of costs (S, fields) on LQT's; None if every seed has a rollout that diverged.
+    """The reduction of costs (S, fields) on LQT's; None if no seed has one to be compared with.
 
-    The interval is that of the percentile bootstrap: the seeds are drawn again with replacement, each
-    with both its costs. Efron, Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13.
+    A seed is left out that has a rollout that diverged, or costs nothing with LQT. The interval is that
+    of the percentile bootstrap: the seeds are drawn again with replacement, each with both its costs.
+    Efron, Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13.
 
     Examples
     --------
@@ -207,7 +208,7 @@ def reduction(costs: Array, lqt: Array) -> Reduction | None:
     (30.0, 37.5)
     """
     own, base = field_means(costs), field_means(lqt)
-    whole = np.isfinite(own) & np.isfinite(base)
+    whole = np.isfinite(own) & np.isfinite(base) & (base != 0.0)
     if not whole.any():
         return None
     pair = own[whole], base[whole]

@@ -23,6 +23,7 @@ from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
+from pdeloop.control_effect import idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from tuner_node.build import build_training
 
@@ -68,6 +69,9 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     explored = _explore(plant, values)
     if values["plant"]:
         yield _repeatable(plant, explored)
+        if plant.settable and (idle := idle_actuators(plant, *_some_steps(explored))):
+            which = "no action moves" if len(idle) == plant.n_a else f"actuators {idle} do not move"
+            yield Finding("actuators", False, f"{which} the state: see what step does with its a")
     yield _halving(plant, values, explored)
     yield _actuators(plant)
     lost = _without_control(plant)
@@ -158,13 +162,18 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
     return Finding("integration step", True, text)
 
 
+def _some_steps(explored: EpisodeRecord) -> tuple[Array, Array]:
+    """States and actions of a few steps of an exploration."""
+    some = np.unique(np.linspace(0, len(explored.actions) - 1, REPEATED).astype(int))
+    return explored.fields[some, 1], explored.actions[some, 1]
+
+
 def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
     """Check that a step has the same bits when it is computed again, and in a batch of another size."""
     name = "repeatability"
     if not plant.settable:
         return Finding(name, True, "not checked: the state of the plant cannot be set")
-    some = np.unique(np.linspace(0, len(explored.actions) - 1, REPEATED).astype(int))
-    states, actions = explored.fields[some, 1], explored.actions[some, 1]
+    states, actions = _some_steps(explored)
     together = plant.evaluate(states, actions)[0]
     if not np.array_equal(plant.evaluate(states, actions)[0], together):
         told = (
@@ -180,7 +189,7 @@ def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
     return Finding(
         name,
         True,
-        f"{len(some)} steps are the same to the bit when computed again, alone and in a batch",
+        f"{len(states)} steps are the same to the bit when computed again, alone and in a batch",
     )
 
 
@@ -372,8 +381,6 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()
     )
-    good = costs[f"order {n_s}"] < costs["no control"]
-    hint = (
-        "" if good else ": the adaptation begins with a law that does not help; try another order"
-    )
-    yield Finding("first law", good, f"mean stage cost of {DRAWN} drawn fields {told}{hint}")
+    good, hint = judged(costs["no control"], costs[f"order {n_s}"])
+    told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")
+    yield Finding("first law", good, told, note=good and bool(hint))

@@ -10,6 +10,14 @@ from typing import Any
 Row = Mapping[str, Any]
 COSTLIER = 3
 """Exit code where a law costs more than no control."""
+LITTLE = 0.05
+"""Share of the cost without control; a law that saves less of it hardly controls."""
+REPEATS = 1e-6
+"""Relative difference of the costs of one law on the same fields that is no rounding."""
+IDLE = (
+    "actions that hardly move the state or are dear (action_weight), a target out of their reach, or "
+    "too few rollouts; `pdeloop check` looks for causes"
+)
 _TOGETHER = ("designed", "checked", "evaluated")
 """Events that every seed has, one after the other."""
 
@@ -143,6 +151,9 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
             "  the LQT law costs at least as much as no control; the adapted one costs "
             f"{against} no control"
         )
+    if comparable and not diverged["none"] and 0 < none - adapted < LITTLE * none:
+        share = f"{100 * (1 - adapted / none):.2g}"
+        lines.append(f"  control saves only {share} % of the cost without it: {IDLE}")
     if not any(summary["changed"]):
         lines.append(
             "  nothing was adapted: the policies are those that the adaptation started from"
@@ -223,6 +234,12 @@ def warnings(summary: Row) -> list[str]:
     costs = summary["costs"]
     found = several_publishers(summary.get("several_publishers", {}))
     found += misjudged_noise(summary)
+    if not _repeatable(summary):
+        found.append(
+            "one law cost otherwise when it ran again from the same initial fields: the plant is no "
+            "function of state, action and seed, as a machine or one that draws random numbers of its "
+            "own, so that differences of costs are partly chance; `pdeloop check` tests its steps"
+        )
     if lost["lqt"] == rollouts:
         found.append(
             "every rollout of the first laws diverged; likely causes: an exploration that is too "
@@ -238,13 +255,33 @@ def warnings(summary: Row) -> list[str]:
         for m, (none, adapted) in enumerate(zip(costs["none"], costs["adapted"], strict=True))
         if not adapted < none
     ]
-    if worse:
+    if worse and not any(costs["none"]):
+        found.append(
+            "without control the fields cost nothing, as they are at the target: there is nothing to "
+            "control; draw other initial fields, or set another target"
+        )
+    elif worse:
         which = (
             "" if summary["seeds"] == 1 else f" for seed{'s' * (len(worse) > 1)} {_listed(worse)}"
         )
         why = f"; {lost['adapted']} of {rollouts} rollouts diverged" if lost["adapted"] else ""
-        found.append(f"after adaptation the cost is not below that without control{which}{why}")
+        found.append(
+            f"after adaptation the cost is not below that without control{which}{why}; likely causes: "
+            f"{IDLE}"
+        )
     return found
+
+
+def _repeatable(summary: Row) -> bool:
+    """False where a law that was not changed cost otherwise than the same one on the same fields."""
+    costs = summary["costs"]
+    rows = zip(
+        summary.get("changed", []), *(costs[n] for n in ("adapted", "lqt", "none")), strict=False
+    )
+    return all(
+        changed or not min(abs(own - lqt), abs(own - none)) > REPEATS * abs(own)
+        for changed, own, lqt, none in rows
+    )
 
 
 def misjudged_noise(summary: Row) -> list[str]:

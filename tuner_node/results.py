@@ -146,8 +146,8 @@ def summarise(training: Training) -> dict[str, Any]:
         "costs_by_field": {name: costs[:, i].tolist() for i, name in enumerate(EVALUATED)},
         "mean_cost": {"none": none.mean(), "lqt": lqt.mean(), "adapted": adapted.mean()},
         "reduction": {
-            "mean_of_ratios": float((1 - adapted / lqt).mean()),
-            "ratio_of_means": float(1 - adapted.mean() / lqt.mean()),
+            "mean_of_ratios": float(_below(adapted, lqt).mean()),
+            "ratio_of_means": float(_below(adapted.mean(), lqt.mean())),
         },
         "improved": bool((adapted <= lqt).all()),
         "evaluation_rollouts": int(costs[:, 0].size),
@@ -176,6 +176,12 @@ def summarise(training: Training) -> dict[str, Any]:
         ],
         "history": training.history,
     }
+
+
+def _below(own: NDArray[np.float64], lqt: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far costs lie below LQT's, as a share of those; 0 where both are the same, or 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(own == lqt, 0.0, 1 - own / lqt)
 
 
 def verdict(none: float, lqt: float, adapted: float, *, changed: bool) -> str:
@@ -230,7 +236,10 @@ def early_end(training: Training, m: int) -> str:
         return ""
     own = [row for row in training.history if row["seed"] == training.settings.seed + m]
     why = str(own[-1].get("early") or NO_MORE) if own else NO_MORE
-    return f"{total - paid} of {total} rollouts were not used: {why}"
+    left, step = total - paid, training.settings.step
+    if why == NO_MORE and left < step:
+        why += f", as its step takes {step}"
+    return f"{left} of {total} rollouts {'was' if left == 1 else 'were'} not used: {why}"
 
 
 def versions() -> dict[str, str]:

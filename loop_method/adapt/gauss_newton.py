@@ -273,7 +273,7 @@ class GaussNewton(Optimizer):
         else:
             return False
         row["accepted"] = now.accepted
-        if np.isfinite(trial) and np.isfinite(incumbent):
+        if np.isfinite(trial) and np.isfinite(incumbent) and incumbent:
             row["relative_cost"] = trial / incumbent
         now.trials[:] = NONE
         now.proposed = False

@@ -18,7 +18,7 @@ from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
-from pde_sim_node.dynamics import Dynamics, arguments_of
+from pde_sim_node.dynamics import Dynamics, arguments_of, refuse_misspelt
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
 
@@ -52,6 +52,7 @@ class DynamicsPlant(BatchPlant):
                 raise ValueError(
                     f"{self.name}: {name} is a method; expected its value (an attribute or property)"
                 )
+        refuse_misspelt(type(dynamics))
         given = {name: getattr(dynamics, name) for name in ("n_a", "sample_time", *SETTABLE)}
         given |= settings
         try:

@@ -37,7 +37,8 @@ def training_curves(problems: Sequence[ProblemData]) -> Figure:
             ax.axhline(1.0, color=COLOURS["lqt"], linestyle=LINES["lqt"], label=NAMES["lqt"])
             reached += [0.8 / 0.93, 1.0, 1.25 / 1.08]
         low, top = min(reached), max(reached)
-        plain_log(ax, top / low if low > 0 else 1.0)
+        if low > 0:
+            plain_log(ax, top / low)
         ax.set_ylim(0.93 * low, 1.08 * top or 1.0)
         ax.set_xlim(left=0)
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -252,7 +252,7 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
     if not isfinite(cost):
         return problem.name, "diverged", f"a rollout of the {NAMES[best]} law diverged"
     said = [f"mean stage cost, {NAMES[best]}"]
-    if isfinite(lqt):
+    if isfinite(lqt) and lqt > 0:
         share = 100 * (1 - cost / lqt)
         said.append(f"{abs(share):.1f} % {'below' if share >= 0 else 'above'} {NAMES['lqt']}")
     if isfinite(none) and none > 0:

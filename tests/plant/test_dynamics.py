@@ -52,6 +52,23 @@ def actions(batch: int, steps: int = 4) -> np.ndarray:
     return np.random.default_rng(3).standard_normal((steps, batch, 2))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [("sampling_time", "sample_time"), ("action_lo", "action_low"), ("mean_states", "mean_state")],
+)
+def test_a_misspelt_attribute_is_refused_with_the_one_that_was_meant(
+    wrong: str, meant: str
+) -> None:
+    with pytest.raises(ValueError, match=f"Own sets '{wrong}'.*; did you mean '{meant}'"):
+        DynamicsPlant(type("Own", (Linear,), {wrong: 3.0})())
+
+
+@pytest.mark.parametrize("own", ["_sampling_time", "viscosity", "targets"])
+def test_an_attribute_of_ones_own_is_left_alone(own: str) -> None:
+    """`targets` next to `target`, too, which is set."""
+    assert DynamicsPlant(type("Own", (Linear,), {own: 3.0})()).n_a == 2
+
+
 @pytest.mark.parametrize("kind", [Linear, Batch])
 def test_states_and_costs_are_those_of_the_formula(kind: type[Linear]) -> None:
     plant = DynamicsPlant(kind())

@@ -22,6 +22,7 @@ from pde_sim_node.plants.loading import as_plant
 from pde_sim_node.plants.reactions import Plate
 from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
+from pdeloop.control_effect import judged
 from pdeloop.problem_check import check, reach
 from tests.support.plants import plant_of
 from tests.support.small import parameters
@@ -206,6 +207,65 @@ def test_a_plant_that_diverges_without_control_is_told_and_weaker_inputs_are_not
     good, text = found["exploration"]
     assert not good and "lower exploration_variance" not in text
     assert f"a horizon of {first} steps or fewer" in text
+
+
+class Deaf(Around):
+    """The same, on which the second and the last input have no effect."""
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return 1.02 * z + 0.1 * a * [1, 0, 1, 0]
+
+
+class Numb(Deaf):
+    """The same without any effect of the inputs."""
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return 0.9 * z
+
+
+class Dear(Around):
+    """The same, with inputs that cost more than they save."""
+
+    action_weight = 1e6
+
+
+class Resting(Around):
+    """The same, already at the target."""
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return np.zeros(4)
+
+
+def test_inputs_without_effect_are_named() -> None:
+    assert "actuators" not in findings_of(Around())
+    assert findings_of(Deaf())["actuators"] == (
+        False,
+        "actuators [1, 3] do not move the state: see what step does with its a",
+    )
+    good, text = findings_of(Numb())["actuators"]
+    assert not good and text.startswith("no action moves the state")
+
+
+def test_a_law_that_does_next_to_nothing_is_not_a_matter_of_the_order() -> None:
+    text = findings_of(Dear())["first law"][1]
+    assert "lower action_weight" in text and "another order" not in text
+    good, text = findings_of(Resting())["first law"]
+    assert not good and "at the target; draw others" in text
+
+
+@pytest.mark.parametrize(
+    ("none", "law", "good", "words"),
+    [
+        (9.0, 1.0, True, ""),
+        (9.0, 8.9, True, "next to nothing"),
+        (9.0, 99.0, False, "another order"),
+    ],
+)
+def test_the_first_law_is_judged_by_what_it_saves(
+    none: float, law: float, good: bool, words: str
+) -> None:
+    found, hint = judged(none, law)
+    assert found == good and words in hint and bool(words) == bool(hint)
 
 
 @pytest.mark.parametrize(

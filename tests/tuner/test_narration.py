@@ -16,6 +16,7 @@ from pdeloop.in_process import LocalPair, train
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training
 from tuner_node.narration import (
+    IDLE,
     Narration,
     closing_lines,
     exit_code,
@@ -194,12 +195,38 @@ def test_several_publishers_of_a_topic_are_a_warning():
 
 def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():
     worse = summary(costs={"none": [4.0, 4.0], "lqt": [2.0, 5.0], "adapted": [1.0, 4.5]})
-    assert warnings(worse) == [
-        "after adaptation the cost is not below that without control for seed 1"
-    ]
+    (told,) = warnings(worse)
+    words = "after adaptation the cost is not below that without control for seed 1"
+    assert told == f"{words}; likely causes: {IDLE}"
     assert not failed(worse)
     lost = summary(costs=worse["costs"], diverged={"none": 0, "lqt": 0, "adapted": 1})
-    assert warnings(lost)[0].endswith(" for seed 1; 1 of 4 rollouts diverged")
+    assert " for seed 1; 1 of 4 rollouts diverged; likely" in warnings(lost)[0]
+
+
+def test_fields_that_cost_nothing_without_control_are_nothing_to_control():
+    found = summary(costs={"none": [0.0, 0.0], "lqt": [0.0, 0.0], "adapted": [0.0, 0.0]})
+    (told,) = warnings(found)
+    assert "there is nothing to control" in told and "likely causes" not in told
+
+
+@pytest.mark.parametrize(("adapted", "said"), [(3.9, True), (3.7, False), (4.1, False)])
+def test_a_law_that_saves_next_to_nothing_is_told_with_likely_causes(adapted, said):
+    costs = {"none": [4.0], "lqt": [4.0], "adapted": [adapted]}
+    lines = closing_lines("kdv", summary(seeds=1, changed=[True], costs=costs), "")
+    assert (
+        any("control saves only 2.5 % of the cost without it: actions" in t for t in lines) == said
+    )
+
+
+def test_one_law_that_costs_otherwise_on_the_same_fields_is_a_plant_that_does_not_repeat():
+    costs = {"none": [4.0], "lqt": [2.0], "adapted": [2.1]}
+    kept = summary(seeds=1, changed=[False], costs=costs)
+    assert "one law cost otherwise when it ran again" in warnings(kept)[0]
+    assert warnings(summary(seeds=1, changed=[True], costs=costs)) == []
+    for same in (2.0, 4.0):  # the first law, or no control, from which it started
+        costs["adapted"] = [same]
+        told = warnings(summary(seeds=1, changed=[False], costs=costs))
+        assert not any("one law cost otherwise" in text for text in told)
 
 
 def test_a_law_that_costs_more_than_no_control_has_an_exit_code_of_its_own():
@@ -318,7 +345,9 @@ def test_every_optimiser_that_leaves_rollouts_over_says_so_in_the_results() -> N
     (own,) = summarise(training)["outcome"]
     total, spent = training.budget.total[0], training.budget.paid[0]
     assert spent == total - 1
-    assert own["early"] == f"1 of {total} rollouts were not used: the optimiser asked for no more"
+    assert own["early"] == (
+        f"1 of {total} rollouts was not used: the optimiser asked for no more, as its step takes 2"
+    )
 
 
 def test_the_interval_of_a_difference_has_the_mean_as_often_as_it_says() -> None:
