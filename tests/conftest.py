@@ -215,10 +215,20 @@ def reproduction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     def make(folder: Path) -> tuple[Path, str]:
         with processes(folder) as running:
-            run = running.pdeloop("reproduce", *REPRODUCED, "--out", str(folder / "out"))
+            run = running.pdeloop(
+                "reproduce", *REPRODUCED, "--processes", "1", "--out", str(folder / "out")
+            )
             return folder / "out", running.wait(run, 600.0)
 
     return made_once(tmp_path_factory, "reproduction", make)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have their pages and files, of which PNGs hold no picture: most of what they cost."""
+    from pdeloop.report import page
+
+    monkeypatch.setattr(page, "_draw", lambda figure, png: png.write(b"a picture"))
 
 
 @pytest.fixture(scope="session")

@@ -54,7 +54,7 @@ def finished(request, tmp_path_factory) -> Path:
 
     def make(folder: Path) -> Path:
         out = folder / "run"
-        options = ["--in-process", "--optimizer", optimizer, "--rollouts", "25", "--out", str(out)]
+        options = ["--in-process", "--optimizer", optimizer, "--rollouts", "15", "--out", str(out)]
         assert main(["train", str(SMALL), *options]) == 0
         return out
 
@@ -429,7 +429,7 @@ def test_a_report_stays_in_its_folder(run, capsys):
         assert "parameter 'problem' is '../../../escaped'" in capsys.readouterr().err
 
 
-def test_a_report_follows_no_link(run, tmp_path, capsys):
+def test_a_report_follows_no_link(run, tmp_path, capsys, undrawn):
     victims = tmp_path / "victims"
     victims.mkdir()
     (run / "report").symlink_to(victims)

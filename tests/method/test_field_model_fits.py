@@ -101,10 +101,10 @@ def test_equations_are_recovered(equation, sample_time, steps, kind, error):
     "name, count, error",
     [
         ("AllenCahnInhomogeneous", 5, 1e-2),
-        ("BurgersBetweenWalls", 4, 1e-3),
+        ("BurgersBetweenWalls", 3, 1e-3),
         ("FitzHughNagumo", 3, 1e-3),
         ("CoupledPendulums", 3, 1e-3),
-        ("RandomLinear", 4, 1e-2),
+        ("RandomLinear", 3, 1e-2),
     ],
 )
 def test_plants_that_are_no_periodic_equation_are_recovered(name, count, error):
@@ -139,13 +139,19 @@ def test_a_linear_plant_of_two_fields_is_a_convolution():
     assert fitted.model.kind == "convolution" and fitted.error < 1e-8
 
 
+@cache
+def in_own_units():
+    """The model that the next test compares with."""
+    return fit_field_model(*explored(KortewegDeVriesModes(), 0.01, 10, 2))
+
+
 @settings(max_examples=8, deadline=None)
 @given(st.floats(-6, 6), st.floats(-6, 6))
 def test_units_change_neither_the_kind_nor_the_error(of_states, of_actions):
     rollouts, target = explored(KortewegDeVriesModes(), 0.01, 10, 2)
     size, reach = 10.0**of_states, 10.0**of_actions
     scaled = [Measured(size * r.states, reach * r.actions) for r in rollouts]
-    before, after = fit_field_model(rollouts, target), fit_field_model(scaled, size * target)
+    before, after = in_own_units(), fit_field_model(scaled, size * target)
     assert after.model.kind == before.model.kind
     assert after.error == pytest.approx(before.error, rel=0.5)
 
@@ -187,7 +193,7 @@ def test_saturated_actions_are_known_by_their_limit():
     assert found.error == fit_field_model(limited, target).error
 
 
-@pytest.mark.parametrize("n_z", [5, 9, 33])
+@pytest.mark.parametrize("n_z", [5, 9, 17])
 def test_odd_and_small_states_can_be_fitted(n_z):
     rng = np.random.default_rng(n_z)
     A = 0.9 * np.linalg.qr(rng.normal(size=(n_z, n_z)))[0]

@@ -217,11 +217,16 @@ def test_an_installed_package_offers_plants_by_name(
     ("name", "given", "method"),
     [
         (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
-        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, **FEW_FITS}),
+        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, "identification": "regression", **FEW_FITS}),
     ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(
-    name: str, given: dict[str, Any], method: dict[str, Any], tmp_path: Path, capsys: Any
+    name: str,
+    given: dict[str, Any],
+    method: dict[str, Any],
+    tmp_path: Path,
+    capsys: Any,
+    undrawn: None,
 ) -> None:
     problem = tmp_path / "own.yaml"
     problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given, **method}}}))

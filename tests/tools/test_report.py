@@ -325,7 +325,7 @@ def test_the_page_needs_no_network_and_a_browser_shows_it_without_complaint(fold
 
 
 def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
-    folder, tmp_path, capsys
+    folder, tmp_path, capsys, undrawn
 ):
     """The costs of a law that is not the projected one cannot be computed again.
 
@@ -353,7 +353,7 @@ def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
     assert drawn == {"training-curves", "costs", "small-steps"}
 
 
-def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path):
+def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path, undrawn):
     from pdeloop.cli import main
 
     if not is_run(folder):

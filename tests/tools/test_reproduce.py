@@ -12,7 +12,7 @@ import pytest
 from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
-from pdeloop.finished_run import reduction
+from pdeloop.finished_run import interval, reduction
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import LEARNED, beside_the_paper, reproduction_in, runs_of
 from pdeloop.study.table import beside_no_control, rows
@@ -100,6 +100,23 @@ def test_the_interval_covers_the_truth_as_often_as_it_says():
         low, high = found.mean_interval
         hits += low <= 30.0 <= high
     assert 0.85 <= hits / 200 <= 0.99
+
+
+def test_the_interval_is_that_of_scipy():
+    import scipy.stats
+
+    rng = np.random.default_rng(4)
+
+    def ratio(a, b, axis):
+        return a.mean(axis=axis) / b.mean(axis=axis)
+
+    for n in (2, 5, 12):
+        pair = rng.lognormal(size=n), rng.lognormal(size=n)
+        for samples, statistic in ((pair, ratio), (pair[:1], np.mean)):
+            how = {"paired": True, "method": "percentile", "random_state": np.random.default_rng(0)}
+            expected = scipy.stats.bootstrap(samples, statistic, **how).confidence_interval
+            assert interval(samples, statistic) == (expected.low, expected.high)
+    assert interval((np.ones(1),), np.mean) is None
 
 
 def test_a_reduction_leaves_out_seeds_that_diverged_and_knows_no_interval_of_one():
