@@ -39,10 +39,9 @@ from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
-from pdeloop.training_run import begin, carry_out
+from pdeloop.training_run import begin, carry_out, continuing
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
-from tuner_node.run_folder import resuming
 
 __all__ = ["Problem", "identify", "problem", "train"]
 
@@ -381,7 +380,8 @@ def train(
         try:
             carry_out(folder, values, transport, display, lambda: None)
         except Interruption as reason:
-            raise RuntimeError(f"stopped by {reason}; continue with: {resuming(folder)}") from None
+            again = continuing(folder, values, transport)
+            raise RuntimeError(f"stopped by {reason}; continue with: {again}") from None
         finally:
             display.close()
         return load_run(folder)

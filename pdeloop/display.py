@@ -66,6 +66,8 @@ class Display:
             self.line(text)
         if row.get("event") == "phase" and row["phase"] == "adapt":
             self._progress = Progress(self._console, "  adapting", "rollouts")
+            if self._console.is_terminal:  # the first fit of models may take a minute
+                self._progress.tell(self._narration.done, self._narration.budget)
         if row.get("event") == "adapted" and self._progress is not None:
             known = self._narration
             self._progress.tell(known.done, known.budget, known.status)

@@ -165,6 +165,22 @@ class Transport:
         return prepared({**os.environ, **({NETWORK: "1"} if self.network else {})})
 
     @property
+    def words(self) -> list[str]:
+        """The flags of `pdeloop train` that ask for it.
+
+        >>> Transport(recorder="required", pairs=2).words
+        ['--record-or-stop', '--pairs', '2']
+        """
+        recorder = {"start": "--record", "required": "--record-or-stop"}.get(self.recorder)
+        numbers = {"--record-every": self.record_every, "--pairs": self.pairs}
+        flags = {"--in-process": self.in_process, "--network": self.network, "--view": self.view}
+        return [
+            *([recorder] if recorder else []),
+            *(word for flag, n in numbers.items() if n > 1 for word in (flag, str(n))),
+            *(flag for flag, given in flags.items() if given),
+        ]
+
+    @property
     def recorded(self) -> bool:
         """True if there is a recorder."""
         return self.recorder != "none"

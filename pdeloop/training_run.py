@@ -8,6 +8,7 @@ import importlib.util
 import itertools
 import os
 import re
+import shlex
 import sys
 import threading
 import time
@@ -139,6 +140,14 @@ def check_messages(values: Mapping[str, Any], training: Training) -> None:
         )
 
 
+def continuing(folder: Path, values: Mapping[str, Any], transport: Transport) -> str:
+    """The command that continues a training as it was begun, with the code that its user has named."""
+    words = transport.words
+    for kind in ("equation", "plant", "optimizer", "law"):
+        words += [f"--{kind}", shlex.quote(values[kind])] if ":" in values[kind] else []
+    return " ".join([resuming(folder), *words])
+
+
 def reopen(folder: Path) -> dict[str, Any]:
     """The parameters of the unfinished training in `folder`, which is no longer paused.
 
@@ -170,7 +179,7 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     try:
         # Over topics every node that was started must be known, and every bag finished.
         with interruptible(
-            resuming(folder) + " --in-process" * transport.in_process, at_once=transport.in_process
+            continuing(folder, values, transport), at_once=transport.in_process
         ) as check:
             carry_out(folder, values, transport, display, check)
     except Interruption:
@@ -225,14 +234,14 @@ def _train_here(
             raise
         except OwnCodeError as error:
             raise OwnCodeError(
-                f"{error} (continue with: {resuming(folder)} --in-process)"
+                f"{error} (continue with: {continuing(folder, values, Transport(True))})"
             ) from error
         try:
             writer.finish({"transport": "in-process", "controller": built_in(training)})
         except OSError as error:
             raise RunFolderError(
                 f"cannot write the results to {folder}: {error.strerror}; make room and "
-                f"continue with: {resuming(folder)} --in-process"
+                f"continue with: {continuing(folder, values, Transport(True))}"
             ) from error
 
 

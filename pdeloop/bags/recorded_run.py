@@ -13,7 +13,7 @@ from controller_node.identification import DesignSettings, design_each
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import recorded_values, with_budget
+from loop_interfaces.parameters import PLANT, recorded_values, with_budget
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pdeloop.bags.episodes import RecordedEpisode
@@ -56,6 +56,12 @@ class RecordedRun:
                 "its parameters are not in the bag, so nothing is recomputed (give them with "
                 "--parameters FILE: the parameters.yaml of the run, or the parameters.json that the "
                 "recorder wrote next to its bag)"
+            )
+            return
+        if not any(spec.name in values for spec in PLANT):
+            self._note(
+                "its plant told no parameters, as one that is a node of its own, so nothing is "
+                "recomputed"
             )
             return
         self._given = set(values)

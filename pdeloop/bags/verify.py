@@ -18,7 +18,6 @@ from typing import Any
 from loop_interfaces.documents import parse_json
 from loop_interfaces.files import FileError, read_bounded
 from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.parameters import PLANT
 from loop_interfaces.spec import MAX_YAML_BYTES, ParameterError
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.recorded_run import RecordedRun
@@ -51,7 +50,7 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
             report.episodes += 1
             number = episode.key[1]
             if number not in runs:
-                values = _complete(known.get(number, every))
+                values = known.get(number, every)
                 runs[number] = RecordedRun(number, values, report, bag.target())
             runs[number].episode(episode)
     for number, run in runs.items():
@@ -125,9 +124,3 @@ def _claims_about(
     """The claims about a run; a folder that names no run is about the only one in the bag."""
     found = (c for c in claims if c.run == number or (c.run is None and len(runs) == 1))
     return next(found, None)
-
-
-def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """The parameters of a run, None without those that only its plant can tell."""
-    told = values is not None and any(spec.name in values for spec in PLANT)
-    return values if told else None

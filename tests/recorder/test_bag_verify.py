@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import zstandard
 
+from loop_interfaces.parameters import PLANT
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.mcap_messages import Message, read
 from pdeloop.bags.reader import Bag
@@ -370,6 +371,19 @@ def test_parameters_are_found_in_the_folder_of_the_run(run, messages, tmp_path):
     (note, *_) = verify(tmp_path / "copy").notes
     assert "its parameters are not in the bag" in note and "parameters.yaml of the run" in note
     assert verified(tmp_path / "copy") == 1
+
+
+def test_a_plant_that_told_no_parameters_is_not_to_be_looked_for_in_a_file(run, messages):
+    """As of a node of its own: those of controller and tuner are there."""
+    without_notes(run, messages)
+    (run / "parameters.yaml").unlink()
+    path = run / "bag" / "parameters.json"
+    known = json.loads(path.read_text())
+    plant = {spec.name for spec in PLANT}
+    kept = {run: {k: v for k, v in own.items() if k not in plant} for run, own in known.items()}
+    path.write_text(json.dumps(kept))
+    (note, *_) = verify(run / "bag").notes
+    assert "its plant told no parameters" in note and "--parameters" not in note
 
 
 @pytest.mark.parametrize("given", ["parameters.yaml", "parameters.json"])

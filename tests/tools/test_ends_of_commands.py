@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,11 +17,12 @@ import pytest
 
 from loop_interfaces.start import PARENT, die_with
 from pdeloop import cli, training_run
-from pdeloop.cli import main
+from pdeloop.cli import main, parser
 from pdeloop.commands import problems
 from pdeloop.interruption import Interruption, interruptible
 from pdeloop.pairs import Transport
 from pdeloop.supervisor import START
+from pdeloop.training_run import continuing
 from tests.support.interpreter import ROOT, python
 from tests.support.small import SMALL
 from tests.support.terminal import LIMIT, PDELOOP
@@ -201,3 +203,26 @@ def test_too_little_memory_is_one_sentence(monkeypatch, capsys) -> None:
     monkeypatch.setattr(problems, "shipped_problems", large)
     assert main(["problems"]) == 1
     assert capsys.readouterr().err.startswith("pdeloop: not enough memory (Unable to allocate 61.0")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--in-process", "--plant", "a folder/own.py:Rod"],
+        ["--record", "--record-every", "3", "--pairs", "2", "--network", "--view"],
+        ["--record-or-stop", "--optimizer", "own.py:Search", "--law", "own.py:Law"],
+        [],
+    ],
+)
+def test_the_command_that_continues_a_training_is_whole(words: list[str]) -> None:
+    """With all that says how it is carried out, and the code that its user has named."""
+    given = parser().parse_args(["train", *words])
+    recorder = "required" if given.record_or_stop else "start" if given.record else "none"
+    transport = Transport(
+        given.in_process, recorder, given.record_every, given.network, given.pairs, given.view
+    )
+    values = {"equation": "burgers", "plant": "", "optimizer": "two_point", "law": "affine"}
+    values |= {name: vars(given)[name] for name in values if vars(given)[name]}
+    _, *again = shlex.split(continuing(Path("a run"), values, transport))
+    found = vars(parser().parse_args(again)) | {"refuse": given.refuse}  # of its own parser
+    assert found == vars(given) | {"resume": Path("a run")}

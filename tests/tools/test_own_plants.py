@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -299,7 +300,7 @@ BREAKS = OWN.replace(
 
 
 def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
-    own: Path, tmp_path: Path, capsys: Any
+    own: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own.write_text(BREAKS)
     run = tmp_path / "run"
@@ -307,7 +308,11 @@ def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
     assert main(["train", "--plant", name, *BUDGET[:4], "--in-process", "--out", str(run)]) == 1
     told = capsys.readouterr().err.splitlines()[-1]
     assert f"Rod.step fails: {own}, line 19: RuntimeError: no licence" in told
-    assert f"continue with: pdeloop train --resume {run} --in-process" in told
+    told, _, again = told.removesuffix(")").partition("continue with: pdeloop ")
+    assert again == f"train --resume {run} --in-process --plant {name}"
+    monkeypatch.delenv("PDELOOP_PLANTS")  # as in the next process
+    assert main(shlex.split(again)) == 1
+    assert "RuntimeError: no licence" in capsys.readouterr().err.splitlines()[-1]
     assert (run / "parameters.yaml").exists()
 
 

@@ -28,7 +28,7 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
     assert re.search(
-        r"adapting [━╺╸]+ +\d+ of 803 rollouts cost [\d.]+ +\d:\d\d:\d\d", shown.plain
+        r"adapting [━╺╸]+ +\d+ of 803 rollouts cost [\d.]+ +\d:\d\d:\d\d left", shown.plain
     ), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
@@ -112,7 +112,7 @@ def test_progress_on_a_terminal_is_a_bar_that_leaves_nothing() -> None:
     progress.tell(4, 8, "3 faults")
     progress.close()
     text = CONTROL.sub("", file.getvalue())
-    assert re.search(r"soak [━╺]+ +4 of 8 episodes 3 faults", text)
+    assert re.search(r"soak [━╺╸]+ +4 of 8 episodes 3 faults 0:00:00 left", text)
     assert file.getvalue().rstrip().endswith("\x1b[2K")
 
 
