@@ -18,7 +18,7 @@ from tests.simulation.history import History
 from tests.simulation.plan import KINDS, Fault, Plan, aimed, draw
 from tests.simulation.planted import BUGS, OPEN, found, planted
 
-SEEDS = 100
+SEEDS = 60
 
 
 def test_a_training_with_faults_ends_with_the_same_bits_or_names_the_cause():

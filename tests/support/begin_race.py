@@ -1,12 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Two processes that begin a training in one folder, in every order of what they write.
 
-`python -m tests.support.begin_race FOLDER [HOW]` forks two processes, A and B, for all n and m: A is
+`python -m tests.support.begin_race FOLDER` forks two processes, A and B, for all n and m: A is
 let up to its n-th call that changes the folder or locks it, then B up to its m-th, then A to its end,
 then B. It prints a line of JSON: how many orders there were, and a sentence for each after which the
 folder does not tell of one training, that of the one process that was let begin.
 
-HOW: `run` begins as a tuner does, `create` as the command line does, which starts a tuner afterwards.
+It does so for each way to begin: `run` begins as a tuner does, `create` as the command line does, which
+starts a tuner afterwards.
 """
 
 from __future__ import annotations
@@ -124,14 +125,19 @@ def judged(folder: Path, codes: tuple[int, int]) -> str:
     return ""
 
 
-def run(place: Path, how: str) -> dict[str, Any]:
-    """Every order."""
+def run(place: Path) -> dict[str, dict[str, Any]]:
+    """Every order of every way to begin."""
     VALUES.update(parameters())
     # What each of them loads, those that are forked find there.
     with ExitStack() as locks:
         first = {**VALUES, "out": str(place / "first"), "resume": False}
         open_run(first, build_training(first), locks, print)
     gc.freeze()  # what a fork touches is copied
+    return {how: every_order(place, how) for how in ("run", "create")}
+
+
+def every_order(place: Path, how: str) -> dict[str, Any]:
+    """Every order of one way to begin."""
     wrong, orders, n, last = [], 0, 0, False
     while not last:
         m, ended = 0, False
@@ -155,4 +161,4 @@ def run(place: Path, how: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(Path(sys.argv[1]), sys.argv[2])))
+    print(json.dumps(run(Path(sys.argv[1]))))

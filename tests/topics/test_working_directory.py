@@ -57,7 +57,7 @@ WORDS: dict[str, tuple[str, ...]] = {
         "1",
     ),
     "report": ("report", "run"),
-    "animate": ("animate", "run", "--out", "run.gif", "--seconds", "1"),
+    "animate": ("animate", "run", "--out", "run.gif", "--seconds", "0.1"),
     "compare": ("compare", "run", "run"),
     "export": ("export", "run", "--out", "law.npz"),
     "study": ("study", "study.yaml", "--out", "study"),
