@@ -46,12 +46,15 @@ class Narration:
     def status(self) -> str:
         """The newest cost of the policies that are being adapted."""
         costs = list(self._costs.values())
+        if not costs:
+            return ""
         return f"cost {_spread(costs)}" if any(cost is not None for cost in costs) else "diverged"
 
     @property
     def progress(self) -> str:
         """The progress of the adaptation."""
-        return f"  {self.done} of {self.budget} rollouts: {self.status}"
+        status = self.status
+        return f"  {self.done} of {self.budget} rollouts" + (status and f": {status}")
 
     def lines(self, row: Row) -> list[str]:
         """The lines to print for this row."""
@@ -72,7 +75,10 @@ class Narration:
         elif event == "adapted":
             seed = row["seed"] - self._seed
             self._rollouts[seed] = row["rollouts"]
-            self._costs[seed] = row.get("cost")
+            if "cost" in row or row.get(
+                "diverged"
+            ):  # an optimiser of a user's own may tell neither
+                self._costs[seed] = row.get("cost")
         elif event == "excitation":
             lines.append(f"  seed {row['seed']}: {row['remark']}")
         elif event == "diverged":

@@ -55,8 +55,9 @@ def no_model(settings: TrainingSettings, steps: Sequence[int], *, paid_up: bool)
     if len(steps) > 1 and steps[-1] <= steps[0]:
         shorter = f"set a horizon of {min(steps)} steps or fewer, " if min(steps) else ""
         return (
-            f"{told}weaker inputs did not delay it, as where it diverges without control: {shorter}"
-            "raise divergence_bound, or begin nearer to the target"
+            f"{told}weaker inputs did not delay it: if it diverges without control, which `pdeloop "
+            f"check` tells, {shorter}raise divergence_bound, or begin nearer to the target; else lower "
+            "exploration_variance by more"
         )
     noise = ", or measurement_noise, which raises it" if settings.measurement_noise else ""
     return (

@@ -145,7 +145,8 @@ class StepOptimizer(Optimizer):
         Returns
         -------
         dict
-            The row of `update`, with the numbers of rollouts and of divergences.
+            The row of `update`, with the numbers of rollouts and of divergences, and where it has no
+            `cost` the mean cost of the step's rollouts that did not diverge.
 
         Raises
         ------
@@ -157,6 +158,8 @@ class StepOptimizer(Optimizer):
             "rollouts": (self._tells + 1) * self.step_rollouts,
             "diverged": sum(not result.usable for result in results),
         }
+        if usable := [result.cost for result in results if result.usable]:
+            row["cost"] = float(np.mean(usable))
         found = self.update(results)
         if not isinstance(found, Mapping):
             kind = type(found).__name__

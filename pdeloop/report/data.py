@@ -26,6 +26,7 @@ from pdeloop.finished_run import FinishedRun, field_means, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
+from pdeloop.study.run import STUDY_FILE
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolderError
@@ -147,6 +148,11 @@ def gather(folder: Path) -> ReportData:
         return ReportData(folder, problems, study)
     if (folder / "parameters.yaml").exists():
         return ReportData(folder, [of_run(load_run(folder))])
+    if (folder / STUDY_FILE).exists():
+        raise RunFolderError(
+            f"{folder} holds a study, whose table and figure are its table.json and costs.png; report "
+            f"one of its runs, {folder}/PROBLEM/VARIANT/SEED"
+        )
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.problem import find_problem
+from loop_interfaces.problem import code_from, find_problem
 from loop_interfaces.text import shown
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
@@ -102,6 +102,8 @@ class Study:
                 "the settings or a variant have 'seed' or 'seeds'; leave them out, and give 'seeds' "
                 "next to 'problems'"
             )
+        settings = _beside(settings, folder)
+        variants = {name: _beside(table, folder) for name, table in variants.items()}
         files = {}
         for word in problems:
             beside = folder / word
@@ -148,3 +150,13 @@ class Study:
                 for seed in self.seeds:
                     found[f"{problem}/{variant}/{seed}"] = {**values, "seed": seed}
         return found
+
+
+def _beside(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Parameters of which those that name code in a relative file name it from the study's folder."""
+    code = {
+        word: code_from(folder.resolve(), table[word])
+        for word in ("equation", "plant", "optimizer", "law")
+        if isinstance(table.get(word), str)
+    }
+    return {**table, **code}

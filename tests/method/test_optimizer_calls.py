@@ -46,6 +46,17 @@ def test_rollouts_and_reports_go_through_as_they_are() -> None:
     assert calls.tell(Own(update=lambda: {"own": 2.0}), [RolloutResult(1.0)])["own"] == 2.0
 
 
+def test_the_row_of_a_step_has_the_mean_cost_of_what_did_not_diverge_unless_told() -> None:
+    class Two(Own):
+        step_rollouts = 2
+
+    good, lost = RolloutResult(3.0), RolloutResult(1e9, diverged=True)
+    assert Two().tell([good, RolloutResult(1.0)])["cost"] == 2.0
+    assert Two().tell([good, lost])["cost"] == 3.0
+    assert "cost" not in Two().tell([lost, lost])
+    assert Two(update=lambda: {"cost": 7.0}).tell([good, good])["cost"] == 7.0
+
+
 @pytest.mark.parametrize(
     ("optimizer", "words"),
     [

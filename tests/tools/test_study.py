@@ -253,6 +253,25 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert not (tmp_path / "new").exists()
 
 
+def test_a_report_of_a_study_points_to_its_table_and_its_runs(reference: Path, capsys: Any):
+    assert main(["report", str(reference)]) == 1
+    told = capsys.readouterr().err
+    assert "table.json" in told and f"{reference}/PROBLEM/VARIANT/SEED" in told
+
+
+def test_code_that_a_study_names_lies_beside_it_not_beside_its_problems(tmp_path: Path):
+    """One is shipped, the other in a folder of its own."""
+    (tmp_path / "problems").mkdir()
+    (tmp_path / "problems" / "own.yaml").write_text(SMALL.read_text().replace("small", "own"))
+    variants = {"search": {"optimizer": "search.py:Search"}, "law": {"law": "/abs/law.py:Law"}}
+    given = {"problems": ["kdv", "problems/own.yaml"], "seeds": 1, "variants": variants}
+    study = Study.of({**given, "settings": {"plant": "", "equation": "burgers"}}, tmp_path)
+    assert study.variants["search"]["optimizer"] == f"{tmp_path}/search.py:Search"
+    assert study.variants["law"]["law"] == "/abs/law.py:Law"
+    assert study.settings["equation"] == "burgers"
+    assert Study.of(study.content()).variants == study.variants
+
+
 def test_the_command_takes_an_own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PDELOOP_EQUATIONS", "")  # to be as it was after the test
     monkeypatch.chdir(tmp_path)

@@ -152,6 +152,15 @@ def test_a_plant_that_costs_nothing_without_control_has_no_share_of_that():
     assert "adaptation 1.5" in closing_lines("kdv", summary(costs=costs), "")[3]
 
 
+def test_an_optimiser_that_tells_no_cost_has_not_diverged():
+    narration = Narration(3, 1)
+    narration.lines({"event": "phase", "phase": "adapt", "rollouts": [3], "budget": [20]})
+    narration.lines({"event": "adapted", "seed": 3, "rollouts": 5})
+    assert narration.progress == "  5 of 20 rollouts"
+    narration.lines(adapted(3, 7, None))
+    assert narration.progress == "  7 of 20 rollouts: diverged"
+
+
 def test_what_adapted_nothing_is_no_gain():
     lines = closing_lines("kdv", summary(changed=[False, False]), "")
     assert not any("LQT;" in line or "% below" in line for line in lines)
