@@ -251,10 +251,22 @@ def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -
     return kind(start, seed=0, rollouts=rollouts, settings=settings, context=context)
 
 
+@cache
+def _told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
+    own = optimiser(**given)
+    results = [measured(asked) for asked in own.ask()]
+    return own, results, dict(own.tell(results))
+
+
+def told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
+    """A copy of an optimiser after its first rollouts, these, and its row: most of what it does."""
+    return copy.deepcopy(_told(**given))
+
+
 def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -> None:
-    first, later = optimiser(), optimiser()
-    assert len(first.ask()) == 1
-    row = first.tell([measured(asked) for asked in first.ask()])
+    later = optimiser()
+    assert len(later.ask()) == 1
+    first, _, row = told()
     assert row["model"] == "sensed" and float(row["predicted_change"]) < 0.0
     later.restore(first.state())
     rows = []
@@ -268,8 +280,7 @@ def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -
 
 def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
     """An equation that reproduces the readings may be wrong between them."""
-    before = optimiser()
-    before.tell([measured(asked) for asked in before.ask()])
+    before, *_ = told()
     own, costs = optimiser(rollouts=7, judging=3, first=before.policy), {}
     for number in range(100):
         asked = own.ask()
@@ -293,8 +304,7 @@ def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
 
 def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields() -> None:
     """The first law does nothing either."""
-    own = optimiser(rollouts=7, judging=3)
-    own.tell([measured(each) for each in own.ask()])
+    own, *_ = told(rollouts=7, judging=3)
     asked = own.ask()
     assert not own._progress.safe and asked and not any(each.policy.any() for each in asked)
     own.tell([measured(each) for each in asked])
@@ -305,10 +315,7 @@ def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields
 
 def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
     """Of three pairs chance explains the difference, of all of its rollouts it does not."""
-    own, row = optimiser(rollouts=7, judging=3), {}
-    asked = own.ask()
-    result = measured(asked[0])
-    own.tell([result, *map(measured, asked[1:])])
+    own, (result, *_), row = told(rollouts=7, judging=3)
     assert not own._progress.safe
     final, checked = own._progress.policy, [70.0, np.inf]  # before, and in an exploration
     few = np.zeros((1, SENSORS)), np.zeros((0, N_A))
@@ -325,8 +332,7 @@ def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
 
 
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
-    better = optimiser()
-    better.tell([measured(asked) for asked in better.ask()])
+    better, *_ = told()
     own = optimiser(rollouts=7, judging=3, first=better.policy)
     own.tell([measured(asked) for asked in own.ask()])
     before, final = own._first + 1e-6, own._first + 2e-6
