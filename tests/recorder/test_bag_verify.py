@@ -56,9 +56,14 @@ def run(original: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "run"))
 
 
+@pytest.fixture(scope="module")
+def original_messages(original: Path) -> tuple[Message, ...]:
+    return tuple(messages_of(original / "bag"))
+
+
 @pytest.fixture
-def messages(original: Path) -> list[Message]:
-    return messages_of(original / "bag")
+def messages(original_messages: tuple[Message, ...]) -> list[Message]:
+    return list(original_messages)
 
 
 def by_episodes(messages: list[Message], *ends: int) -> list[list[Message]]:
@@ -72,12 +77,21 @@ def by_episodes(messages: list[Message], *ends: int) -> list[list[Message]]:
     return parts
 
 
-@pytest.fixture
-def split(original: Path, messages: list[Message], tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def in_three(
+    original: Path, original_messages: tuple[Message, ...], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The bag in three files: episodes 1 and 2, 3 and 4, and the others."""
-    folder = write(tmp_path / "split", by_episodes(messages, 2, 4))
+    folder = write(
+        tmp_path_factory.mktemp("in-three") / "bag", by_episodes(list(original_messages), 2, 4)
+    )
     shutil.copy(original / "bag" / "parameters.json", folder)
     return folder
+
+
+@pytest.fixture
+def split(in_three: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(in_three, tmp_path / "split"))
 
 
 def words_of(report: Report) -> str:

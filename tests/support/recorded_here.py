@@ -13,6 +13,7 @@ import yaml
 
 from controller_node.identification import design_each
 from loop_interfaces.arrays import Array
+from loop_interfaces.documents import parse_yaml
 from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import (
@@ -145,7 +146,7 @@ def write(folder: Path, parts: Sequence[Sequence[Message]]) -> Path:
         name = FILE if len(parts) == 1 else f"bag_{number}.mcap"
         (folder / "part" / FILE).rename(folder / name)
         text = (folder / "part" / METADATA).read_text()
-        told.append(yaml.safe_load(text)["rosbag2_bagfile_information"])
+        told.append(parse_yaml(text.encode())["rosbag2_bagfile_information"])
         told[-1]["files"][0]["path"] = name
         told[-1]["relative_file_paths"] = [name]
         (folder / "part" / METADATA).unlink()
@@ -178,7 +179,7 @@ def _together(told: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = yaml.safe_load((folder / METADATA).read_text())
+    content: dict[str, Any] = parse_yaml((folder / METADATA).read_bytes())
     return dict(content["rosbag2_bagfile_information"])
 
 
