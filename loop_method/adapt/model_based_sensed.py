@@ -89,19 +89,15 @@ class ModelBasedSensed(ModelBasedReadings):
             super()._improve(belief, row, final)
             return
         loop, fields = sensed_loop(self._context, belief.model), self._fields()
-        progress, settings, number = self._progress, self._settings, self._records.count
-        drawn, others = (
-            mixtures(
-                fields,
-                settings.mixtures,
-                np.random.default_rng([self._seed, DRAWN_STREAM, number, which]),
-                periodic=self._context.periodic,
-            )
-            for which in range(2)
-        )
+        progress, settings = self._progress, self._settings
+        sets = 1
+        if final:  # a law with memory has many parameters, and simulations cost no rollout
+            sets, iterations = settings.observer_draws, settings.observer_iterations
+            settings = replace(settings, iterations=iterations, least_gain=settings.observer_gain)
+        drawn, others = (self._drawn(fields, sets, which) for which in range(2))
         every, weights = weighted(fields, drawn, settings.measured_share)
         laws = [loop.theta(progress.policy)]
-        whole = whole_field_law(loop, every, weights, settings)
+        whole = whole_field_law(loop, every, weights, self._settings)
         laws += [] if whole is None else compensators(loop, whole)
         start = cheapest(loop, laws, every, weights)
         gain = settings.least_gain if final else settings.first_gain
@@ -122,6 +118,13 @@ class ModelBasedSensed(ModelBasedReadings):
         row["steps"] = found.steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
+
+    def _drawn(self, fields: Array, sets: int, which: int) -> Array:
+        """Draws from the distribution of the fields, as often as there are sets."""
+        rng = np.random.default_rng([self._seed, DRAWN_STREAM, self._records.count, which])
+        most, periodic = self._settings.mixtures, self._context.periodic
+        drawn = [mixtures(fields, most, rng, periodic=periodic) for _ in range(sets)]
+        return np.concatenate(drawn)
 
     def ask(self) -> list[Rollout]:
         """No control where it may stay, and the final law on the fields of the one that may stay."""

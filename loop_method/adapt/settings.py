@@ -145,6 +145,16 @@ class ModelBasedSettings(ImprovementSettings):
     enough_fields: int = setting(
         48, "number of measured fields at which improvements stop", 2, 1_000_000
     )
+    observer_iterations: int = setting(
+        400,
+        "as iterations, for the last improvement of the law observer on a model of the field",
+        1,
+        10_000,
+    )
+    observer_gain: float = setting(3e-4, "as least_gain, likewise", 0.0, 1.0)
+    observer_draws: int = setting(
+        2, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
+    )
     readings_trust: float = setting(
         1.0,
         "weight of the distance from the start of a step on a model of readings; for a linear "
