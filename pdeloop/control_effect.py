@@ -7,9 +7,14 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 
 LITTLE = 0.02
 """Share of the cost without control; a law that changes it by less does next to nothing."""
+SMALL = 1e-6
+"""Size of actions, relative to the explored ones, within any bounds."""
+SOME_BEYOND, MOST_BEYOND = 0.05, 0.5
+"""Shares of the exploratory actions beyond the bounds that are worth a note, and too many."""
 
 
 def idle_actuators(plant: Plant, states: Array, actions: Array) -> list[int]:
@@ -22,6 +27,24 @@ def idle_actuators(plant: Plant, states: Array, actions: Array) -> list[int]:
         if np.array_equal(plant.evaluate(states, alone)[0], still):
             idle.append(j)
     return idle
+
+
+def beyond_bounds(plant: Plant, actions: Array) -> tuple[bool, str]:
+    """Whether bounds of a user's actuators change few of the actions (N, n_a), and how many, in words.
+
+    Empty where next to none are. What bounds do to small actions too, such as to take away the mean,
+    models know.
+    """
+    if not isinstance(plant, DynamicsPlant):
+        return True, ""
+    linear = plant.applied(SMALL * actions) / SMALL
+    changed = ~np.isclose(plant.applied(actions), linear, rtol=1e-6, atol=1e-9)
+    share = float(changed.any(axis=1).mean())
+    told = (
+        f"{100 * share:.0f} % of the exploratory actions are beyond the actuators' bounds, which "
+        "models do not know: lower exploration_variance"
+    )
+    return share <= MOST_BEYOND, told if share > SOME_BEYOND else ""
 
 
 def judged(none: float, law: float) -> tuple[bool, str]:

@@ -23,7 +23,7 @@ from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
-from pdeloop.control_effect import idle_actuators, judged
+from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from tuner_node.build import build_training
 
@@ -100,6 +100,9 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
             f"{_variance(values):.3g} diverge, the first at step {diverged.min()}: {remedy}",
         )
         return
+    few, told = beyond_bounds(plant, explored.actions.reshape(-1, plant.n_a))
+    if told:
+        yield Finding("bounds", few, told, note=few)
     yield from _identification(values)
 
 

@@ -123,7 +123,8 @@ class TunerNode:
         if self._session.stopped:
             self._log.info("stopped on request")
             return STOPPED
-        self._log.info(f"stopped by {reason} before the end")
+        again = "; continue with -p resume:=true" if self._writer else ""
+        self._log.info(f"stopped by {reason} before the end{again}")
         return 130
 
     def join(self, node: Node, loop: NodeLoop) -> None:

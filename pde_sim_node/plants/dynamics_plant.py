@@ -170,7 +170,7 @@ class DynamicsPlant(BatchPlant):
         if not alive.size:
             return
         states, totals = self.states[alive], self.totals[alive]
-        self.actions[alive] = held = self._held(self.actions[alive])
+        self.actions[alive] = held = self.applied(self.actions[alive])
         lost = self._advanced(states, held, totals, self.step_index)
         if self.step_index + 1 == self.horizon:
             self.cost.add_terminal(totals, states)
@@ -179,11 +179,11 @@ class DynamicsPlant(BatchPlant):
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
         costs = np.zeros(len(states))
-        self._advanced(states, self._held(actions), costs, 0)
+        self._advanced(states, self.applied(actions), costs, 0)
         return costs
 
-    def _held(self, actions: Array) -> Array:
-        """The actions within the limits of the actuators, (M, n_a)."""
+    def applied(self, actions: Array) -> Array:
+        """The actions that actuators apply for requested ones (M, n_a)."""
         if type(self.dynamics).actuated is Dynamics.actuated:
             return actions if self.allowed.everything else self.allowed.project(actions)
         taken = [float_array("it", self._call("actuated", a.copy())) for a in actions]

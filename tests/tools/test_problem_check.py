@@ -246,6 +246,25 @@ def test_inputs_without_effect_are_named() -> None:
     assert not good and text.startswith("no action moves the state")
 
 
+class Bounded(Around):
+    """The same with bounds of a third of the exploration's standard deviation, and without a mean."""
+
+    action_low, action_high, zero_mean = -0.1, 0.1, True
+
+
+class Balanced(Around):
+    """The same, whose actions have no mean, which a model of them knows."""
+
+    zero_mean = True
+
+
+def test_an_exploration_beyond_the_bounds_of_the_actuators_is_told() -> None:
+    good, text = findings_of(Bounded())["bounds"]
+    share = float(re.match(r"[\d.]+", text)[0])
+    assert not good and 90 < share <= 100 and text.endswith("lower exploration_variance")
+    assert "bounds" not in findings_of(Balanced()) and "bounds" not in findings_of(Around())
+
+
 def test_a_law_that_does_next_to_nothing_is_not_a_matter_of_the_order() -> None:
     text = findings_of(Dear())["first law"][1]
     assert "lower action_weight" in text and "another order" not in text
