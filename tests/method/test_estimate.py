@@ -31,7 +31,7 @@ def upper(rate: float, draws: int = DRAWS) -> float:
     return rate + 4.0 * float(np.sqrt(rate * (1.0 - rate) / draws))
 
 
-@pytest.mark.parametrize("pairs", range(2, 9))
+@pytest.mark.parametrize("pairs", [2, 3, 5, 8])
 @pytest.mark.parametrize("confidence", [1.0, 2.0])
 def test_pairs_without_a_difference_are_taken_for_one_at_the_level_however_few(
     pairs: int, confidence: float
@@ -137,7 +137,7 @@ def test_no_control_that_diverged_loses_and_so_does_a_law() -> None:
     assert kept.chosen == NONE and kept.reason == "a rollout of the adapted law diverged"
 
 
-@pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 3), (3, 12), (2, 40), (8, 8)])
+@pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 12), (2, 40), (8, 8)])
 @pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
 def test_laws_of_one_cost_on_different_fields_are_told_apart_no_more_often_than_the_level(
     own: int, others: int, ratio: float

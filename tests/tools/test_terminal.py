@@ -23,12 +23,12 @@ from tests.support.terminal import COLOUR, CONTROL, LIMIT, PDELOOP, run, termina
 
 @pytest.mark.parametrize("colour", [True, False])
 def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: bool) -> None:
-    words = ("train", str(SMALL), "--in-process", "--iterations", "400", "--out", "run")
+    words = ("train", str(SMALL), "--in-process", "--iterations", "200", "--out", "run")
     environment = {"PYTHONPATH": str(ROOT)} | ({} if colour else {"NO_COLOR": "1"})
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
     assert re.search(
-        r"adapting [━╺╸]+ +\d+ of 803 rollouts cost [\d.]+ +\d:\d\d:\d\d left", shown.plain
+        r"adapting [━╺╸]+ +\d+ of 403 rollouts cost [\d.]+ +\d:\d\d:\d\d left", shown.plain
     ), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
