@@ -18,7 +18,7 @@ from pdeloop.episode import rollout
 from tests.support.sensed import SENSORS
 
 FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=8, sensed_last_iterations=20)
-T = 24
+T = 16
 
 
 def test_narrow_actuators_are_not_taken_for_unequal_ones() -> None:
