@@ -98,7 +98,7 @@ class ModelBasedSensed(ModelBasedReadings):
         every, weights = weighted(fields, drawn, settings.measured_share)
         laws = [loop.theta(progress.policy)]
         whole = whole_field_law(loop, every, weights, self._settings)
-        laws += [] if whole is None else compensators(loop, whole)
+        laws += [] if whole is None else compensators(loop, whole, settings if final else None)
         start = cheapest(loop, laws, every, weights)
         gain = settings.least_gain if final else settings.first_gain
         found = improve(loop, start, every, weights, curvature_of(loop), settings, gain)

@@ -12,6 +12,10 @@ a share of the initial second moment per step, because a steady filter does not 
 begins; v is the noise plus the part of a reading that the modes do not represent. A linearisation at
 the target would have unstable modes in directions that no field takes.
 
+Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So the
+law is also mixed with the best law of the newest readings, a = D y + b, found by a descent on the model
+from the regression of the actions on the readings.
+
 The law starts with p_0 = U^T y_0. The compensator's coordinates are those in which this is the best
 linear estimate of x_0 from the first readings.
 
@@ -25,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy import linalg
@@ -113,11 +118,13 @@ def whole_field_law(
     return WholeFieldLaw(whole, found.theta, simulation.of_fields(known), share)
 
 
-def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
+def compensators(
+    loop: SensedLoop, law: WholeFieldLaw, settings: ModelBasedSettings | None = None
+) -> Iterator[Array]:
     """Theta (`ObservedLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
 
-    One for each of `SHARES` and `ESTIMATED`: where few readings tell little of a nonlinear plant, a law
-    on the filter's estimate alone may run away.
+    One for each of `SHARES` and `ESTIMATED`. settings: of the descent to the law of newest readings,
+    which without them is the regression's.
     """
     model = loop.model
     assert isinstance(model, SensedModel)
@@ -140,6 +147,8 @@ def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
     guess = linalg.solve(seen, y[0].T @ (law.weights[:, None] * x[0]), assume_a="pos").T
     read = np.column_stack([y[:-1].reshape(-1, model.sensors), np.ones(weights.size)])
     D, own, _ = _regression(read, a.reshape(weights.size, -1), weights, np.append(noise, 0.0))
+    if settings is not None:
+        D, own = _of_readings(loop, D, own, z[0], law.weights, settings)
     K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
     for share in SHARES:
         try:
@@ -153,6 +162,40 @@ def compensators(loop: SensedLoop, law: WholeFieldLaw) -> Iterator[Array]:
             rest = (1.0 - part) * D, (1.0 - part) * own
             mixed = rows[0], rows[1] + rest[0], rows[2] + rest[1]
             yield law_theta(loop, B, guess, mixed, after)
+
+
+class _WithOffset(ClosedLoop):
+    """A loop whose law has an offset of its own, whatever the target is."""
+
+    constant_feature: ClassVar[float] = 1.0
+
+
+def _of_readings(
+    loop: SensedLoop,
+    D: Array,
+    own: Array,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+) -> tuple[Array, Array]:
+    """The law a = D y + b of the newest readings of least cost on the model, from one to begin with."""
+    model = loop.model
+    assert isinstance(model, SensedModel)
+    static = _WithOffset(
+        model.at_sensors(np.eye(model.sensors)),
+        loop.target,
+        loop.state_weight,
+        loop.action_weight,
+        loop.horizon,
+        loop.action_limit,
+        model=model,
+        noise=loop.noise,
+    )
+    theta = np.column_stack([D, own])
+    found = improve(static, theta, fields, weights, curvature_of(static), settings)
+    if found is not None:
+        theta = found.theta
+    return theta[:, :-1], theta[:, -1]
 
 
 def _regression(

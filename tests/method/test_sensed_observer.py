@@ -183,11 +183,28 @@ def test_the_designed_law_is_near_to_that_of_the_whole_field(shared: Array) -> N
     whole = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
     assert whole is not None
     best = float(whole.simulation.costs.mean())
-    law = cheapest(loop, list(compensators(loop, whole)), every, weights)
+    law = cheapest(loop, list(compensators(loop, whole, ModelBasedSettings())), every, weights)
     none = float(loop.costs(loop.no_control, every).mean())
     own = float(loop.costs(law, every).mean())
     assert best < 0.9 * none
     assert own - best < 0.25 * (none - best)
+
+
+def test_the_designed_law_of_the_newest_readings_is_an_optimum_of_their_gains() -> None:
+    model = model_with(CUBIC, 0.3)
+    loop = loop_of(model)
+    fields = np.stack([field(model, seed) for seed in range(4)])
+    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
+    whole = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
+    assert whole is not None
+    static = list(compensators(loop, whole, ModelBasedSettings(least_gain=1e-5)))[2]
+    n_s, cost = len(loop.law.model.A), float(loop.costs(static, every) @ weights)
+    assert not static[:N_A, n_s : 2 * n_s].any()  # of no estimate
+    for scale, offset in ((0.8, 0.0), (1.2, 0.0), (1.0, 0.1), (1.0, -0.1)):
+        other = static.copy()
+        other[:N_A, :n_s] *= scale
+        other[:N_A, -1] += offset
+        assert float(loop.costs(other, every) @ weights) > cost
 
 
 def test_the_model_survives_a_checkpoint() -> None:
@@ -244,7 +261,7 @@ def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -
     _, context = small()
     kind = ModelBased.for_context(context)
     assert kind is ModelBasedSensed
-    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=judging)
+    settings = ModelBasedSettings(iterations=5, observer_iterations=5, mixtures=2, judging=judging)
     law = context.law
     assert law is not None
     start = law.theta_start if first is None else first
