@@ -87,7 +87,7 @@ IDENTIFICATION = Spec(
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
     "control law: a shipped or installed name, or code that the user must allow, 'file.py:Class' "
-    "or 'module:Class'; the default of model_based is observer where few sensors measure with noise"
+    "or 'module:Class'; the default of model_based is observer with few sensors"
 )
 
 PROBLEM = _section(

@@ -75,8 +75,8 @@ def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
     few = (
         0 < _number(given, "sensors") < _number({POINTS.name: POINTS.default, **given}, POINTS.name)
     )
-    if few and kind.with_noisy_sensors and _number(given, "measurement_noise") > 0:
-        preferences[LAW.name] = kind.with_noisy_sensors
+    if few and kind.law_of_sensors and _number(given, "sensor_delays") <= 1:
+        preferences[LAW.name] = kind.law_of_sensors
     readings = law_of({**preferences, **given}).from_readings
     if few and readings:
         preferences["identification"] = readings

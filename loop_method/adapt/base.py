@@ -247,8 +247,8 @@ class Optimizer(Protocol):
     """Rollouts of an exploration, from as many initial fields."""
     with_sensors: ClassVar[str] = ""
     """The optimiser used instead when the state is that of few sensors; empty: none."""
-    with_noisy_sensors: ClassVar[str] = ""
-    """The law preferred where few sensors measure with noise; empty: as without."""
+    law_of_sensors: ClassVar[str] = ""
+    """The law preferred where the state is that of few sensors; empty: as without."""
     iteration_rollouts: ClassVar[int] = 0
     """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
     preferences: ClassVar[Mapping[str, Any]] = {}
