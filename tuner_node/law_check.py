@@ -45,8 +45,8 @@ def check_law(
         if action_limit > 0.0:
             expected = np.clip(expected, -action_limit, action_limit)
         scale = np.maximum.accumulate(np.abs(actions).max(axis=1, initial=1.0))  # so far
-        allowed = (allowed + TOLERANCE * scale)[:, None] + TOLERANCE * np.abs(expected)
-        if not (np.abs(actions - expected) <= allowed).all():
+        allowed += TOLERANCE * scale
+        if not (np.abs(actions - expected) <= allowed[:, None]).all():
             words = AFFINE if law.compiled else f"'{law.name}'"
             raise ValueError(
                 f"the actions are not those of the law {words}, which this optimizer needs; with a "

@@ -26,7 +26,12 @@ from loop_method.adapt import (
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
-from loop_method.adapt.observer_design import compensators, law_theta, whole_field_law
+from loop_method.adapt.observer_design import (
+    WholeFieldLaw,
+    compensators,
+    law_theta,
+    whole_field_law,
+)
 from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
@@ -173,15 +178,19 @@ def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:
         x = F @ x + G @ y + c + B @ a
 
 
+def whole_law(model: SensedModel, count: int) -> tuple[SensedLoop, WholeFieldLaw, Array, Array]:
+    """A loop, the law of the whole field from so many initial fields, and these with their weights."""
+    loop, fields = loop_of(model), np.stack([field(model, seed) for seed in range(count)])
+    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
+    law = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
+    assert law is not None
+    return loop, law, every, weights
+
+
 @pytest.mark.parametrize("shared", [LINEAR, CUBIC])
 def test_the_designed_law_is_near_to_that_of_the_whole_field(shared: Array) -> None:
     """With little noise the readings tell the state, so that the estimate costs little."""
-    model = model_with(shared, 0.02)
-    loop = loop_of(model)
-    fields = np.stack([field(model, seed) for seed in range(6)])
-    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
-    whole = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
-    assert whole is not None
+    loop, whole, every, weights = whole_law(model_with(shared, 0.02), 6)
     best = float(whole.simulation.costs.mean())
     law = cheapest(loop, list(compensators(loop, whole, ModelBasedSettings())), every, weights)
     none = float(loop.costs(loop.no_control, every).mean())
@@ -191,12 +200,7 @@ def test_the_designed_law_is_near_to_that_of_the_whole_field(shared: Array) -> N
 
 
 def test_the_designed_law_of_the_newest_readings_is_an_optimum_of_their_gains() -> None:
-    model = model_with(CUBIC, 0.3)
-    loop = loop_of(model)
-    fields = np.stack([field(model, seed) for seed in range(4)])
-    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
-    whole = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
-    assert whole is not None
+    loop, whole, every, weights = whole_law(model_with(CUBIC, 0.3), 4)
     static = list(compensators(loop, whole, ModelBasedSettings(least_gain=1e-5)))[2]
     n_s, cost = len(loop.law.model.A), float(loop.costs(static, every) @ weights)
     assert not static[:N_A, n_s : 2 * n_s].any()  # of no estimate
