@@ -5,6 +5,8 @@ SHELL := /bin/bash
 .SHELLFLAGS := -o pipefail -c
 # Python must not import from this folder by chance (loop_interfaces/module_path.py).
 export PYTHONSAFEPATH := 1
+# What hundreds of processes import is compiled once, also where the environment says otherwise.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup run test coverage packages lint types docs check lock audit clean
 

@@ -9,6 +9,7 @@ import gc
 import itertools
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -43,6 +44,7 @@ LONG = (
 
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False  # for the tests themselves, whose asserts each worker would rewrite
 # Processes inherit what is ignored: SIGINT in a shell's background, SIGHUP under nohup.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
