@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.loop_harness import Processes, until, without_domain
-from tests.support.small import SMALL
+from tests.support.small import SMALL, paced
 
 pytestmark = pytest.mark.topics
 LIMIT = 240.0
@@ -61,9 +61,8 @@ def test_two_trainings_at_once_do_not_end_each_other(loop: Processes, tmp_path: 
 def test_a_second_training_in_a_domain_that_is_given_ends_at_once_and_the_first_goes_on(
     loop: Processes, tmp_path: Path
 ) -> None:
-    first = loop.pdeloop(
-        "train", str(SMALL), "--iterations", "100000", "--out", str(tmp_path / "a")
-    )
+    slow = str(paced(tmp_path, 10.0))
+    first = loop.pdeloop("train", slow, "--iterations", "100000", "--out", str(tmp_path / "a"))
     until(lambda: "adapt" in loop.output(first), LIMIT, "first training")
     second = loop.pdeloop(*TRAIN, "--out", str(tmp_path / "b"))
     said = loop.wait(second, LIMIT, code=1)
