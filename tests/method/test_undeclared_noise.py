@@ -202,7 +202,7 @@ def test_gauss_newton_goes_on_with_the_noise_that_a_model_shows(
 
 QUICK = {
     **{"n_z": 128, "horizon": 40, "rollouts": 6, "evaluation_fields": 1},
-    **{"field_model_settings.folds": 2, "field_model_settings.passes": 4},
+    **{"field_model_settings.folds": 2, "field_model_settings.passes": 2},
     **{"exploration_variance": 1.0, "identification": "regression"},
     **{"field_model_settings.largest_degree": 3},
 }
