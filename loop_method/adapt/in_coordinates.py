@@ -77,7 +77,7 @@ class InCoordinates(Optimizer):
         if not isinstance(context.law, Observer):
             return None
         U = self.basis.coordinates(context.U.T).T
-        return Observer(replace(context.law.model, U=U), context.law.horizon)
+        return type(context.law)(replace(context.law.model, U=U), context.law.horizon)
 
     @classmethod
     def first_step(cls, settings: Any) -> int:

@@ -82,7 +82,7 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
-    also_improves = ("observer",)
+    also_improves = ("observer", "extended_kalman")
     in_coordinates = True
     judges_first_law = True
     explorations = 2

@@ -20,6 +20,7 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.laws.extended_kalman import ExtendedKalman
 
 FEWEST = 2
 """Rollouts of a law with which its mean cost counts."""
@@ -61,8 +62,10 @@ class ModelBasedReadings(ModelBased):
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """A step from the law that measured best."""
-        own = self._records.all()
+        own = [record for record in self._records.all() if self._is_linear(record.policy)]
         best = best_measured(own, self._first)
+        if not self._is_linear(self._progress.policy):
+            self._progress.policy = best.copy()
         found = step(belief.loop(self._context), own, best, self._settings)
         if found is None:
             row["reason"] = "the law is not finite on the model; it stays"
@@ -71,9 +74,18 @@ class ModelBasedReadings(ModelBased):
 
     def _judge(self, row: Row) -> None:
         """Judge the law that measured best in place of the last one."""
-        others = [r for r in self._records.all() if not np.array_equal(r.policy, self._first)]
+        others = [
+            record
+            for record in self._records.all()
+            if self._is_linear(record.policy) and not np.array_equal(record.policy, self._first)
+        ]
         self._progress.policy = best_measured(others, self._progress.policy).copy()
         super()._judge(row)
+
+    def _is_linear(self, policy: Array) -> bool:
+        """False of a law on an estimate of the field, which a model of the readings does not have."""
+        law = self._context.law
+        return not (isinstance(law, ExtendedKalman) and law.estimates(policy))
 
 
 def best_measured(records: Sequence[Record], first: Array) -> Array:

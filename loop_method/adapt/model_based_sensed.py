@@ -21,13 +21,15 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.estimate import Estimate, mean_of
+from loop_method.adapt.estimated_loop import estimated_laws
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
-from loop_method.adapt.observer_design import compensators, whole_field_law
+from loop_method.adapt.observer_design import compensators
 from loop_method.adapt.progress import JUDGING, RENEWING
-from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
+from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -38,6 +40,8 @@ from loop_method.adapt.verdict import (
     evidence_of_pairs,
     size_of,
 )
+from loop_method.adapt.whole_field_law import whole_field_law
+from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
@@ -89,33 +93,31 @@ class ModelBasedSensed(ModelBasedReadings):
             super()._improve(belief, row, final)
             return
         loop, fields = sensed_loop(self._context, belief.model), self._fields()
-        progress, settings = self._progress, self._settings
-        sets = 1
-        if final:  # a law with memory has many parameters, and simulations cost no rollout
-            sets, iterations = settings.observer_draws, settings.observer_iterations
-            settings = replace(settings, iterations=iterations, least_gain=settings.observer_gain)
+        progress, settings, law = self._progress, self._settings, self._context.law
+        # A law with memory has many parameters, and simulations cost no rollout.
+        sets = settings.observer_draws if final else 1
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
         every, weights = weighted(fields, drawn, settings.measured_share)
-        laws = [loop.theta(progress.policy)]
-        whole = whole_field_law(loop, every, weights, self._settings)
-        laws += [] if whole is None else compensators(loop, whole, settings if final else None)
-        start = cheapest(loop, laws, every, weights)
-        gain = settings.least_gain if final else settings.first_gain
-        found = improve(loop, start, every, weights, curvature_of(loop), settings, gain)
-        if found is None:
+        now = loop.theta(progress.policy)
+        if isinstance(law, ExtendedKalman):
+            models = self._context.field_models
+            laws, steps = estimated_laws(loop, law, every, weights, settings, models)
+        else:
+            laws, steps = _observers(loop, now, every, weights, settings, final)
+        if not laws:
             row["reason"] = "no law is finite on the model; the law stays"
             return
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
-        theta = cheapest(loop, [laws[0], start, found.theta], held_out, equal)
-        if theta is not laws[0]:
+        theta = cheapest(loop, [now, *laws], held_out, equal)
+        if theta is not now:
             progress.policy = loop.policy(theta, self._first)
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)
         progress.safe = bool(first.mean() < none.mean())
         change = gained(loop.costs(theta, held_out), first if progress.safe else none)
         progress.fraction, progress.change = 1.0, change
-        row["steps"] = found.steps
+        row["steps"] = steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
@@ -208,6 +210,28 @@ class ModelBasedSensed(ModelBasedReadings):
     def _report(row: Row, verdict: Verdict) -> None:
         row["chosen"], row["reason"] = verdict.chosen, verdict.reason
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+
+
+def _observers(
+    loop: SensedLoop,
+    now: Array,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+    final: bool,
+) -> tuple[list[Array], int]:
+    """The cheapest law with an observer to begin with, the one after a descent, and its steps."""
+    longer = settings
+    if final:
+        iterations, gain = settings.observer_iterations, settings.observer_gain
+        longer = replace(settings, iterations=iterations, least_gain=gain)
+    laws = [now]
+    whole = whole_field_law(loop, fields, weights, settings, len(loop.law.model.A))
+    laws += [] if whole is None else compensators(loop, whole, longer if final else None)
+    start = cheapest(loop, laws, fields, weights)
+    gain = longer.least_gain if final else longer.first_gain
+    found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
+    return ([], 0) if found is None else ([start, found.theta], found.steps)
 
 
 def gained(costs: Array, base: Array) -> Estimate:

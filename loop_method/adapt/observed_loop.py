@@ -49,7 +49,8 @@ class ObservedLoop(ClosedLoop):
             np.split(rows, [n_s, 2 * n_s], axis=1) for rows in (theta[:n_a], theta[n_a:])
         )
         parts = {"D": D, "K": K, "b": b[:, 0], "G": G, "F": F, "c": c[:, 0]}
-        return self.law.vector(parts).reshape(near.shape)
+        others = self.law.parts(np.zeros(self.law.size))  # of a law that is derived from it
+        return self.law.vector({**others, **parts}).reshape(near.shape)
 
     @property
     def memory_input(self) -> Array:

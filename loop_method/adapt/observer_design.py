@@ -28,18 +28,17 @@ Booton, "Nonlinear control systems with random inputs", IRE Trans. Circuit Theor
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.closed_loop import ClosedLoop, Simulation
+from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.sensed_loop import SensedLoop
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.design.finite_horizon import finite_horizon
+from loop_method.adapt.whole_field_law import WholeFieldLaw
 from loop_method.design.lqg import kalman_filter
 from loop_method.design.lqt import DesignError
 from loop_method.models.sensed import SensedModel
@@ -54,68 +53,6 @@ TOLD = 1e-2
 """Least singular value of the estimate of x_0 from readings, relative to the largest."""
 LEAST = 1e-8
 """Least variance of a noise, relative to the mean square of a reading or a mode."""
-
-
-@dataclass(frozen=True, eq=False)
-class WholeFieldLaw:
-    """The best law found of the whole field on a model.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-        Its U are the modes V.
-    theta : (n_a, n_s + 1) array
-        [K b].
-    simulation : Simulation
-        Of this law, from the fields that have a finite cost.
-    weights : array
-        Of these fields.
-    """
-
-    loop: ClosedLoop
-    theta: Array
-    simulation: Simulation
-    weights: Array
-
-
-def whole_field_law(
-    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings
-) -> WholeFieldLaw | None:
-    """The best law of as many modes as the law with an observer has; None where none is finite."""
-    model, n = loop.model, loop.model.n_z
-    none = np.zeros(model.n_a)
-    A, B = model.linearise(loop.target, none)
-    drift = model.step(loop.target[None], none[None])[0] - loop.target
-    K, b = finite_horizon(A, B, drift, loop.state_weight, loop.action_weight, loop.horizon)
-    b = b - K @ loop.target
-
-    def under(U: Array) -> ClosedLoop:
-        return ClosedLoop(
-            U,
-            loop.target,
-            loop.state_weight,
-            loop.action_weight,
-            loop.horizon,
-            loop.action_limit,
-            model=loop.model,
-        )
-
-    first = under(np.eye(n))
-    simulation = first.simulate(np.column_stack([K, b]), fields)
-    seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])
-    modes = linalg.svd(seen, full_matrices=False)[2][: len(loop.law.model.A)]
-    whole = under(modes.T)
-    found = improve(
-        whole, np.column_stack([K @ modes.T, b]), fields, weights, curvature_of(whole), settings
-    )
-    if found is None:
-        return None
-    simulation = whole.simulate(found.theta, fields)
-    known = np.isfinite(simulation.costs)
-    if not known.any():
-        return None
-    share = weights[known] / weights[known].sum()
-    return WholeFieldLaw(whole, found.theta, simulation.of_fields(known), share)
 
 
 def compensators(

@@ -14,8 +14,10 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
-from loop_method.adapt.closed_loop import ClosedLoopProblem
+from loop_method.adapt.closed_loop import ClosedLoopProblem, Simulation
+from loop_method.adapt.estimated_loop import simulate_estimated
 from loop_method.adapt.observed_loop import ObservedLoop
+from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.laws.observer import Observer
 from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
@@ -33,6 +35,21 @@ class SensedLoop(ObservedLoop):
     """Laws with an observer on a `SensedModel`; U and target are those of its grid."""
 
     settings: FieldModelSettings = DEFAULTS
+
+    def theta(self, policy: Array) -> Array:
+        """Theta, or the whole vector of a law whose actions depend on an estimate of the field."""
+        if isinstance(self.law, ExtendedKalman) and self.law.estimates(policy):
+            return np.ravel(policy).copy()
+        return super().theta(policy)
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        return theta.reshape(near.shape).copy() if theta.ndim == 1 else super().policy(theta, near)
+
+    def simulate(self, theta: Array, fields: Array) -> Simulation:
+        if theta.ndim > 1:
+            return super().simulate(theta, fields)
+        assert isinstance(self.law, ExtendedKalman)
+        return simulate_estimated(self, self.law, theta, fields)
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""

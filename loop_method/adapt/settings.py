@@ -155,6 +155,32 @@ class ModelBasedSettings(ImprovementSettings):
     observer_draws: int = setting(
         2, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
     )
+    filter_modes: int = setting(
+        24, "modes of the field that the law extended_kalman feeds back", 1, 1000
+    )
+    filter_unpredicted: float = setting(
+        0.04,
+        "share of the size of a field that its filter adds to the noise of a reading, as no model "
+        "predicts it",
+        0.0,
+        1.0,
+    )
+    filter_independent: float = setting(
+        0.1,
+        "share of the standard deviation of each wave that it assumes of initial fields besides the "
+        "covariance of those that were estimated",
+        0.0,
+        10.0,
+    )
+    filter_inflation: float = setting(
+        1.0, "factor of the standard deviations of its estimate in every step", 1.0, 2.0
+    )
+    filter_seen: float = setting(
+        0.1,
+        "share of the size of a field that is noise on what one of its laws is optimised for",
+        0.0,
+        10.0,
+    )
     readings_trust: float = setting(
         1.0,
         "weight of the distance from the start of a step on a model of readings; for a linear "

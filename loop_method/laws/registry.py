@@ -15,6 +15,7 @@ from loop_interfaces.own_code import OwnCode
 from loop_interfaces.spec import LAW_SETTINGS
 from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law
+from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from loop_method.settings import settings_from
@@ -22,7 +23,7 @@ from loop_method.settings import settings_from
 OWN_LAWS = OwnCode(
     "law",
     "PDELOOP_LAWS",
-    MappingProxyType({kind.name: kind for kind in (Affine, FeedForward, Observer)}),
+    MappingProxyType({kind.name: kind for kind in (Affine, FeedForward, Observer, ExtendedKalman)}),
 )
 
 

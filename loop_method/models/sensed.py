@@ -150,6 +150,8 @@ class SensedModel(SpectralModel):
         Standard deviation of the unpredicted part of a reading, including noise.
     spread : (33,) array
         Standard deviations of the Fourier coefficients of an initial field: its mean, cosines, sines.
+    largest : float
+        Largest |z| that is simulated.
     """
 
     shared: Array = field(kw_only=True)
@@ -157,6 +159,7 @@ class SensedModel(SpectralModel):
     sensors: int = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
     spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
+    largest: float = field(default=0.0, kw_only=True)
 
     def at_sensors(self, rows: Array) -> Array:
         """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
@@ -174,6 +177,7 @@ class SensedModel(SpectralModel):
             "sensors": np.array(self.sensors),
             "noise": np.array(self.noise),
             "spread": self.spread,
+            "largest": np.array(self.largest),
         }
         return super().arrays() | own
 
@@ -193,6 +197,9 @@ class SensedModel(SpectralModel):
             sensors=sensors,
             noise=float(checked_array(arrays, "noise", "f", ())),
             spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
+            largest=float(checked_array(arrays, "largest", "f", ()))
+            if "largest" in arrays
+            else 0.0,
         )
 
 
@@ -264,6 +271,7 @@ def sensed_model(
         actuators=actuators,
         sensors=sensors,
         noise=noise,
+        largest=largest,
     )
 
 

@@ -87,7 +87,7 @@ def numeric(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray)
 
 
 @pytest.mark.parametrize("k", [0, 1, T])
-@pytest.mark.parametrize("kind", SHIPPED)
+@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
 def test_derivatives_agree_with_finite_differences(kind: type[Law], k: int) -> None:
     law, rng = kind(MODEL, T), np.random.default_rng(k)
     theta = law.theta_start + 0.3 * rng.standard_normal(law.size)
@@ -188,7 +188,7 @@ def test_a_law_that_cannot_be_used_is_refused_in_one_sentence(members, words) ->
 
 def test_the_registry_knows_ours_and_refuses_what_is_no_law(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv(OWN_LAWS.variable, "")
-    assert offered()[:3] == [kind.name for kind in SHIPPED]
+    assert offered()[: len(SHIPPED)] == [kind.name for kind in SHIPPED]
     assert [law_kind(kind.name) for kind in SHIPPED] == SHIPPED
     assert OWN_LAWS.take(Affine) == "affine"
     with pytest.raises(ValueError, match="unknown law 'afine': give one of affine, feedforward"):

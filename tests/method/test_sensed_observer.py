@@ -26,15 +26,11 @@ from loop_method.adapt import (
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
-from loop_method.adapt.observer_design import (
-    WholeFieldLaw,
-    compensators,
-    law_theta,
-    whole_field_law,
-)
+from loop_method.adapt.observer_design import compensators, law_theta
 from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
 from loop_method.laws import Observer
 from loop_method.models.files import model_of
 from loop_method.models.sensed import (
@@ -182,7 +178,7 @@ def whole_law(model: SensedModel, count: int) -> tuple[SensedLoop, WholeFieldLaw
     """A loop, the law of the whole field from so many initial fields, and these with their weights."""
     loop, fields = loop_of(model), np.stack([field(model, seed) for seed in range(count)])
     every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
-    law = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20))
+    law = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20), 10)
     assert law is not None
     return loop, law, every, weights
 

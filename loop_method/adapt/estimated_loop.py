@@ -1,0 +1,127 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The law `extended_kalman` on a model of the field between few sensors.
+
+The law of the whole field is designed on the model and acts on the filter's estimate of the field as if
+that were the field: certainty equivalence, which is optimal where model and law are linear and the cost
+is quadratic. What is not known of the field in a closed loop is seen in simulations of the model under
+the filter, whose model it is.
+
+References
+----------
+Bar-Shalom, Tse, "Dual effect, certainty equivalence, and separation in stochastic control", IEEE
+Trans. Automatic Control 19(5), 1974.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.closed_loop import ClosedLoop, Simulation
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.whole_field_law import whole_field_law
+from loop_method.laws.extended_kalman import ExtendedKalman
+from loop_method.models.sensed import SensedModel, coefficients_of
+from loop_method.models.sensed_filter import SensedFilter
+from loop_method.models.settings import FieldModelSettings
+
+
+def estimated_laws(
+    loop: ClosedLoop,
+    law: ExtendedKalman,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+    models: FieldModelSettings,
+) -> tuple[list[Array], int]:
+    """Theta of laws on the estimate, and the steps of L-BFGS that they took; none if none is finite.
+
+    The first is the best law of the whole field; the others are optimised with noise on what they see,
+    so that they depend less on what an estimate has wrong.
+    """
+    model = loop.model
+    assert isinstance(model, SensedModel)
+    whole = whole_field_law(loop, fields, weights, settings, settings.filter_modes)
+    if whole is None:
+        return [], 0
+    size = root_mean_square(model.spread)
+    noise = float(np.hypot(model.noise, settings.filter_unpredicted * size))
+    mean, factor = prior(fields, weights, settings.filter_independent * model.spread)
+    known = SensedFilter(model, mean, factor, noise, settings.filter_inflation)
+    found, theta, steps = [], whole.theta, whole.steps
+    for share in (0.0, settings.filter_seen):
+        seen = replace(whole.loop, noise=share * size)
+        if share:
+            better = improve(seen, theta, fields, weights, curvature_of(seen), settings)
+            if better is None:
+                continue
+            theta, steps = better.theta, steps + better.steps
+        K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
+        found.append(law.theta_of(K, b, known, models))
+    return found, steps
+
+
+def prior(fields: Array, weights: Array, deviations: Array) -> tuple[Array, Array]:
+    """Mean and factor (`SensedFilter`) of the Fourier coefficients of these weighted fields.
+
+    deviations (33,): standard deviations that each coefficient has in addition, independently, as a
+    few fields do not have all that others may.
+    """
+    x = coefficients_of(fields)
+    mean = weights @ x
+    off = x - mean
+    values, vectors = np.linalg.eigh(off.T @ (weights[:, None] * off) + np.diag(deviations**2))
+    return mean, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def root_mean_square(spread: Array) -> float:
+    """That of fields with independent Fourier coefficients of these standard deviations."""
+    return float(np.sqrt(spread[0] ** 2 + 2.0 * np.sum(spread[1:] ** 2)))
+
+
+def simulate_estimated(
+    loop: ClosedLoop, law: ExtendedKalman, theta: Array, fields: Array
+) -> Simulation:
+    """Roll the law's vector theta out from the fields (F, n); the simulation has no features."""
+    parts, model = law.parts(theta), loop.model
+    assert isinstance(model, SensedModel)
+    T, count, every = loop.horizon, len(fields), model.n_z // model.sensors
+    states, actions = np.zeros((T + 1, *fields.shape)), np.zeros((T, count, model.n_a))
+    costs, features = np.full(count, np.inf), np.empty((T, count, 0))
+    known = law.filter(parts)
+    if known is None:
+        return Simulation(states, actions, costs, features)
+    costs, finite = np.zeros(count), np.ones(count, dtype=bool)
+    noise = loop.noise * np.random.default_rng(0).standard_normal((T, count, model.sensors))
+    states[0] = fields
+    x, S = (np.repeat(part[None], count, axis=0) for part in known.start)
+    p = np.empty((count, 0))
+    with np.errstate(all="ignore"):
+        for k in range(T):
+            z = states[k]
+            y = z[:, every // 2 :: every] + noise[k]
+            s = y @ law.model.U
+            p = p if k else s
+            x, S = known.measured(x, S, y)
+            a = x @ parts["K_e"].T + p @ parts["K"].T + s @ parts["D"].T + parts["b"]
+            if loop.action_limit:
+                np.clip(a, -loop.action_limit, loop.action_limit, out=a)
+            error = z - loop.target
+            costs += loop.state_weight * np.einsum("fi,fi->f", error, error)
+            costs += loop.action_weight * np.einsum("fi,fi->f", a, a)
+            finite &= np.isfinite(costs)
+            for part in (a, x, S, p):
+                part[~finite] = 0.0
+            p = p @ parts["F"].T + s @ parts["G"].T + a @ law.model.B.T + parts["c"]
+            actions[k] = a
+            after = model.step(z, a)
+            finite &= np.isfinite(after).all(axis=1)
+            after[~finite] = 0.0
+            states[k + 1] = after
+            x, S = known.predicted(x, S, a)
+    costs /= T
+    costs[~finite] = np.inf
+    return Simulation(states, actions, costs, features)

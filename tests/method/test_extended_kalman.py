@@ -1,0 +1,229 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The extended Kalman filter of a field between sensors, and the law on its estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loop_interfaces.model_rows import ModelRows
+from loop_method.adapt import Context, ModelBased, Trajectory
+from loop_method.adapt.estimated_loop import estimated_laws, prior, root_mean_square
+from loop_method.adapt.model_based_readings import ModelBasedReadings
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.whole_field_law import whole_field_law
+from loop_method.laws import ExtendedKalman, Law, Observer
+from loop_method.laws.base import differentiable
+from loop_method.laws.calls import MAX_NUMBER, action, along
+from loop_method.models.sensed import (
+    COEFFICIENTS,
+    TERMS,
+    WAVES,
+    Actuators,
+    SensedModel,
+    coefficients_of,
+    field_of,
+    sensed_model,
+    unknowns,
+)
+from loop_method.models.sensed_filter import SensedFilter
+from loop_method.models.settings import DEFAULTS
+from tests.support.small import same_bits
+
+Array = np.ndarray
+SENSORS, N_A, T, N_S = 8, 3, 24, 6
+ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.full(N_A, 0.1))
+SPREAD = np.concatenate([[0.3], *2 * [np.r_[1.0, 0.7, 0.4, np.full(WAVES - 3, 1e-3)]]])
+FACTOR = np.diag(SPREAD)
+SEEN = slice(4, None, 8)
+"""The sensors among the 64 points of the grid."""
+SIGMA = 0.2
+
+
+def model_of(**terms: float) -> SensedModel:
+    """The equation with these terms, like z1_x2 for the second derivative of z."""
+    shared = np.zeros(unknowns(N_A))
+    for name, value in terms.items():
+        p, j = (int(part) for part in name[1:].split("_x"))
+        shared[TERMS.index((p, j))] = value
+    shared[COEFFICIENTS] = 5.0
+    model = sensed_model(shared, SENSORS, ACTUATORS, 4.0, noise=SIGMA)
+    return replace(model, spread=SPREAD)
+
+
+LINEAR = model_of(z1_x0=1.5, z1_x1=20.0, z1_x2=0.5)
+CUBIC = model_of(z1_x0=8.0, z1_x2=0.5, z3_x0=-1.0)
+
+
+def filter_of(
+    model: SensedModel, sigma: float = SIGMA, kappa: float = 1.0, factor: Array = FACTOR
+) -> SensedFilter:
+    return SensedFilter(model, np.zeros(SPREAD.size), factor, sigma, kappa)
+
+
+def rows_of(gain: float = 0.0) -> ModelRows:
+    rng = np.random.default_rng(2)
+    A, B, K = (0.3 * rng.standard_normal(shape) for shape in ((N_S, N_S), (N_S, N_A), (N_A, N_S)))
+    U = np.linalg.qr(rng.standard_normal((SENSORS, N_S)))[0]
+    return ModelRows(A=A, B=B, U=U, K_a=gain * K, K_b=gain * K, s_r=np.zeros(N_S))
+
+
+def context_of(law: Law) -> Context:
+    target, none = np.zeros(SENSORS), np.zeros((T, N_A))
+    seen = Trajectory(np.ones((T + 1, SENSORS)), none)
+    return Context(law.model.U, target, 1.0, 0.1, T, seen, sensors=SENSORS, law=law)
+
+
+def loop_of(model: SensedModel) -> tuple[SensedLoop, ExtendedKalman]:
+    law = ExtendedKalman(rows_of(), T)
+    return sensed_loop(context_of(law), model), law
+
+
+def fields(count: int, seed: int = 0) -> Array:
+    rng = np.random.default_rng(seed)
+    return field_of(SPREAD * rng.standard_normal((count, SPREAD.size)), 64)
+
+
+def test_of_a_linear_equation_it_is_the_kalman_filter() -> None:
+    rng = np.random.default_rng(1)
+    mean, factor = rng.standard_normal(SPREAD.size), SPREAD * rng.standard_normal(2 * [SPREAD.size])
+    known = SensedFilter(LINEAR, mean, factor, SIGMA, 1.1)
+    A, B = LINEAR.linearise(np.zeros(64), np.zeros(N_A))
+    H = np.eye(64)[SEEN]
+    first = field_of(factor, 64)
+    x, P = field_of(mean, 64), first.T @ first
+    own, S = (np.repeat(part[None], 2, axis=0) for part in known.start)
+    for _ in range(6):
+        y, a = rng.standard_normal(SENSORS), rng.standard_normal(N_A)
+        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + SIGMA**2 * np.eye(SENSORS))
+        x, P = x + gain @ (y - H @ x), P - gain @ H @ P
+        own, S = known.measured(own, S, np.stack([y, 3.0 * y]))
+        np.testing.assert_allclose(own[0], x, atol=1e-8)
+        np.testing.assert_allclose(S[0].T @ S[0], P, atol=1e-8)
+        x, P = A @ x + B @ a, 1.1**2 * A @ P @ A.T
+        own, S = known.predicted(own, S, np.stack([a, a]))
+
+
+def test_it_finds_a_field_that_no_reading_shows() -> None:
+    """It begins with waves that are zero at every sensor, and runs past them."""
+    x = np.arange(64) / 64
+    z = np.sin(2 * np.pi * 4 * (x - 1 / 16))[None]
+    assert np.abs(z[0, SEEN]).max() < 1e-12
+    spread = np.zeros_like(SPREAD)
+    spread[[4, 4 + WAVES]] = 1.0
+    known = filter_of(LINEAR, 1e-3, factor=np.diag(spread))
+    own, S = (part[None] for part in known.start)
+    for k in range(T):
+        own, S = known.measured(own, S, z[:, SEEN])
+        assert k or np.linalg.norm(own - z) > 0.9 * np.linalg.norm(z)
+        none = np.zeros((1, N_A))
+        z, (own, S) = LINEAR.step(z, none), known.predicted(own, S, none)
+    assert np.linalg.norm(own - z) < 0.01 * np.linalg.norm(z)
+
+
+def test_what_overflows_in_one_environment_leaves_the_other_alone() -> None:
+    known = filter_of(CUBIC)
+    x, S = (np.repeat(part[None], 2, axis=0) for part in known.start)
+    y = np.stack([np.full(SENSORS, np.inf), np.ones(SENSORS)])
+    with np.errstate(invalid="ignore"):
+        both, _ = known.measured(x, S, y)
+    alone, _ = known.measured(x[1:], S[1:], y[1:])
+    assert np.isnan(both[0]).all()
+    np.testing.assert_allclose(both[1], alone[0], rtol=1e-12)
+
+
+def test_it_starts_as_the_law_observer() -> None:
+    rng, rows = np.random.default_rng(3), rows_of(1.0)
+    readings, actions = rng.standard_normal((T, SENSORS)), rng.standard_normal((T, N_A))
+    law, linear = ExtendedKalman(rows, T), Observer(rows, T)
+    assert not law.estimates(law.theta_start)
+    expected = along(linear, linear.theta_start, readings, actions)
+    assert expected.any()
+    assert same_bits(along(law, law.theta_start, readings, actions), expected)
+
+
+def test_it_has_no_derivative_to_be_trained_with() -> None:
+    assert differentiable(Observer) and not differentiable(ExtendedKalman)
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.2])
+def test_its_simulation_is_what_the_law_does_on_the_model(limit: float) -> None:
+    loop, law = loop_of(replace(CUBIC, noise=0.0))
+    loop = replace(loop, action_limit=limit)
+    theta = law.theta_of(
+        0.05 * np.random.default_rng(5).standard_normal((N_A, 64)),
+        np.full(N_A, 0.1),
+        filter_of(CUBIC, kappa=1.02),
+        DEFAULTS,
+    )
+    assert law.estimates(theta) and loop.theta(theta).ndim == 1
+    found = loop.simulate(theta, fields(3))
+    for m in range(3):
+        z, a = found.states[:, m], found.actions[:, m]
+        expected = along(law, theta, z[:-1, SEEN], a)
+        if limit:
+            expected = np.clip(expected, -limit, limit)
+            assert (np.abs(a) == limit).any() and (np.abs(a) < limit).any()
+        np.testing.assert_allclose(a, expected, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(z[1:], CUBIC.step(z[:-1], a), rtol=1e-7, atol=1e-9)
+        cost = np.mean(loop.state_weight * np.sum(z[:-1] ** 2, axis=1) + 0.1 * np.sum(a**2, axis=1))
+        assert found.costs[m] == pytest.approx(cost)
+
+
+def test_an_equation_that_cannot_be_integrated_is_a_law_that_diverges() -> None:
+    loop, law = loop_of(CUBIC)
+    theta = law.theta_of(np.ones((N_A, 64)), np.zeros(N_A), filter_of(CUBIC), DEFAULTS)
+    parts = dict(law.parts(theta))
+    parts["integration"] = np.zeros(4)  # internal steps without a reach
+    assert law.filter(parts) is None
+    a = action(law, parts, np.ones(SENSORS), law.memory_start(), 0)
+    assert (a == MAX_NUMBER).all()
+    assert law.memory_update(parts, np.ones(SENSORS), law.memory_start(), a, 0).shape == (
+        law.memory_size,
+    )
+    assert np.isinf(loop.costs(law.vector(parts), fields(2))).all()
+
+
+def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> None:
+    loop, law = loop_of(CUBIC)
+    every, weights = fields(24), np.full(24, 1.0 / 24.0)
+    settings = ModelBasedSettings(iterations=30, filter_unpredicted=0.0)
+    laws, steps = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    assert len(laws) == 2 and steps > 0
+    others, equal = fields(20, seed=1), np.full(20, 1.0 / 20.0)
+    none = loop.costs(loop.no_control, others) @ equal
+    own = [loop.costs(theta, others) @ equal for theta in laws]
+    whole = whole_field_law(loop, every, weights, settings, settings.filter_modes)
+    assert whole is not None
+    best = whole.loop.costs(whole.theta, others) @ equal
+    assert best < 0.9 * none
+    assert max(own) - best < 0.1 * (none - best)
+
+
+def test_the_prior_has_the_moments_of_the_fields() -> None:
+    drawn, weights = fields(60) + 0.5, np.full(60, 1.0 / 60.0)
+    x = coefficients_of(drawn)
+    mean, factor = prior(drawn, weights, np.full(SPREAD.size, 0.01))
+    np.testing.assert_allclose(mean, x.mean(axis=0), atol=1e-12)
+    expected = np.cov(x.T, bias=True) + 1e-4 * np.eye(SPREAD.size)
+    np.testing.assert_allclose(factor.T @ factor, expected, atol=1e-12)
+
+
+def test_the_size_of_a_field_is_that_of_its_waves() -> None:
+    drawn = fields(4000)
+    assert root_mean_square(SPREAD) == pytest.approx(np.sqrt(np.mean(drawn**2)), rel=0.03)
+
+
+def test_a_model_of_the_readings_steps_from_laws_without_an_estimate() -> None:
+    """Where no equation reproduces the rollouts any more."""
+    law = ExtendedKalman(rows_of(0.1), T)
+    context = context_of(law)
+    own = ModelBased.for_context(context)(
+        law.theta_start, seed=0, rollouts=12, settings=ModelBasedSettings(), context=context
+    )
+    assert isinstance(own, ModelBasedReadings)
+    estimated = law.theta_of(np.ones((N_A, 64)), np.zeros(N_A), filter_of(CUBIC), DEFAULTS)
+    assert not own._is_linear(estimated) and own._is_linear(law.theta_start)
