@@ -166,7 +166,7 @@ class ModelBasedSettings(ImprovementSettings):
         1.0,
     )
     filter_independent: float = setting(
-        0.1,
+        0.3,
         "share of the standard deviation of each wave that it assumes of initial fields besides the "
         "covariance of those that were estimated",
         0.0,
@@ -176,7 +176,7 @@ class ModelBasedSettings(ImprovementSettings):
         1.0, "factor of the standard deviations of its estimate in every step", 1.0, 2.0
     )
     filter_seen: float = setting(
-        0.1,
+        0.2,
         "share of the size of a field that is noise on what one of its laws is optimised for",
         0.0,
         10.0,
