@@ -33,7 +33,7 @@ def run(
     *,
     sensors: Sequence[int] = (8, 16),
     noise: Sequence[float] = (0.0, 0.03, 0.1),
-    laws: Sequence[str] = ("observer",),
+    laws: Sequence[str] = ("extended_kalman",),
     first: int = 2000,
     seeds: int = 6,
     rollouts: int = 20,

@@ -238,7 +238,7 @@ def designed(
         if not filtered:
             raise ValueError(
                 f"the identification 'subspace' designs a filter, which the law '{settings.law}' "
-                "does not use; take the law 'observer'"
+                "does not use; take the law 'extended_kalman' or 'observer'"
             )
         every = [*trajectories, *further]
         found_model = subspace_model(

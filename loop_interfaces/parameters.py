@@ -80,14 +80,14 @@ IDENTIFICATION = Spec(
 ).means(
     "regression: least squares in reduced coordinates; field: a linearised model of the whole "
     "field, where its law is better; subspace: a model in innovation form with its filter, from "
-    "measurements alone, for the law observer; dmdc: the paper's truncated DMDc. An optimiser may "
-    "have its own default: gauss_newton has regression, two_point dmdc; the law observer has "
-    "subspace with few sensors"
+    "measurements alone, for the laws extended_kalman and observer, whose default it is with few "
+    "sensors; dmdc: the paper's truncated DMDc. An optimiser may have its own default: gauss_newton "
+    "has regression, two_point dmdc"
 )
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
     "control law: a shipped or installed name, or code that the user must allow, 'file.py:Class' "
-    "or 'module:Class'; the default of model_based is observer with few sensors"
+    "or 'module:Class'; the default of model_based is extended_kalman with few sensors"
 )
 
 PROBLEM = _section(

@@ -119,7 +119,7 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
             f"the identification 'subspace' designs a filter, which the law '{law.name}' does not "
-            "use; give --law observer, or another identification"
+            "use; give --law extended_kalman, or another identification"
         )
     return law
 

@@ -87,7 +87,7 @@ class ModelBased(Optimizer):
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"
-    law_of_sensors = "observer"  # measured: python -m benchmarks few_sensors
+    law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
 
     def __init__(
         self,

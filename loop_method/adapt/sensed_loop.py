@@ -172,7 +172,18 @@ def sensed_from(
     size = float(np.mean([np.mean(own**2) for own in readings]))
     # Else what the grid does not resolve would be taken for fields and actuators.
     declared = float(np.hypot(context.noise, settings.sensed_unresolved * np.sqrt(size)))
-    found = fit_rollouts(problem, chosen, actuators, declared, start, settings, spread)
+    found = fit_rollouts(problem, chosen, actuators, declared, start, alike(settings), spread)
+    noise = context.noise**2 / size
+    chance = settings.sensed_alike_chi * noise * np.sqrt(2.0 / np.size(readings))
+    if found is None or found[2] > max(settings.sensed_unresolved**2, chance):
+        near = start if found is None else found[0]
+        free = fit_rollouts(problem, chosen, actuators, declared, near, settings, spread)
+        if found is None or (free is not None and differ(found[2], free[2], chance, settings)):
+            found = free
+        else:
+            settings = alike(settings)
+    else:
+        settings = alike(settings)
     if found is None:
         return None
     shared, fields, error = found
@@ -210,6 +221,25 @@ def sensed_from(
     largest = settings.sensed_extrapolation * float(np.abs(fields).max())
     model = sensed_model(shared, sensors, actuators, largest, settings, noise=smoothing.noise)
     return replace(model, spread=likely), error
+
+
+def alike(settings: FieldModelSettings) -> FieldModelSettings:
+    """Settings with which a fit holds the strengths of actuators near to each other.
+
+    Few sensors tell little of them: waves that the sensors do not resolve would be taken for
+    differences in strength, with which the readings are reproduced as well.
+    """
+    held = settings.sensed_alike_unequal, settings.sensed_alike_ridge
+    return replace(settings, sensed_unequal=held[0], sensed_unequal_ridge=held[1])
+
+
+def differ(held: float, free: float, chance: float, settings: FieldModelSettings) -> bool:
+    """True if actuators differ in strength, by the errors of fits that hold them and do not.
+
+    chance: the least change of an error that noise does not explain.
+    """
+    unresolved = settings.sensed_unresolved**2
+    return held - free > chance and free + unresolved < 0.5 * (held + unresolved)
 
 
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:

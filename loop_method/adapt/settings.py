@@ -153,7 +153,11 @@ class ModelBasedSettings(ImprovementSettings):
     )
     observer_gain: float = setting(3e-4, "as least_gain, likewise", 0.0, 1.0)
     observer_draws: int = setting(
-        2, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
+        2,
+        "sets of drawn initial fields, each of at most mixtures, likewise and of the law "
+        "extended_kalman",
+        1,
+        100,
     )
     filter_modes: int = setting(
         24, "modes of the field that the law extended_kalman feeds back", 1, 1000

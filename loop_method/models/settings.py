@@ -274,6 +274,16 @@ class FieldModelSettings(Settings):
         1e6,
     )
     sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
+    sensed_alike_chi: float = setting(
+        4.0,
+        "standard deviations of what noise has in an error by which it must fall for differences "
+        "between actuators to count",
+        0,
+        1000,
+    )
+    sensed_alike_ridge: float = setting(
+        1e-2, "that ridge while actuators are held near to one strength", 0, 1
+    )
     sensed_deviation: float = setting(
         10.0,
         "prior standard deviation of the unknowns of the equation, with measurement noise",
@@ -283,6 +293,7 @@ class FieldModelSettings(Settings):
     sensed_unequal: float = setting(
         1.0, "the same for the differences between actuators", 1e-6, 1e12
     )
+    sensed_alike_unequal: float = setting(0.1, "the same while they are held", 1e-6, 1e12)
     sensed_field_ridge: float = setting(
         1e-3, "ridge of the Fourier coefficients of an initial field", 0, 1
     )

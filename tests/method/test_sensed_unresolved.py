@@ -11,18 +11,26 @@ from threadpoolctl import threadpool_limits
 import pdeloop
 from loop_interfaces.actuators import extents
 from loop_method.adapt import Context, Record, Trajectory
-from loop_method.adapt.sensed_loop import sensed_from
-from loop_method.models.sensed import SHARED, SensedModel
+from loop_method.adapt.sensed_loop import differ, sensed_from
+from loop_method.models.sensed import COEFFICIENTS, SHARED, SensedModel
 from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
 from tests.support.sensed import SENSORS
 
 FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=8, sensed_last_iterations=20)
 T = 16
+Array = np.ndarray
 
 
-def test_narrow_actuators_are_not_taken_for_unequal_ones() -> None:
-    """Twelve that are alike, three spacings of the grid wide, of which eight sensors see edges."""
+FREE = {"sensed_alike_unequal": DEFAULTS.sensed_unequal, "sensed_alike_ridge": 1e-4}
+"""Constants that hold actuators no nearer to each other than a fit of their differences."""
+
+
+def found(**constants: float) -> tuple[SensedModel, float]:
+    """The model of three rollouts of twelve actuators, and the size of their readings.
+
+    The actuators are three spacings of the grid wide, so that eight sensors see their edges.
+    """
     problem = pdeloop.problem("allen-cahn-modes", sensors=SENSORS, horizon=T)
     plant, rng = problem.plant(), np.random.default_rng(0)
     assert plant.supports is not None
@@ -34,25 +42,43 @@ def test_narrow_actuators_are_not_taken_for_unequal_ones() -> None:
         cost = float(seen.costs.mean[0])
         records.append(Record(nothing, cost, seen.states[:, 0], seen.actions[:, 0]))
 
-    def found(unresolved: float) -> SensedModel:
-        context = Context(
-            np.eye(SENSORS),
-            plant.target,
-            plant.state_weight,
-            plant.action_weight,
-            T,
-            Trajectory(records[0].states, records[0].actions),
-            sensors=SENSORS,
-            actuator_positions=centres.tolist(),
-            actuator_widths=widths.tolist(),
-            field_models=replace(FEW_ITERATIONS, sensed_unresolved=unresolved),
-        )
-        with threadpool_limits(1):
-            known = sensed_from(context, records, None)
-        assert known is not None
-        return known[0]
+    context = Context(
+        np.eye(SENSORS),
+        plant.target,
+        plant.state_weight,
+        plant.action_weight,
+        T,
+        Trajectory(records[0].states, records[0].actions),
+        sensors=SENSORS,
+        actuator_positions=centres.tolist(),
+        actuator_widths=widths.tolist(),
+        field_models=replace(FEW_ITERATIONS, **constants),
+    )
+    with threadpool_limits(1):
+        known = sensed_from(context, records, None)
+    assert known is not None
+    size = float(np.sqrt(np.mean([np.mean(record.acted_from**2) for record in records])))
+    return known[0], size
 
-    taken, counted = found(0.0), found(DEFAULTS.sensed_unresolved)
-    size = np.sqrt(np.mean([np.mean(record.acted_from**2) for record in records]))
+
+def differences(model: SensedModel) -> Array:
+    """Of the strengths from each other, as shares of their mean."""
+    own = model.shared[COEFFICIENTS] + model.shared[SHARED:]
+    return own / own.mean() - 1.0
+
+
+def test_narrow_actuators_are_not_taken_for_unequal_ones() -> None:
+    (taken, _), (counted, size) = (
+        found(sensed_unresolved=share, **FREE) for share in (0.0, DEFAULTS.sensed_unresolved)
+    )
     assert counted.noise >= DEFAULTS.sensed_unresolved * size > taken.noise
     assert np.std(counted.shared[SHARED:]) < 0.5 * np.std(taken.shared[SHARED:])
+    held, _ = found()
+    assert np.std(differences(held)) < 0.2 * np.std(differences(counted))
+
+
+def test_actuators_differ_where_that_explains_what_noise_and_the_grid_do_not() -> None:
+    share = DEFAULTS.sensed_unresolved**2
+    assert differ(10.0 * share, share, 0.0, DEFAULTS)
+    assert not differ(10.0 * share, share, 9.5 * share, DEFAULTS)  # noise explains it
+    assert not differ(3.0 * share, 1.5 * share, 0.0, DEFAULTS)

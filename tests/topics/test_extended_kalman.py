@@ -1,0 +1,54 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The law that estimates the field between few sensors, over topics: the bits of one process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pdeloop
+from loop_method.laws import ExtendedKalman
+from tests.support.loop_harness import Processes
+from tests.support.small import same_bits
+from tests.support.small_loop import LIMIT
+from tests.tools.test_own_law import policies
+
+pytestmark = pytest.mark.topics
+
+PARAMETERS = {
+    "sensors": 8,
+    "n_a": 3,
+    "actuator_width": 0.2,
+    "reduced_order": 4,
+    "horizon": 20,
+    "exploration_variance": 4.0,
+    "rollouts": 5,
+    "evaluation_fields": 2,
+}
+SETTINGS = {
+    "optimizer_settings": {"iterations": 5, "mixtures": 2, "judging": 1},
+    "field_model_settings": {
+        "sensed_iterations": 4,
+        "sensed_last_iterations": 6,
+        "sensed_newest": 3,
+        "sensed_learning": 1,
+        "sensed_again": 0,
+    },
+}
+
+
+def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_from_a_bag(
+    loop: Processes, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = [f"{name}={value}" for name, value in PARAMETERS.items()]
+    words += [f"{of}.{name}={value}" for of, own in SETTINGS.items() for name, value in own.items()]
+    flags = [word for setting in words for word in ("--set", setting)]
+    loop.wait(loop.pdeloop("train", "allen-cahn", *flags, "--record", "--out", str(out)), LIMIT)
+    here = pdeloop.train("allen-cahn", **PARAMETERS, **SETTINGS)
+    law = here.laws[0]
+    assert isinstance(law, ExtendedKalman) and law.estimates(here.policies[0])
+    assert same_bits(policies(out), here.policies)
+    verified = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
+    assert "no difference, to the bit" in verified
