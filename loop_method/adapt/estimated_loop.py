@@ -24,9 +24,13 @@ from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.whole_field_law import whole_field_law
 from loop_method.laws.extended_kalman import ExtendedKalman
-from loop_method.models.sensed import SensedModel, coefficients_of
+from loop_method.models.sensed import WAVES, SensedModel, coefficients_of
 from loop_method.models.sensed_filter import SensedFilter
 from loop_method.models.settings import FieldModelSettings
+
+INDEPENDENT = (0.3, 1.0)
+"""Shares of the standard deviation of each wave that initial fields are assumed to have besides the
+covariance of those that were estimated; each makes a filter."""
 
 
 def estimated_laws(
@@ -39,8 +43,8 @@ def estimated_laws(
 ) -> tuple[list[Array], int]:
     """Theta of laws on the estimate, and the steps of L-BFGS that they took; none if none is finite.
 
-    The first is the best law of the whole field; the others are optimised with noise on what they see,
-    so that they depend less on what an estimate has wrong.
+    That of the whole field, and one that is optimised with noise on what it sees, so that it depends
+    less on what an estimate has wrong; each with filters that know the initial fields well, and less.
     """
     model = loop.model
     assert isinstance(model, SensedModel)
@@ -49,8 +53,10 @@ def estimated_laws(
         return [], 0
     size = root_mean_square(model.spread)
     noise = float(np.hypot(model.noise, settings.filter_unpredicted * size))
-    mean, factor = prior(fields, weights, settings.filter_independent * model.spread)
-    known = SensedFilter(model, mean, factor, noise, settings.filter_inflation)
+    filters = [
+        SensedFilter(model, *prior(fields, weights, share), noise, settings.filter_inflation)
+        for share in INDEPENDENT
+    ]
     found, theta, steps = [], whole.theta, whole.steps
     for share in (0.0, settings.filter_seen):
         seen = replace(whole.loop, noise=share * size)
@@ -60,20 +66,24 @@ def estimated_laws(
                 continue
             theta, steps = better.theta, steps + better.steps
         K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
-        found.append(law.theta_of(K, b, known, models))
+        found += [law.theta_of(K, b, known, models) for known in filters]
     return found, steps
 
 
-def prior(fields: Array, weights: Array, deviations: Array) -> tuple[Array, Array]:
+def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:
     """Mean and factor (`SensedFilter`) of the Fourier coefficients of these weighted fields.
 
-    deviations (33,): standard deviations that each coefficient has in addition, independently, as a
-    few fields do not have all that others may.
+    independent: share of the standard deviation of each wave that its cosine and sine have in addition,
+    independently, as a few fields do not have all that others may.
     """
     x = coefficients_of(fields)
     mean = weights @ x
     off = x - mean
-    values, vectors = np.linalg.eigh(off.T @ (weights[:, None] * off) + np.diag(deviations**2))
+    covariance = off.T @ (weights[:, None] * off)
+    own = np.diag(covariance).copy()
+    waves = 0.5 * (own[1 : WAVES + 1] + own[WAVES + 1 :])
+    added = independent**2 * np.concatenate([own[:1], waves, waves])
+    values, vectors = np.linalg.eigh(covariance + np.diag(added))
     return mean, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 

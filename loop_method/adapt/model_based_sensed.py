@@ -99,11 +99,12 @@ class ModelBasedSensed(ModelBasedReadings):
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
         every, weights = weighted(fields, drawn, settings.measured_share)
         now = loop.theta(progress.policy)
-        if isinstance(law, ExtendedKalman):
+        linear = now if now.ndim > 1 else loop.theta(self._first)
+        laws, steps = _observers(loop, linear, every, weights, settings, final)
+        if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
             models = self._context.field_models
-            laws, steps = estimated_laws(loop, law, every, weights, settings, models)
-        else:
-            laws, steps = _observers(loop, now, every, weights, settings, final)
+            further, more = estimated_laws(loop, law, every, weights, settings, models)
+            laws, steps = [*laws, *further], steps + more
         if not laws:
             row["reason"] = "no law is finite on the model; the law stays"
             return

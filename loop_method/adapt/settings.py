@@ -169,13 +169,6 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         1.0,
     )
-    filter_independent: float = setting(
-        0.3,
-        "share of the standard deviation of each wave that it assumes of initial fields besides the "
-        "covariance of those that were estimated",
-        0.0,
-        10.0,
-    )
     filter_inflation: float = setting(
         1.0, "factor of the standard deviations of its estimate in every step", 1.0, 2.0
     )
