@@ -111,7 +111,8 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     except ValueError as error:
         raise ParameterError(str(error)) from error
     if kind.needs_affine_law and law is not Affine and law.name not in kind.also_improves:
-        adapted = " and ".join((Affine.name, *kind.also_improves))
+        *names, last = Affine.name, *kind.also_improves
+        adapted = f"{', '.join(names)} and {last}" if names else last
         raise ParameterError(
             f"the optimizer '{values['optimizer']}' adapts only {adapted}, but the law is "
             f"'{values['law']}'; choose an optimizer that adapts any law, such as two_point"

@@ -172,7 +172,7 @@ def test_a_file_alone_does_not_run_it(
 
 @pytest.mark.parametrize(
     ("optimizer", "adapted"),
-    [("model_based", "affine and observer"), ("gauss_newton", "affine")],
+    [("model_based", "affine, observer and extended_kalman"), ("gauss_newton", "affine")],
 )
 def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     optimizer: str, adapted: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
