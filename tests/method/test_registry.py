@@ -106,10 +106,10 @@ def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
     assert training_parameters("burgers", none)["identification"] == "regression"
 
 
-def test_few_sensors_get_an_observer_unless_a_law_is_given() -> None:
+def test_few_sensors_get_an_estimate_of_the_field_unless_a_law_is_given() -> None:
     few = {"sensors": 16}
     found = training_parameters("burgers", few)
-    assert (found["law"], found["identification"]) == ("observer", "subspace")
+    assert (found["law"], found["identification"]) == ("extended_kalman", "subspace")
     others: list[dict[str, object]] = [
         {"sensors": 0},
         {"sensor_delays": 4},  # a memory of another kind
