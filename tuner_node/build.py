@@ -117,6 +117,11 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
             f"the optimizer '{values['optimizer']}' adapts only {adapted}, but the law is "
             f"'{values['law']}'; choose an optimizer that adapts any law, such as two_point"
         )
+    if law.needs_model and law.name not in kind.also_improves:
+        raise ParameterError(
+            f"the law '{law.name}' has a model of the plant in its parameters, which the optimizer "
+            f"'{values['optimizer']}' does not know; choose model_based, or the law 'observer'"
+        )
     if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
             f"the identification 'subspace' designs a filter, which the law '{law.name}' does not "

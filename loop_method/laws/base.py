@@ -86,6 +86,9 @@ class Law(ABC):
     """True if it uses the filter gain L, which its model then comes with (`model.L`)."""
     from_readings: ClassVar[str] = ""
     """Its preferred `identification` of a plant with few sensors; that of the optimiser if empty."""
+    needs_model: ClassVar[bool] = False
+    """True if its theta has a model of the plant, so that only an optimiser that knows it can adapt it
+    (`Optimizer.also_improves`)."""
     memory_size: int = 0
     cost: Cost | None = None
 

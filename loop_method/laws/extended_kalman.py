@@ -42,6 +42,7 @@ class ExtendedKalman(Observer):
     """
 
     name = "extended_kalman"
+    needs_model = True
     # It has no derivative: an estimate is not linear in the readings.
     pull_back = Law.pull_back
     pull_back_memory = Law.pull_back_memory

@@ -185,6 +185,17 @@ def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     assert told.count("\n") == 1 and not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("optimizer", ["two_point", RANDOM_SEARCH])
+def test_a_law_with_a_model_is_refused_with_an_optimizer_that_does_not_know_it(
+    optimizer: str,
+) -> None:
+    """It would change the equation in theta by chance."""
+    with pytest.raises(
+        ValueError, match="which the optimizer '.*' does not know; choose model_based"
+    ):
+        pdeloop.train(str(SMALL), law="extended_kalman", optimizer=optimizer, **BUDGET)
+
+
 @pytest.mark.parametrize("law", ["feedforward", "observer"])
 def test_an_optimizer_of_ones_own_knows_theta_alone(law: str) -> None:
     # The entries of F and G are much larger than gains, to which the size of a change is relative.
