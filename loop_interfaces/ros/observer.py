@@ -87,6 +87,11 @@ class EventLoop:
         return True
 
     @property
+    def stop_reason(self) -> str:
+        """The last reason that `stop` was given; empty if none was."""
+        return self._stop_reason or ""
+
+    @property
     def stopped(self) -> bool:
         """True once `stop` was called or ROS was shut down."""
         return self._stop_reason is not None or not self.node.context.ok()

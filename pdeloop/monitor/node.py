@@ -259,6 +259,8 @@ def show_loops(page: Page, finder: Finder, *, namespace: str | None, network: bo
         os.environ["ROS_DOMAIN_ID"] = str(live.domain)
         options = ["--ros-args", "--disable-external-lib-logs"]
         with ros_node("monitor", options, Observer) as (node, loop):
-            body = MonitorNode(node, loop, page, live, finder=finder, namespace=namespace)
-            if body.run().startswith("SIG"):
+            if stop.is_set():  # while the loop was looked for, or the node did not exist yet
                 return
+            MonitorNode(node, loop, page, live, finder=finder, namespace=namespace).run()
+        if loop.stop_reason.startswith("SIG"):  # also while the node was destroyed
+            return

@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,24 @@ PAINTED = """
 """How many different colours a canvas shows."""
 REFUSED = "WebSocket connection to"
 """What a browser always writes to the console while a server is away."""
+
+INTERRUPTED = """
+import os, signal
+from pathlib import Path
+from pdeloop.live import Live
+from pdeloop.monitor.node import show_loops
+from viewer_node.web.page import Page
+class Finder:
+    only_run, asked = None, False
+    def find(self):
+        if not self.asked:
+            os.kill(os.getpid(), signal.SIGINT)
+        self.asked = True
+        return Live(int(os.environ["ROS_DOMAIN_ID"]), None, 0.0)
+show_loops(Page(0), Finder(), namespace=None, network=False)
+print("ended")
+"""
+"""A monitor that gets an interrupt while it looks for a loop, and finds one."""
 
 
 @pytest.fixture
@@ -233,3 +252,9 @@ def test_a_port_in_use_and_a_folder_without_a_loop_are_told_in_one_line(loop, re
     text = loop.wait(loop.pdeloop("monitor", str(recorded)), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert line.endswith(f"is shown by: pdeloop report {recorded}")
+
+
+def test_an_interrupt_while_a_loop_is_looked_for_ends_the_monitor(loop: Processes) -> None:
+    assert "ended" in loop.wait(
+        loop.program(sys.executable, "-c", INTERRUPTED, name="monitor"), 60.0
+    )
