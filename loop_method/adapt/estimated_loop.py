@@ -98,7 +98,7 @@ def simulate_estimated(
     """Roll the law's vector theta out from the fields (F, n); the simulation has no features."""
     parts, model = law.parts(theta), loop.model
     assert isinstance(model, SensedModel)
-    T, count, every = loop.horizon, len(fields), model.n_z // model.sensors
+    T, count = loop.horizon, len(fields)
     states, actions = np.zeros((T + 1, *fields.shape)), np.zeros((T, count, model.n_a))
     costs, features = np.full(count, np.inf), np.empty((T, count, 0))
     known = law.filter(parts)
@@ -112,7 +112,7 @@ def simulate_estimated(
     with np.errstate(all="ignore"):
         for k in range(T):
             z = states[k]
-            y = z[:, every // 2 :: every] + noise[k]
+            y = z[:, model.seen] + noise[k]
             s = y @ law.model.U
             p = p if k else s
             x, S = known.measured(x, S, y)

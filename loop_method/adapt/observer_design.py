@@ -65,9 +65,8 @@ def compensators(
     """
     model = loop.model
     assert isinstance(model, SensedModel)
-    every = model.n_z // model.sensors
     z, a = law.simulation.states, law.simulation.actions
-    x, y = z @ law.loop.U, z[..., every // 2 :: every]
+    x, y = z @ law.loop.U, z[..., model.seen]
     n_s, steps = x.shape[2], len(a)
     weights = np.tile(law.weights / steps, steps)
     before = np.column_stack([x[:-1].reshape(-1, n_s), np.ones(weights.size)])

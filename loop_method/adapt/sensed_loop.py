@@ -65,11 +65,10 @@ class SensedLoop(ObservedLoop):
         return known[record]
 
     def _smooth(self, model: SensedModel, record: Record) -> tuple[Array, float]:
-        every = model.n_z // model.sensors
         steps = len(record.actions)
         if not steps or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
-        target, weight = self.target[every // 2 :: every], self.state_weight * every
+        target, weight = self.target[model.seen], self.state_weight * (model.n_z // model.sensors)
         smoothing = Smoothing(
             model.shared, model.actuators, model.noise, target, model.spread, self.settings
         )

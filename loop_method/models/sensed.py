@@ -161,11 +161,16 @@ class SensedModel(SpectralModel):
     spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
     largest: float = field(default=0.0, kw_only=True)
 
+    @property
+    def seen(self) -> slice:
+        """The grid points that are sensors."""
+        every = self.n_z // self.sensors
+        return slice(every // 2, None, every)
+
     def at_sensors(self, rows: Array) -> Array:
         """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
-        every = self.n_z // self.sensors
         found = np.zeros((self.n_z, rows.shape[1]))
-        found[every // 2 :: every] = rows
+        found[self.seen] = rows
         return found
 
     def arrays(self) -> Arrays:

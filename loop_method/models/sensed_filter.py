@@ -69,8 +69,7 @@ class SensedFilter:
 
     def measured(self, x: Array, S: Array, y: Array) -> tuple[Array, Array]:
         """After a reading: x (M, n), S (M, 33, n) and y (M, n_y)."""
-        every = self.model.n_z // self.model.sensors
-        seen = slice(every // 2, None, every)
+        seen = self.model.seen
         sigma = max(self.noise, _LEAST * float(np.abs(self.factor).max()), 1e-12)
         H = S[:, :, seen] / sigma
         D = np.eye(H.shape[1]) + H @ H.swapaxes(1, 2)
