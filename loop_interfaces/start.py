@@ -4,6 +4,7 @@
 The console scripts of the nodes are here; `python -m loop_interfaces.start NODE` does the same.
 """
 
+import gc
 import importlib
 import os
 import resource
@@ -14,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from loop_interfaces.module_path import leave_out_working_directory
+from loop_interfaces.quick_imports import quick_imports
 
 STOPPED_BY_SIGNAL = 130
 """Exit code."""
@@ -121,12 +123,14 @@ def run(node: str) -> int:
         die_with(int(parent))
     begin(node)
     try:
-        module = importlib.import_module(f"{node}.node")
+        with quick_imports():
+            module = importlib.import_module(f"{node}.node")
     except ModuleNotFoundError as error:
         if (needed := what_to_install(error)) is None:
             raise
         print(f"{node}: {needed}", file=sys.stderr)
         return REFUSED
+    gc.freeze()  # nor later: modules stay
     code: int = module.main()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 
 from loop_interfaces.problem import shipped_problems
+from loop_interfaces.quick_imports import quick_imports
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
@@ -95,8 +96,9 @@ def add(commands: Commands) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from pdeloop.pairs import Transport
-    from pdeloop.training_run import begin, reopen, resolve, run
+    with quick_imports():
+        from pdeloop.pairs import Transport
+        from pdeloop.training_run import begin, reopen, resolve, run
 
     recorded = options.record or options.record_or_stop
     if recorded:

@@ -1,0 +1,49 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Imports without what takes time at every start of a process, and is hardly ever used."""
+
+import contextlib
+import gc
+import importlib.util
+import sys
+from collections.abc import Iterator
+
+OF_NUMPY = ("numpy.f2py", "numpy.ma", "numpy.matlib", "numpy.testing")
+"""SciPy takes all names of NumPy, and so would load these."""
+REPORTER = "coverage"
+"""Numba tells it, where it is installed, which lines are compiled."""
+
+
+@contextlib.contextmanager
+def quick_imports() -> Iterator[None]:
+    """What is imported in this block is not looked through for garbage meanwhile.
+
+    From then on the modules OF_NUMPY load when they are used. Numba does without REPORTER, unless it
+    runs.
+    """
+    unreported = REPORTER not in sys.modules
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        if unreported:
+            sys.modules[REPORTER] = None  # type: ignore[assignment]  # as Python has it: not there
+        for name in OF_NUMPY:
+            load_when_used(name)
+        yield
+    finally:
+        if unreported:
+            del sys.modules[REPORTER]
+        if collected:
+            gc.enable()
+
+
+def load_when_used(name: str) -> None:
+    """Let a module of a package load when one of its names is first used; nothing if it is loaded."""
+    if name in sys.modules or (spec := importlib.util.find_spec(name)) is None:
+        return
+    assert spec.loader is not None
+    loader = spec.loader = importlib.util.LazyLoader(spec.loader)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    loader.exec_module(module)
+    package, _, own = name.rpartition(".")
+    setattr(sys.modules[package], own, module)
