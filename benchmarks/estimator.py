@@ -41,6 +41,7 @@ import numpy as np
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
+import pdeloop
 from benchmarks.bounds import (
     TRAINING_SEED,
     best_law,
@@ -50,8 +51,8 @@ from benchmarks.bounds import (
     law_costs,
     loop_of,
 )
+from benchmarks.families.cases import case_of
 from loop_interfaces.arrays import Array
-from loop_interfaces.problem import load_parameters
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.settings import ModelBasedSettings
 from pde_sim_node.build import build_plant
@@ -165,7 +166,7 @@ def run(
     Parameters
     ----------
     problems
-        Names, or files.
+        Names, also of the cases of `benchmarks.families`, or files.
     sensors
         How many there are.
     noise
@@ -191,7 +192,7 @@ def run(
             for count in sensors:
                 for sigma in noise:
                     given = {"sensors": count, "measurement_noise": sigma}
-                    sensed = build_plant(load_parameters(problem, given))
+                    sensed = build_plant(values_of(problem, given))
                     assert isinstance(sensed, InstrumentedPlant)
                     laws = [estimator(sensed, true, law, initial) for law in candidates]
                     tuned = [_cost(sensed, law, others) for law in laws]
@@ -202,11 +203,17 @@ def run(
     return rows
 
 
+def values_of(problem: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """All parameters of a problem with these of its own."""
+    case = case_of(problem)
+    return dict(pdeloop.problem(case.base or None, **case.parameters(), **given).values)
+
+
 def static_law(
     sensed: InstrumentedPlant, problem: str, given: Mapping[str, Any], fields: int
 ) -> Law:
     """The law a_k = K y_k + b of the newest readings of least cost over as many initial fields."""
-    values = load_parameters(problem, given)
+    values = values_of(problem, given)
     readings = np.eye(values["n_z"])[:, sensed.positions]
     loop = closed_loop(values, readings)
     initial = initial_fields(sensed.plant, evaluation_seeds(TRAINING_SEED, fields))
@@ -220,7 +227,7 @@ def _whole(
     problem: str, seed: int, fields: int, seeds: Sequence[int]
 ) -> tuple[Plant, list[Law], dict[str, Any]]:
     """The plant, laws of the whole field, and their costs on held-out fields."""
-    values = load_parameters(problem, {"seed": seed})
+    values = values_of(problem, {"seed": seed, "optimizer": "gauss_newton"})
     true, loop, first = loop_of(values, "gauss_newton")
     initial = initial_fields(true, evaluation_seeds(TRAINING_SEED, fields))
     theta = best_law(loop, first, initial)

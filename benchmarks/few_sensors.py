@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-import pdeloop
-from benchmarks.general import number
+from benchmarks.families.cases import case_of
+from benchmarks.general import number, trained
 from benchmarks.kept import errors, kept_row, rows_of
 from loop_method.adapt.estimate import mean_of
 
@@ -45,7 +45,7 @@ def run(
     Parameters
     ----------
     problems
-        Names, or files.
+        Names, also of the cases of `benchmarks.families`, or files.
     sensors
         How many there are.
     noise
@@ -73,14 +73,14 @@ def train(task: Task, *, rollouts: int, folder: Path) -> dict[str, Any]:
     """One training; its costs on the held-out fields, or the error that ended it."""
     problem, sensors, noise, law, seed = task
     label = f"{Path(problem).stem}-{sensors}-{noise:g}-{law}-{seed}-{rollouts}"
-    case = {"problem": problem, "sensors": sensors, "noise": noise, "law": law, "seed": seed}
+    row = {"problem": problem, "sensors": sensors, "noise": noise, "law": law, "seed": seed}
 
     def costs() -> dict[str, float]:
-        given: dict[str, Any] = {"sensors": sensors, "measurement_noise": noise, "law": law}
-        done = pdeloop.train(problem, rollouts=rollouts, seed=seed, **given)
+        case, given = case_of(problem), {"sensors": sensors, "measurement_noise": noise}
+        done = trained(case, rollouts=rollouts, seed=seed, law=law, **given)
         return {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
 
-    return kept_row(folder / f"{label}.json", case, costs)
+    return kept_row(folder / f"{label}.json", row, costs)
 
 
 def line(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -120,6 +120,9 @@ CASES: dict[str, Case] = {
     "allen-cahn-modes, unequal actuators": varied(
         "allen-cahn-modes", actuator_positions=TWELVE_ACTUATORS
     ),
+    "allen-cahn-modes, unequal strengths": Case(
+        "variations", "allen-cahn-modes", {}, {}, "AllenCahnUnequal"
+    ),
     "allen-cahn-modes, target 0": varied("allen-cahn-modes", {"target_amplitude": 0.0}),
     "kdv, sampled every 0.1": varied("kdv", sample_time=0.1, horizon=60),
     "kdv-modes, action weight 0.1": replace(varied("kdv-modes", action_weight=0.1), law_fields=192),
@@ -182,3 +185,8 @@ CASES: dict[str, Case] = {
     "random linear": foreign("RandomLinear"),
 }
 """By name; nobody may choose a constant of the method on the seeds of `general.TABLE_SEEDS`."""
+
+
+def case_of(problem: str) -> Case:
+    """The case of this name, else that of a shipped problem or of a file, as it is."""
+    return CASES.get(problem) or Case("", problem)

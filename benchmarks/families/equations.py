@@ -8,6 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from pde_sim_node.equations import Field, RandomModes, Spectrum, parameter
+from pde_sim_node.equations.random_modes import AllenCahnModes
+from pde_sim_node.supports import indicator_supports
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,3 +186,14 @@ class SteepTarget(RandomModes):
     def target(self, x: Field) -> Field:
         fronts: Field = 0.1 * np.tanh(4 * np.cos(2 * np.pi * x / self.length))
         return fronts
+
+
+@dataclass(frozen=True, kw_only=True)
+class AllenCahnUnequal(AllenCahnModes):
+    """Allen-Cahn with actuators whose strengths are 0.5, 1 and 1.5 in turn."""
+
+    name: ClassVar[str] = "allen-cahn-unequal"
+
+    def supports(self, x: Field, n_a: int, width: float) -> Field:
+        own: Field = indicator_supports(len(x), n_a, width) * (0.5 + np.arange(n_a) % 3 / 2)
+        return own

@@ -28,7 +28,7 @@ from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
 from loop_method.adapt.observer_design import compensators
 from loop_method.adapt.progress import JUDGING, RENEWING
-from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
@@ -63,6 +63,20 @@ class ModelBasedSensed(ModelBasedReadings):
         if self._sensed is None:
             return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last
+
+    def _renew(self, row: Row) -> None:
+        """Where laws run too far away to be fitted, rollouts without control show the equation."""
+        super()._renew(row)
+        if self._progress.stage != RENEWING or self._sensed is not None or not self._attempts_left():
+            return
+        if not any(own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]):
+            self._progress.policy = self._none.copy()
+            row["reason"] = "no equation is found, and the law runs away: no control follows"
+
+    def _attempts_left(self) -> bool:
+        """True if an equation is looked for again after the next rollouts."""
+        tried = self._records.count // self._settings.judging
+        return tried + 1 < self._context.field_models.sensed_attempts
 
     def _believe(self) -> Belief | None:
         """In an equation where one reproduces the readings, else in a model of the readings.

@@ -150,6 +150,18 @@ def can_be_sensed(context: Context) -> bool:
     return context.periodic and sensors == len(context.target) and 0 < sensors <= most
 
 
+def to_be_fitted(
+    context: Context, records: Sequence[Record]
+) -> tuple[ClosedLoopProblem, list[Record]]:
+    """The problem between the sensors, and the rollouts in a fit; the first one is an exploration."""
+    problem = ClosedLoopProblem(
+        context.U, context.target, context.state_weight, context.action_weight, context.horizon
+    )
+    settings = context.field_models
+    largest_cost = settings.sensed_largest_cost * problem.cost_of(records[0])
+    return problem, whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
+
+
 def sensed_from(
     context: Context, records: Sequence[Record], before: SensedModel | None
 ) -> tuple[SensedModel, float] | None:
@@ -158,11 +170,7 @@ def sensed_from(
     before: the model of earlier rollouts, whose equation and spread the fit starts from.
     """
     sensors, n_a, settings = context.sensors, records[0].actions.shape[1], context.field_models
-    problem = ClosedLoopProblem(
-        context.U, context.target, context.state_weight, context.action_weight, context.horizon
-    )
-    largest_cost = settings.sensed_largest_cost * problem.cost_of(records[0])
-    chosen = whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
+    problem, chosen = to_be_fitted(context, records)
     if not chosen:
         return None
     actuators = context.actuators(n_a)

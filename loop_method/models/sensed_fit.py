@@ -98,40 +98,50 @@ def fit_sensed(
         known = None if near is None else coefficients_of(near)
         found = _refined(problem, start, fields, known, settings)
     else:
-        calm, *driven = few_rollouts(y, a)
-        found = _from_few(problem, calm, settings, np.inf)
-        enough = settings.sensed_reproduced
-        if driven and found[0] > enough:
-            # A fit to all rollouts takes long: only from what is an equation of these two.
-            own = _from_few(problem, driven[0], settings, enough)
+        first, *others = few_rollouts(y, a, settings.sensed_starts)
+        found, enough = _from_few(problem, first, settings, np.inf), settings.sensed_reproduced
+        for few in others:
+            if found[0] <= enough:
+                break
+            # A fit to all rollouts takes long: only from what is an equation of these few.
+            own = _from_few(problem, few, settings, enough)
             found = min(found, own, key=lambda each: each[0])
     error, shared, fields = found
     return shared, field_of(fields, n), max(error, 0.0)
 
 
-def few_rollouts(y: Array, a: Array) -> list[list[int]]:
-    """Pairs of rollouts that a fit from nothing begins with, one after the other.
+def few_rollouts(y: Array, a: Array, most: int) -> list[list[int]]:
+    """Sets of rollouts that a fit from nothing begins with, one after the other; so many at most.
 
     The calmest one with inputs and the calmest of the others, from which most descents find the
-    equation. Where they show too little of it, the calmest one and that with the largest inputs.
+    equation. Where they show too little of it, the calmest one and that with the largest inputs. Then
+    each of these by itself, as one rollout is reproduced more easily, and the calmest one with each of
+    the others.
     """
     calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
     acted = [m for m in calmest if a[m].any()]
     driven = np.argsort(-np.sum(a * a, axis=(1, 2)), kind="stable").tolist()
     pairs = [list(dict.fromkeys([*acted[:1], *own]))[:2] for own in (calmest, driven)]
-    return pairs if set(pairs[1]) != set(pairs[0]) else pairs[:1]
+    first = pairs[0][:1]
+    alone = [first, [m for m in pairs[1] if m not in first]]
+    others = [[*first, m] for m in calmest if m not in first]
+    every: list[list[int]] = []
+    for few in (*pairs, *alone, *others):
+        if few and few not in every:
+            every.append(few)
+    return every[:most]
 
 
 def _from_few(
-    problem: SensedProblem, pair: list[int], settings: FieldModelSettings, most: float
+    problem: SensedProblem, few: list[int], settings: FieldModelSettings, most: float
 ) -> Found:
-    """The fit to all rollouts from what a pair of them suggests, and with further terms.
+    """The fit to all rollouts from what a few of them suggest, and with further terms.
 
-    most: the error on the pair from which on there is none, of infinite error.
+    most: the error on these from which on there is none, of infinite error.
     """
     problem.prior.forget()
     fields = problem.interpolated()
-    error, shared, fields[pair] = _first_guess(problem.part(pair, hold=True), settings)
+    error, shared, fields[few] = _first_guess(problem.part(few, hold=True), settings)
     if not np.isfinite(error) or error > most:
         return np.inf, shared, fields
     found = _refined(problem, shared, fields, None, settings, first=True)

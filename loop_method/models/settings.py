@@ -203,6 +203,9 @@ class FieldModelSettings(Settings):
     sensed_attempts: int = setting(
         5, "maximum number of times that an equation is looked for in vain", 1, 1000
     )
+    sensed_starts: int = setting(
+        8, "maximum number of sets of a few rollouts from which an equation is looked for", 1, 1000
+    )
     sensed_largest_cost: float = setting(
         3.0, "maximum cost of a rollout in a fit, per cost of the exploration", 1, 1e6
     )

@@ -383,6 +383,27 @@ def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_aga
     assert models[2] == "innovations" and models[3] == "sensed"
 
 
+@pytest.mark.parametrize("far", [1.0, 100.0])
+def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far: float) -> None:
+    """Its rollouts show none; those of a law that stays near may."""
+    before, *_ = told()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model_based_sensed, "sensed_from", lambda *_: None)
+        own = optimiser(rollouts=20, judging=3, first=before.policy)
+        assert all(asked.policy.any() for asked in own.ask())
+        results = [measured(asked) for asked in own.ask()]
+        seen = [result.trajectory for result in results if result.trajectory is not None]
+        row = own.tell(
+            [
+                replace(result, trajectory=Trajectory(far * known.states, far * known.actions))
+                for result, known in zip(results, seen, strict=True)
+            ]
+        )
+        runs_away = far > 1.0
+        assert ("no control follows" in str(row.get("reason"))) is runs_away
+        assert all(asked.policy.any() is not np.bool_(runs_away) for asked in own.ask())
+
+
 def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
     _, context = small()
     other = Context(**{**vars(context), "periodic": False})

@@ -16,9 +16,10 @@ def test_a_fit_begins_with_the_calmest_rollouts_and_then_with_the_largest_inputs
     y, a = np.ones((4, 2, 1)), np.zeros((4, 2, 1))
     y *= np.array([3.0, 1.0, 4.0, 2.0])[:, None, None]
     a[[0, 2, 3], 0] = np.array([[5.0], [1.0], [2.0]])
-    assert few_rollouts(y, a) == [[3, 1], [3, 0]]
-    assert few_rollouts(y[:2], a[:2]) == [[0, 1]]
-    assert few_rollouts(y[1:2], a[1:2]) == [[0]]
+    assert few_rollouts(y, a, 2) == [[3, 1], [3, 0]]
+    assert few_rollouts(y, a, 8) == [[3, 1], [3, 0], [3], [0], [3, 2]]
+    assert few_rollouts(y[:2], a[:2], 8) == [[0, 1], [0], [1]]
+    assert few_rollouts(y[1:2], a[1:2], 8) == [[0]]
 
 
 def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_inputs() -> None:
@@ -32,7 +33,7 @@ def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_i
     fields = [np.cos(2 * np.pi * (x - shift)) for shift in (0.1, 0.4)]
     readings = [*1e-3 * random.normal(size=(2, STEPS, SENSORS))]
     readings += [readings_of(model, a, z) for a, z in zip(actions[2:], fields, strict=True)]
-    assert set(few_rollouts(np.stack(readings), actions)[0]) == {0, 1}
+    assert set(few_rollouts(np.stack(readings), actions, 1)[0]) == {0, 1}
     _, _, alone = fit_sensed(readings[:2], list(actions[:2]), DECLARED)
     _, _, error = fit_sensed(readings, list(actions), DECLARED)
     assert alone == np.inf and error < 1e-4
