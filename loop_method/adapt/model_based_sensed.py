@@ -67,9 +67,15 @@ class ModelBasedSensed(ModelBasedReadings):
     def _renew(self, row: Row) -> None:
         """Where laws run too far away to be fitted, rollouts without control show the equation."""
         super()._renew(row)
-        if self._progress.stage != RENEWING or self._sensed is not None or not self._attempts_left():
+        if (
+            self._progress.stage != RENEWING
+            or self._sensed is not None
+            or not self._attempts_left()
+        ):
             return
-        if not any(own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]):
+        if not any(
+            own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]
+        ):
             self._progress.policy = self._none.copy()
             row["reason"] = "no equation is found, and the law runs away: no control follows"
 
