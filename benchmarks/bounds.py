@@ -19,7 +19,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 import pdeloop
 from benchmarks.descent import Descent, descend
@@ -27,6 +26,7 @@ from benchmarks.families.cases import Case
 from benchmarks.true_model import TrueModel
 from benchmarks.warm_start import warm_start
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import cheapest, curvature_of, improve
@@ -77,7 +77,7 @@ def bounds_of(case: Case, seed: int, held_out: Sequence[int]) -> dict[str, Array
     seed: of the training whose basis and first law are taken; held_out: seeds of the fields.
     """
     values = dict(pdeloop.problem(case.base or None, seed=seed, **case.parameters()).values)
-    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+    with one_thread(), np.errstate(all="ignore"):
         plant, loop, first = loop_of(values, values["optimizer"])
         own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, case.law_fields))
         theta = best_law(loop, first, own)

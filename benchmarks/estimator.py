@@ -39,7 +39,6 @@ from typing import Any
 
 import numpy as np
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 import pdeloop
 from benchmarks.bounds import (
@@ -53,6 +52,7 @@ from benchmarks.bounds import (
 )
 from benchmarks.families.cases import case_of
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.settings import ModelBasedSettings
 from pde_sim_node.build import build_plant
@@ -184,7 +184,7 @@ def run(
     rows = []
     seeds, others = evaluation_seeds(evaluation, FIELDS), evaluation_seeds(TRAINING_SEED, FIELDS)
     # Laws on the way to a better one may overflow.
-    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+    with one_thread(), np.errstate(all="ignore"):
         for problem in problems:
             true, candidates, known = _whole(problem, seed, fields, seeds)
             drawn = evaluation_seeds(TRAINING_SEED, draws or SAMPLES)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
-from threadpoolctl import threadpool_limits
 
 from benchmarks.estimators import Experiment, Identified, KalmanLaw, LikeliestField
 from benchmarks.warm_start import warm_start
@@ -22,6 +21,7 @@ from controller_node.identification import identify
 from controller_node.policy import excitation
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import unpack
+from loop_interfaces.one_thread import one_thread
 from loop_method.design import lqt
 from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
@@ -52,7 +52,7 @@ def measure(
         As of `pdeloop.study.training.train_one`, whose result.json this one's is like.
     """
     here = require_environment(expected)
-    with threadpool_limits(limits=1):
+    with one_thread():
         pair, law, paid = METHODS[method](values, **constants)
         costs = rollout(pair.plant, law, evaluation_fields(values), keep=False).costs.mean
     result = {

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from benchmarks.baselines import pairs
 from benchmarks.bounds import (
@@ -41,6 +40,7 @@ from benchmarks.descent import WINDOW, Descent
 from benchmarks.limits import content
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.reproduction import PAPER
@@ -79,7 +79,7 @@ def law_of(
     -------
     Its mean cost on the fields, the law, and the costs by field of the laws lqt and optimum.
     """
-    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+    with one_thread(), np.errstate(all="ignore"):
         plant, loop, first = loop_of({**values, "seed": seed}, "gauss_newton")
         own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, fields))
         best = best_law(loop, first, own, tolerance)
@@ -98,7 +98,7 @@ def inputs_of(
 ) -> tuple[float, Descent]:
     """The cost of the best inputs of one initial field, and the descent to them from a law."""
     U, theta = law
-    with threadpool_limits(limits=1), np.errstate(all="ignore"):
+    with one_thread(), np.errstate(all="ignore"):
         field = initial_fields(build_plant(values), [field_seed])
         costs, found = best_inputs(closed_loop(values, U), theta, field, tolerance)
     return float(costs[0]), found

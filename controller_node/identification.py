@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.parameters import model_order
 from loop_interfaces.signature import CONSTANTS
 from loop_interfaces.spec import IDENTIFICATION_SETTINGS
@@ -269,7 +269,7 @@ def designed(
         return Designed(
             lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows
         )
-    with threadpool_limits(limits=1):  # as in the identification itself
+    with one_thread():  # as in the identification itself
         found = field_law(
             [*trajectories, *further],
             target,

@@ -17,7 +17,7 @@ from controller_node.policy import ProjectedLaw, checked_index
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import digest
 from loop_method.laws.base import Law, Parts
-from loop_method.laws.calls import action, one_thread, updated
+from loop_method.laws.calls import action, arithmetic_of_laws, updated
 
 
 class MemoryUnknownError(Exception):
@@ -104,7 +104,7 @@ class LawBatch:
         if self.compiled is not None:
             return self.compiled.actions(states)
         if not self.remembers:
-            with one_thread():
+            with arithmetic_of_laws():
                 return self._computed(step, states)
         seen = digest(states)
         if step in self._answered:
@@ -121,7 +121,7 @@ class LawBatch:
             raise MemoryUnknownError(
                 f"the states before step {step} are not known, or not all of them"
             )
-        with one_thread():
+        with arithmetic_of_laws():
             actions = self._computed(step, states)
             self._memories = [
                 updated(law, theta, z, memory, a, step)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
 from loop_method.laws.base import Law, differentiable
-from loop_method.laws.calls import action, one_thread, updated
+from loop_method.laws.calls import action, arithmetic_of_laws, updated
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
@@ -202,7 +202,7 @@ class Gradients:
             rows = [updated(law, parts, *own, k) for own in zip(z, rows, a, strict=True)]
             return a
 
-        with one_thread():
+        with arithmetic_of_laws():
             episode = self._roll(fields, acted)
             return self._gradient_of_theta(law, given, episode, memories)
 

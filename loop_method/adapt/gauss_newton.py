@@ -26,9 +26,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.adapt.base import (
     Context,
     Optimizer,
@@ -313,7 +313,7 @@ class GaussNewton(Optimizer):
         fresh = (self.next_field + np.arange(left)).tolist()
         if now.believed:
             rng = np.random.default_rng([self._seed, _CONFIRMING])
-            with threadpool_limits(limits=1):
+            with one_thread():
                 judging = fresh[: self._settings.judging]
                 comparison = self._proposer.comparison(
                     self._laws, known, now.believed, judging, rng
@@ -348,7 +348,7 @@ class GaussNewton(Optimizer):
         if costs and np.isfinite(costs).all():
             row["cost"] = float(np.mean(costs))
         row["rollouts"] = self._records.count
-        with threadpool_limits(limits=1):
+        with one_thread():
             verdict = self._proposer.verdict(comparison, self._laws, before, fresh)
         now.policy = comparison.law
         self._comparison = None
@@ -379,7 +379,7 @@ class GaussNewton(Optimizer):
         count = self._records.count
         # To find that no model of the whole field is good enough takes long.
         again = bool(now.believed) or count >= 2 * now.tried
-        with threadpool_limits(limits=1):
+        with one_thread():
             proposal = self._proposer.propose(
                 self._records.all(),
                 [self._records[int(stamp)] for stamp in now.incumbents],

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
+from loop_interfaces.one_thread import one_thread
 from loop_method.adapt.base import (
     Context,
     Optimizer,
@@ -180,7 +180,7 @@ class CostInCoordinates(Cost):
         """R, and its aims Q^T w_k as rows, both with one number more for what no x can reach."""
         E = self._whole.residual(W, terminal=terminal)
         w = np.atleast_2d(self._whole.residual_target(terminal=terminal))
-        with threadpool_limits(limits=1):
+        with one_thread():
             Q, R = linalg.qr(E, mode="economic")
             aims = w @ Q
             beyond = linalg.norm(w - aims @ Q.T, axis=1)

@@ -18,9 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.adapt.base import (
     Context,
     Optimizer,
@@ -172,7 +172,7 @@ class ModelBased(Optimizer):
             self._records.validated_samples(result)
         self._progress.tells += 1
         # One thread: a threaded LAPACK rounds differently for another number of threads.
-        with threadpool_limits(limits=1):
+        with one_thread():
             if self._progress.stage == SEARCHING:
                 row = self._search(results)
             added = [

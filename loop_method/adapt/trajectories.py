@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
 from loop_method.models.denoising import cleaned_states
 from loop_method.reduce.snapshots import LARGE, factored
@@ -27,7 +27,7 @@ class LowRankTrajectory(Trajectory):
     @property
     def states(self) -> Array:
         """The states, made anew each time."""
-        with threadpool_limits(limits=1):
+        with one_thread():
             whole: Array = self.coordinates @ self.modes
         return whole
 

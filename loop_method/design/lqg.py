@@ -29,11 +29,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.one_thread import one_thread
 from loop_method.design.lqt import DesignError, track_outputs
 from loop_method.reduce.reduced_model import ReducedModel, Steps, repeated, steps_of
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
@@ -105,7 +105,7 @@ def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: A
     (array([[0.618034]]), array([[1.618034]]))
     """
     A, C, W, V = (np.asarray(part, dtype=np.float64) for part in (A, C, process, measurement))
-    with threadpool_limits(limits=1):
+    with one_thread():
         require_detectable(A, C)
         try:
             P = linalg.solve_discrete_are(A.T, C.T, W, V)
@@ -201,7 +201,7 @@ def with_filter(
     settings: IdentificationSettings = DEFAULTS,
 ) -> ModelRows:
     """A reduced model with the gain of its Kalman filter; parameters as of `noise_of`."""
-    with threadpool_limits(limits=1):
+    with one_thread():
         noise = noise_of(rows, trajectories, sigma, settings)
     found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)
     return replace(rows, L=found.M)
@@ -260,7 +260,7 @@ def law_of_innovations(
         cost = Cost(
             n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
         )
-    with threadpool_limits(limits=1):
+    with one_thread():
         require_detectable(A, C)
         seen = ReducedModel(A, B, model.U @ C)
         gains = track_outputs(seen, cost)

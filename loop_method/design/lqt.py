@@ -27,10 +27,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.reduced_model import ReducedModel
 
 # A direction that the inputs move by less than this, relative to what they move at most, counts as out
@@ -137,7 +137,7 @@ def track(
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
     # One thread: a threaded LAPACK rounds differently for another number of threads.
-    with threadpool_limits(limits=1):
+    with one_thread():
         unit, level = _units(model, state_weight)
         B = model.B * unit
         Q = state_weight / level * np.eye(model.n_s)
@@ -153,7 +153,7 @@ def track_outputs(model: ReducedModel, cost: Cost) -> Gains:
 
     The columns of U need not be orthonormal: it is what the state looks like, z = U s.
     """
-    with threadpool_limits(limits=1):
+    with one_thread():
         E, R = cost.residual(model.U), cost.action_matrix
         P, S, K_a, poles = _feedback(model, model.B, E.T @ E, R)
         # The steady state of p and b of the tracking over a horizon.

@@ -3,34 +3,29 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.own_code import OwnCodeError, called
 from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law, Parts
 
 MAX_NUMBER = 1e9
 """Largest magnitude of an action or a memory; what exceeds it, or is not finite, counts as this."""
-_blas: tuple[int, ThreadpoolController] | None = None
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """One LAPACK thread during the call, because the number of threads changes the rounding."""
-    global _blas
-    if _blas is None or _blas[0] != len(sys.modules):  # another library may have been loaded
-        _blas = len(sys.modules), ThreadpoolController()
-    with _blas[1].limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
+def arithmetic_of_laws() -> Iterator[None]:
+    """One thread of linear algebra, and no warning of numbers that are too large."""
+    with one_thread(), np.errstate(over="ignore", invalid="ignore"):
         yield
 
 
@@ -60,7 +55,7 @@ def _copied(model: ModelRows) -> ModelRows:
 
 
 def _checked(kind: type[Law], model: ModelRows, horizon: int, cost: Cost | None) -> Law:
-    with one_thread():
+    with arithmetic_of_laws():
         law: Law = _called(kind.name, "__init__", kind, model, horizon)
         law.cost = cost
         _called(kind.name, "start", law.start)  # by itself, so that an error names its line
@@ -119,7 +114,7 @@ def updated(law: Law, theta: Parts, z: Array, memory: Array, a: Array, k: int) -
 def along(law: Law, theta: Array, states: Array, actions: Array) -> Array:
     """The law's actions along a trajectory: states (L, n_z) and actions (L, n_a) that were seen."""
     parts, found = law.parts(theta), np.empty_like(actions)
-    with one_thread():
+    with arithmetic_of_laws():
         memory = law.memory_start()
         for k, (z, a) in enumerate(zip(states, actions, strict=True)):
             found[k] = action(law, parts, z, memory, k)

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
 from loop_method.models.denoising import cleaned_states
 from loop_method.models.kinds import Kind, kinds_of
@@ -94,7 +94,7 @@ def fit_field_model(
         kinds = [kind for kind in kinds if kind.fit_noisy is not None]
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
-    with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load
+    with one_thread():  # a rounding must not depend on the machine's load
         for kind in kinds:
             least = min(judged.values(), default=np.inf)
             if not least > kind.needed:

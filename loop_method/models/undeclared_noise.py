@@ -16,9 +16,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured
 from loop_method.models.choice import FittedModel, fit_field_model, limited, with_clean
 from loop_method.models.noise_level import noise_level, share_of_noise, short_waves
@@ -83,7 +83,7 @@ def fit_undeclared_noise(
     if found is None or found.error > most or not found.error < better_than:
         return None
     known = with_clean([limited(rollout, action_limit) for rollout in rollouts], noise)
-    with threadpool_limits(limits=1):
+    with one_thread():
         left = innovations(found.model, known, noise, settings)
     if left is None:
         return None

@@ -21,9 +21,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels, cut_off
 from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
 from loop_method.reduce.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
@@ -66,7 +66,7 @@ def truncated_dmdc(
     check_sizes(p, n_s, n_z=n_z, n_a=n_a, steps=steps)
 
     # One thread: a threaded LAPACK rounds differently for another number of threads.
-    with threadpool_limits(limits=1):
+    with one_thread():
         basis, _ = leading_modes(data.after, n_s, channels)
         examine_steps(data, basis, channels).require()
         stacked = np.vstack([data.before.T, data.inputs.T])
@@ -92,7 +92,7 @@ def truncation_remarks(
 ) -> list[str]:
     """Name the inputs that p directions of [Z; Y] hardly keep."""
     data = steps_of(trajectories)
-    with threadpool_limits(limits=1):
+    with one_thread():
         stacked = np.vstack([data.before.T, data.inputs.T])
         psi, _, _ = linalg.svd(stacked, full_matrices=False)
     kept = _kept(psi, data.inputs.shape[1], p)

@@ -29,9 +29,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce import channels as words
 from loop_method.reduce.channels import NUMBERED, Channels, constant, scaled
 from loop_method.reduce.reduced_model import (
@@ -115,7 +115,7 @@ def examine(
         What the sentences call states and inputs.
     """
     data = steps_of(trajectories)
-    with threadpool_limits(limits=1):  # as in the identification itself
+    with one_thread():  # as in the identification itself
         found = examine_steps(data, U, channels)
     remarks = list(found.remarks)
     if copies := repeated(trajectories):
@@ -134,7 +134,7 @@ def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) ->
     trajectory : (states (N + 1, n_z), actions (N, n_a))
     """
     data = steps_of([trajectory])
-    with threadpool_limits(limits=1):
+    with one_thread():
         U = linalg.svd(data.after, full_matrices=False)[2][:1].T
         return examine_steps(data, U, channels)
 

@@ -24,9 +24,9 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels, scaled
 from loop_method.reduce.identifiability import examine_steps
 from loop_method.reduce.reduced_model import (
@@ -166,7 +166,7 @@ def study_orders(
         raise ValueError(f"orders holds {wrong[0]!r}; expected whole numbers")
     tried = sorted({n for n in asked if n >= 1})
     errors, scales = [], np.zeros(2)
-    with threadpool_limits(limits=1):  # as in the identification itself
+    with one_thread():  # as in the identification itself
         singular_values: Array = linalg.svdvals(everything.after)
         if len(everything.inputs) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()

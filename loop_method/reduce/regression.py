@@ -24,9 +24,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels, scaled
 from loop_method.reduce.identifiability import examine_steps
 from loop_method.reduce.reduced_model import ReducedModel, Steps, leading_modes, steps_of
@@ -77,7 +77,7 @@ def exact_regression(
     steps, n_a = data.inputs.shape
     check_sizes(n_s, n_a, steps)
     # One thread: a threaded LAPACK rounds differently for another number of threads.
-    with threadpool_limits(limits=1):
+    with one_thread():
         U, _ = leading_modes(data.after, n_s, channels)
         examine_steps(data, U, channels).require()
         return fit(data, U)

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 
 LARGE = 2048
 """States of more numbers than this are kept as coordinates."""
@@ -39,7 +39,7 @@ def factored(states: Array) -> tuple[Array, Array]:
     >>> C.shape, bool(np.allclose(C @ V, np.outer([1.0, 2.0, 3.0], [0.6, 0.8, 0.0])))
     ((3, 1), True)
     """
-    with threadpool_limits(limits=1):  # a threaded LAPACK rounds differently
+    with one_thread():  # a threaded LAPACK rounds differently
         left, values, right = linalg.svd(states, full_matrices=False)
     kept = max(int(np.count_nonzero(values > ROUNDED * linalg.norm(values))), 1)
     return left[:, :kept] * values[:kept], np.ascontiguousarray(right[:kept])
@@ -72,7 +72,7 @@ class SnapshotBasis:
         room = CAPACITY - len(self.rows)
         if room <= 0 or not len(states):
             return
-        with threadpool_limits(limits=1):
+        with one_thread():
             left = states - (states @ self.rows.T) @ self.rows
             # Again, as the first time leaves rounding errors of what is inside.
             left -= (left @ self.rows.T) @ self.rows
@@ -86,6 +86,6 @@ class SnapshotBasis:
     def coordinates(self, states: Array) -> Array:
         """x of states (N, n_z), (N, CAPACITY)."""
         found = np.zeros((len(states), CAPACITY))
-        with threadpool_limits(limits=1):
+        with one_thread():
             found[:, : len(self.rows)] = states @ self.rows.T
         return found

@@ -37,9 +37,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
 from loop_method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
@@ -120,7 +120,7 @@ def subspace_model(
         for number, (z, a) in enumerate(trajectories)
         if number not in copies
     ]
-    with threadpool_limits(limits=1):
+    with one_thread():
         pasts = (past,) if past else PASTS
         # The data may not determine as many states as were asked for.
         asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)] or [ORDERS]

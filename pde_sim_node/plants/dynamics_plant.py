@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
@@ -67,8 +66,6 @@ class DynamicsPlant(BatchPlant):
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
         self.supports = None if dynamics.supports is None else self._checked_supports()
-        self._blas: ThreadpoolController | None = None
-        self._modules = 0
         self._mean: Array | None = None
 
     def __repr__(self) -> str:
@@ -76,10 +73,6 @@ class DynamicsPlant(BatchPlant):
             f"{type(self).__name__}({self.name}: state of {self.n_z}, {self.n_a} actuators, "
             f"{self.horizon} steps of {self.sample_time:g})"
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the handles of libraries of this process."""
-        return vars(self) | {"_blas": None}
 
     def _checked_grid(self) -> Grid:
         grid, n_z = self.dynamics.grid, whole("n_z", self.dynamics.n_z, 0)
@@ -220,10 +213,8 @@ class DynamicsPlant(BatchPlant):
 
     def _call(self, method: str, *arguments: Any) -> Any:
         """Call a method of the object, with one LAPACK thread: more of them round otherwise."""
-        if self._blas is None or self._modules != len(sys.modules):  # it may have loaded another
-            self._blas, self._modules = ThreadpoolController(), len(sys.modules)
         function = getattr(self.dynamics, method)
-        with self._blas.limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
+        with one_thread(), np.errstate(over="ignore", invalid="ignore"):
             return called(f"{self.name}.{method}", function, *arguments)
 
     def _numbers(self, method: str, returned: Any, count: int) -> Array:
