@@ -9,8 +9,13 @@ import inspect
 
 import scipy.fft
 import scipy.special  # noqa: F401  # for what a training needs at its end
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.type_support import check_for_type_support
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from type_description_interfaces.srv import GetTypeDescription
 
 import controller_node.node
 import pde_sim_node.node
@@ -18,6 +23,7 @@ import recorder_node.node
 import tests.support.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
+from loop_interfaces.one_thread import one_thread
 from pdeloop import cli
 from tests.support.compiled import COMPILED
 
@@ -35,6 +41,9 @@ for load in COMPILED.values():
     load()
 # Looks through all modules, as rclpy does for a node's first line of a log.
 inspect.getmodule(inspect.currentframe())
-check_for_type_support(ParameterEvent)  # imports a generator of code, as each node would
+for kind in (ParameterEvent, DiagnosticArray, Clock, String, Trigger, GetTypeDescription):
+    check_for_type_support(kind)  # loads libraries, and a generator of code, as each node would
+with one_thread():  # looks for libraries
+    pass
 gc.collect()
 gc.freeze()  # a collection in a forked process would write to, and so copy, all of this
