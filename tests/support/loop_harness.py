@@ -27,9 +27,12 @@ from typing import Any
 
 import pytest
 
+import pdeloop.domain
+import pdeloop.live
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.start import die_with
 from pde_sim_node import run_record
+from pdeloop import supervisor
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 from tests.support import forked_nodes
 
@@ -121,6 +124,9 @@ def become(log: Path, environment: Mapping[str, str]) -> None:
     assert PRELOADED in sys.modules, "forked from a process that could not load anything"
     os.environ.clear()
     os.environ.update(environment)
+    tempfile.tempdir = None  # which it looks for again, as a program that starts
+    domains = Path(tempfile.gettempdir()) / DOMAINS_FOLDER.name
+    pdeloop.domain.DOMAINS_FOLDER = pdeloop.live.DOMAINS_FOLDER = domains
     os.chdir(log.parent)
 
 
@@ -199,7 +205,8 @@ class Processes:
         """Start one of our nodes."""
         if self.forks:
             return self._fork(self._new_log(name), name, "--ros-args", *ros_arguments)
-        return self.start("-m", f"{name}.node", "--ros-args", *ros_arguments, name=name)
+        words = ("-m", supervisor.START, name, "--ros-args", *ros_arguments)
+        return self.start(*words, name=name)
 
     def pdeloop(self, *arguments: str) -> Any:
         """Start the command line."""
@@ -297,7 +304,6 @@ def without_domain(loop: Processes) -> Iterator[None]:
     folder = loop.folder / DOMAINS_FOLDER.name
     folder.mkdir()
     loop.environment["TMPDIR"] = str(loop.folder)
-    loop.forks = False  # a program looks for its temporary folder when it starts
     with own_domain() as another, contextlib.ExitStack() as held:
         for domain in set(map(str, DOMAINS)) - {own, str(another)}:
             fcntl.flock(held.enter_context((folder / domain).open("w")), fcntl.LOCK_EX)
