@@ -12,7 +12,7 @@ from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
 from spectral_solver.fft import is_transform_length, plane_size
-from spectral_solver.memory import Constants, aligned, filled_up, lay_out
+from spectral_solver.memory import Constants, aligned, lay_out
 from spectral_solver.polynomial import (
     PLAN,
     advance,
@@ -58,53 +58,34 @@ class PolynomialStep:
 
     def __init__(self, equation: Polynomials) -> None:
         self._equation = equation
-        n_x, modes = len(equation.constant), len(equation.constant) // 2 + 1
-        degree = equation.polynomials.shape[1] + 1
-        fine, h = fine_length(n_x, degree), 1.0 / equation.steps
-        self._n_x, self._last, self._degree = n_x, modes - 1, degree
-        constants, self._plans = Constants(), np.zeros(1, PLAN)
-        plan, rows = self._plans[0], constants.add_spectra
-        plan["parts"], plan["degree"], plan["clip"] = (
-            len(equation.multipliers),
-            degree,
-            equation.clip,
-        )
-        plan["steps"], plan["n_x"] = equation.steps, n_x
-        supports = np.column_stack([equation.supports, equation.constant])
-        plan["n_a"], plan["modes"] = supports.shape[1], whole_lanes(modes)
+        n_x, (parts, powers) = len(equation.constant), equation.polynomials.shape
+        degree, steps = powers + 1, equation.steps
+        self._n_x, self._last, self._degree = n_x, n_x // 2, degree
         self._whole = n_x % 2 == 0 and is_transform_length(n_x // 2)
-        if self._whole:
-            plan["coarse"] = constants.add_transform(n_x // 2, modes)
-        plan["fine"] = constants.add_transform(fine, modes)
-        L = equation.linear
-        for name, spectrum in zip(
-            COEFFICIENTS, coefficients(L.tobytes(), L.dtype, h, fine), strict=True
-        ):
-            plan[name] = rows(spectrum)
-        plan["supports"] = rows(np.fft.rfft(supports, axis=0).T / n_x)
-        plan["multipliers"] = rows(equation.multipliers)
-        plan["polynomials"] = constants.add(equation.polynomials)
-        plan["slopes"] = constants.add(equation.polynomials * np.arange(2, degree + 1))
-        own, self._weighted = int(plan["modes"]), False
-        for name in WEIGHTS:
-            plan[name] = rows(np.zeros(own))
-        size = lay_out(
-            plan,
-            {
-                **dict.fromkeys(("z1", "z2"), plane_size(max(fine, n_x // 2))),
-                **dict.fromkeys(("x", "part"), fine + WIDTH),
-                **dict.fromkeys(("next", "b", "c", "qf", "ff", "sum"), own),
-                **dict.fromkeys(("covector", "on_b", "on_c", "on_force"), own),
-                "power": fine,
-                **dict.fromkeys(("now", "total"), degree * own),
-                "path": (equation.steps + 1) * own,
-                "tape": 4 * equation.steps * fine,
-            },
-        )
-        self._constants, self._scratch = constants.planes(), aligned(2 * size)
+        supports = np.column_stack([equation.supports, equation.constant])
+        kept, planes, size = layout(n_x, degree, parts, supports.shape[1], steps)
+        self._plans, self._constants = kept.copy(), aligned(planes.size)
+        self._scratch, self._weighted = aligned(2 * size), False
+        self._constants[:] = planes
+        plan = self._plans[0]
+        plan["clip"] = equation.clip
+        L, fine = equation.linear, int(plan["fine"]["m"])
+        self._put("e", coefficients(L.tobytes(), L.dtype, 1.0 / steps, fine))
+        self._put("supports", np.fft.rfft(supports, axis=0).T / n_x)
+        self._put("multipliers", equation.multipliers)
+        self._put("polynomials", equation.polynomials.reshape(1, -1))
+        self._put("slopes", (equation.polynomials * np.arange(2, degree + 1)).reshape(1, -1))
         plan["constants"] = self._constants.ctypes.data
-        plan["constants_apart"] = self._constants.size // 2
         plan["scratch"] = self._scratch.ctypes.data
+
+    def _put(self, name: str, rows: NDArray[Any]) -> None:
+        """Write rows (r, n) of constants, each of which is filled up to whole lanes."""
+        r, n = rows.shape
+        start, length = int(self._plans[0][name]), whole_lanes(n)
+        planes = self._constants.reshape(2, -1)[:, start : start + r * length]
+        planes = planes.reshape(2, r, length)
+        planes[0, :, :n] = rows.real
+        planes[1, :, :n] = rows.imag
 
     def __reduce__(self) -> Any:
         """Made anew from the equation: the plan has addresses."""
@@ -159,17 +140,14 @@ class PolynomialStep:
 
         Most steps integrate nothing.
         """
-        h, plan, self._weighted = 1.0 / self._equation.steps, self._plans[0], True
+        h, self._weighted = 1.0 / self._equation.steps, True
         phi1, phi2, phi3 = phi_functions(self._equation.linear * 2 * h)
         weights = (
             2 * h * (phi1 - 3 * phi2 + 4 * phi3),
             2 * h * (4 * phi2 - 8 * phi3),
             2 * h * (4 * phi3 - phi2),
         )
-        planes = self._constants.reshape(2, -1)
-        for name, weight in zip(WEIGHTS, weights, strict=True):
-            at = slice(plan[name], plan[name] + len(weight))
-            planes[:, at] = weight.real, weight.imag
+        self._put(WEIGHTS[0], np.stack(weights))
 
     def spectra(self, states: Array) -> Array:
         """Spectra (M, 2, modes), real and imaginary parts: the real FFT over the number of points."""
@@ -230,15 +208,53 @@ def fine_length(n_x: int, degree: int) -> int:
     return length
 
 
-@lru_cache(maxsize=64)  # a fit varies the nonlinear parts of an equation, too
-def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> tuple[Spectrum, ...]:
-    """The COEFFICIENTS of steps of this length, for a linear operator of these numbers."""
-    c, m = etdrk4_coefficients(np.frombuffer(linear, kind), h), 1.0 / (4 * fine)
-    found = (
-        *(c.e, c.e2, c.q, c.q * m, c.f1 * m, 2 * c.f2 * m, c.f3 * m),
-        c.f1 + 4 * c.f2 + c.f3,
+@lru_cache(maxsize=16)  # a fit makes thousands of steps of one size
+def layout(n_x: int, degree: int, parts: int, n_a: int, steps: int) -> tuple[Any, Array, int]:
+    """What steps of one size have in common: their plan, their constants, the numbers of a scratch.
+
+    Without addresses, and without the numbers of an equation, for which there is room.
+    """
+    plans, constants, modes = np.zeros(1, PLAN), Constants(), n_x // 2 + 1
+    plan, fine, own = plans[0], fine_length(n_x, degree), whole_lanes(n_x // 2 + 1)
+    plan["parts"], plan["degree"], plan["steps"] = parts, degree, steps
+    plan["n_x"], plan["n_a"], plan["modes"] = n_x, n_a, own
+    if n_x % 2 == 0 and is_transform_length(n_x // 2):
+        plan["coarse"] = constants.add_transform(n_x // 2, modes)
+    plan["fine"] = constants.add_transform(fine, modes)
+    for name in (*COEFFICIENTS, *WEIGHTS):  # those of each kind lie one after the other
+        plan[name] = constants.add_spectra(np.zeros(own))
+    plan["supports"] = constants.add_spectra(np.zeros((n_a, own)))
+    plan["multipliers"] = constants.add_spectra(np.zeros((parts, own)))
+    for name in ("polynomials", "slopes"):
+        plan[name] = constants.add(np.zeros(parts * (degree - 1)))
+    size = lay_out(
+        plan,
+        {
+            **dict.fromkeys(("z1", "z2"), plane_size(max(fine, n_x // 2))),
+            **dict.fromkeys(("x", "part"), fine + WIDTH),
+            **dict.fromkeys(("next", "b", "c", "qf", "ff", "sum"), own),
+            **dict.fromkeys(("covector", "on_b", "on_c", "on_force"), own),
+            "power": fine,
+            **dict.fromkeys(("now", "total"), degree * own),
+            "path": (steps + 1) * own,
+            "tape": 4 * steps * fine,
+        },
     )
-    return tuple(filled_up(spectrum) for spectrum in found)
+    planes = constants.planes()
+    plan["constants_apart"] = planes.size // 2
+    return plans, planes, size
+
+
+@lru_cache(maxsize=64)  # a fit varies the nonlinear parts of an equation, too
+def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> Spectrum:
+    """The COEFFICIENTS of steps of this length, for a linear operator of these numbers, as rows."""
+    c, m = etdrk4_coefficients(np.frombuffer(linear, kind), h), 1.0 / (4 * fine)
+    return np.stack(
+        (
+            *(c.e, c.e2, c.q, c.q * m, c.f1 * m, 2 * c.f2 * m, c.f3 * m),
+            c.f1 + 4 * c.f2 + c.f3,
+        )
+    )
 
 
 def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:
