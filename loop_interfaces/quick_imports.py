@@ -3,9 +3,11 @@
 
 import contextlib
 import gc
-import importlib.util
+import importlib
 import sys
 from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
 
 OF_NUMPY = ("numpy.f2py", "numpy.ma", "numpy.matlib", "numpy.testing")
 """SciPy takes all names of NumPy, and so would load these."""
@@ -36,14 +38,19 @@ def quick_imports() -> Iterator[None]:
             gc.enable()
 
 
+class LateModule(ModuleType):
+    """Stands for a module of a package, as its attribute, until one of its names is used.
+
+    It is not in sys.modules: who looks through those, as for a line of a log, would load it.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        """Names of the module, which is imported now and takes this one's place."""
+        return getattr(importlib.import_module(self.__name__), name)
+
+
 def load_when_used(name: str) -> None:
     """Let a module of a package load when one of its names is first used; nothing if it is loaded."""
-    if name in sys.modules or (spec := importlib.util.find_spec(name)) is None:
-        return
-    assert spec.loader is not None
-    loader = spec.loader = importlib.util.LazyLoader(spec.loader)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    loader.exec_module(module)
     package, _, own = name.rpartition(".")
-    setattr(sys.modules[package], own, module)
+    if name not in sys.modules:
+        setattr(importlib.import_module(package), own, LateModule(name))
