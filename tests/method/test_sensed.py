@@ -451,7 +451,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         patch.setattr(sensed_fit, "_first_guess", guessed)
         patch.setattr(SensedProblem, "implausibility", lambda _, x, fields: abs(x[0] - wanted))
         # Of noise alone, which any equation explains.
-        few = {"settings": FEW_ITERATIONS}
+        few = {"settings": replace(FEW_ITERATIONS, sensed_starts=1)}
         worse, wanted = 10.0, 0.0
         shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
         assert same_bits(shared, likelier) and len(starts) == 2
