@@ -70,7 +70,7 @@ class ModelBasedSensed(ModelBasedReadings):
         if (
             self._progress.stage != RENEWING
             or self._sensed is not None
-            or not self._attempts_left()
+            or not self._attempts_left(self._records.count + self._settings.judging)
         ):
             return
         if not any(
@@ -79,10 +79,9 @@ class ModelBasedSensed(ModelBasedReadings):
             self._progress.policy = self._none.copy()
             row["reason"] = "no equation is found, and the law runs away: no control follows"
 
-    def _attempts_left(self) -> bool:
-        """True if an equation is looked for again after the next rollouts."""
-        tried = self._records.count // self._settings.judging
-        return tried + 1 < self._context.field_models.sensed_attempts
+    def _attempts_left(self, own: int) -> bool:
+        """True if an equation is looked for after so many own rollouts."""
+        return own // self._settings.judging < self._context.field_models.sensed_attempts
 
     def _believe(self) -> Belief | None:
         """In an equation where one reproduces the readings, else in a model of the readings.
@@ -90,8 +89,7 @@ class ModelBasedSensed(ModelBasedReadings):
         More rollouts may determine one that the first ones did not.
         """
         measured, model = self._measurements(), self._sensed
-        before = self._records.count // self._settings.judging
-        if model is not None or before < self._context.field_models.sensed_attempts:
+        if model is not None or self._attempts_left(self._records.count):
             found = sensed_from(self._context, measured, model)
             if found is not None:
                 return Belief(*found, 1)
