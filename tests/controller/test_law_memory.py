@@ -17,8 +17,8 @@ from loop_interfaces.protocol import ModelFailure
 from loop_method.laws import Observer
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
-from tests.controller.test_responder import RUN, start, target
-from tests.controller.test_responder import models as affine_models
+from tests.support.responding import RUN, start, target
+from tests.support.responding import models as affine_models
 from tests.support.small import parameters, same_bits
 from tuner_node.batch import Batch
 

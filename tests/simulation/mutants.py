@@ -57,7 +57,13 @@ _PLANT = (
     "plant/test_taken_actions.py",
     _SIGNATURE,
 )
-_CONTROLLER = ("controller/test_responder.py", "controller/test_answered_steps.py", _SIGNATURE)
+_CONTROLLER = (
+    "controller/test_responder.py",
+    "controller/test_exploration.py",
+    "controller/test_run_memory.py",
+    "controller/test_answered_steps.py",
+    _SIGNATURE,
+)
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")
 TESTS: dict[str, tuple[str, ...]] = {
     "tuner_node.dispatch": _TUNER,
