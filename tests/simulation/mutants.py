@@ -42,27 +42,27 @@ from tests.support.interpreter import ROOT
 SEEDS = 8
 LIMIT = 60.0
 """Seconds that a mutant has, however busy the machine: one that takes longer waits for ever."""
-_SIGNATURE = "interfaces/test_signature.py"
+_SIGNATURE = ("interfaces/test_signature.py", "interfaces/test_design_digest.py")
 _TUNER = (
     "tuner/test_dispatch.py",
     "tuner/test_contradictions.py",
     "tuner/test_pauses.py",
     "tuner/test_session.py",
-    _SIGNATURE,
+    *_SIGNATURE,
 )
 _PLANT = (
     "plant/test_lockstep.py",
     "plant/test_lockstep_pauses.py",
     "plant/test_lockstep_contradictions.py",
     "plant/test_taken_actions.py",
-    _SIGNATURE,
+    *_SIGNATURE,
 )
 _CONTROLLER = (
     "controller/test_responder.py",
     "controller/test_exploration.py",
     "controller/test_run_memory.py",
     "controller/test_answered_steps.py",
-    _SIGNATURE,
+    *_SIGNATURE,
 )
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")
 TESTS: dict[str, tuple[str, ...]] = {
@@ -83,7 +83,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "controller_node.answered_steps": _CONTROLLER,
     "controller_node.law_batch": (*_MEMORY, *_CONTROLLER),
     "controller_node.exploration": _CONTROLLER,
-    "loop_interfaces.signature": (_SIGNATURE,),
+    "loop_interfaces.signature": _SIGNATURE,
 }
 """The modules that are changed, and their tests."""
 ENDS = {1: "simulation", 2: "tests", 3: "time limit", 0: "survived"}

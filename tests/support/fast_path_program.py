@@ -19,7 +19,7 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.sample_subscription import SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
-from tests.fast_path.test_fast_path import Controller, Plant, with_number
+from tests.support.fast_path_pair import Controller, Plant, with_number
 from tests.support.loop_harness import until
 
 LIMIT = 60.0

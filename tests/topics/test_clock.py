@@ -28,7 +28,7 @@ STUCK = """
 import rclpy
 from loop_interfaces.ros import node_loop
 from loop_interfaces.topics import ACTION, STATE
-from tests.fast_path.test_fast_path import Controller
+from tests.support.fast_path_pair import Controller
 node_loop.HOUSEKEEPING = node_loop.WAIT = 600.0  # as long as a wait until a moment that was set back
 rclpy.init()
 loop = node_loop.NodeLoop(rclpy.create_node("stuck"))
