@@ -27,6 +27,7 @@ from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
 from pdeloop.conformance.probing import FAILED, Check, Message
 from pdeloop.conformance.tuner import TunerCheck
+from pdeloop.problem_check import Finding
 from tests.support.lockstep import plant_protocol
 from tests.support.small import parameters
 from tuner_node.build import build_training
@@ -148,3 +149,22 @@ def tuner(options: dict[str, Any] | None = None, **mistakes: Mistake) -> Check:
 
 
 WEIGHTS = {"state_weight": 1.0, "action_weight": 1.0}
+
+
+MAKERS = {"plant": plant, "controller": controller, "tuner": tuner}
+
+
+def findings(check: Check, *names: str) -> list[Finding]:
+    """Those of all probes, or of some."""
+    if names:
+        check.probes = tuple(p for p in check.probes if p.__name__.replace("_", " ") in names)
+        assert len(check.probes) == len(names)
+    return list(check.findings())
+
+
+def named(found: list[Finding]) -> list[str]:
+    """The names of what is not simply good, a note in brackets."""
+    names = [f"({finding.name})" if finding.note else finding.name for finding in found]
+    return [
+        name for name, finding in zip(names, found, strict=True) if finding.note or not finding.good
+    ]
