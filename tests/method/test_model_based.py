@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The optimiser model_based: a known optimum, what it returns and why, its checkpoints."""
+"""The optimiser model_based: a known optimum, what it asks and returns, its checkpoints."""
 
 from __future__ import annotations
 
@@ -12,20 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory, model_based
+from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory, model_based
 from loop_method.adapt.belief import believe
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.estimate import ZERO, Estimate, mean_of
-from loop_method.adapt.renewal import choose_fraction, held_out_fraction
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
     NONE,
-    Evidence,
-    choose,
-    evidence_of,
-    evidence_of_pairs,
 )
 from loop_method.design.lqt import track
 from loop_method.models.settings import FieldModelSettings
@@ -260,138 +254,6 @@ def test_a_large_budget_ends_once_the_fields_are_known() -> None:
     assert [row["rollouts"] for row in rows] == [4, 10, 13]
     assert "fields would not change" in rows[-1]["early"]
     assert not any("early" in row for row in rows[:-1])
-
-
-class Costs:
-    """A loop whose costs from field i under the law theta are given by a function."""
-
-    replays = False
-
-    def __init__(self, cost: Callable[[float, int], float]) -> None:
-        self._cost = cost
-
-    def theta(self, policy: np.ndarray) -> np.ndarray:
-        return policy
-
-    def beginnings(self, records: list[Record]) -> np.ndarray:
-        return np.stack([record.states[0] for record in records])
-
-    def costs(self, theta: np.ndarray, fields: np.ndarray) -> np.ndarray:
-        return np.array([self._cost(float(theta[0, 0]), int(field[0])) for field in fields])
-
-
-@pytest.mark.parametrize(
-    ("cost", "fraction"),
-    [
-        (lambda x, i: (x - 1.0) ** 2 + i, 1.0),  # all agree on all of it
-        (lambda x, i: (x - 0.5) ** 2 + i, 0.5),  # on half of the way
-        (lambda x, i: x + i, 0.0),  # on none
-        (lambda x, i: 5.0 - x if i == 3 else 5.0 + 0.01 * x, 0.0),  # only one gains: chance
-        (lambda x, i: np.inf if x > 0.6 and i == 2 else 5.0 - x, 0.5),  # one is lost
-    ],
-)
-def test_the_way_from_the_first_law_is_what_fields_that_were_left_out_agree_on(
-    cost: Callable[[float, int], float], fraction: float
-) -> None:
-    fields = np.arange(8.0)[:, None]
-    loop: Any = Costs(cost)
-    found, change = held_out_fraction(
-        loop, np.zeros((1, 1)), [np.ones((1, 1))] * 2, fields, ModelBasedSettings()
-    )
-    assert found == fraction
-    differences = np.array([cost(fraction, i) - cost(0.0, i) for i in range(8)])
-    assert change.value == pytest.approx(differences.mean()) and change.error >= 0.0
-
-
-def test_fields_that_cost_more_do_not_hide_a_gain_that_is_the_same_share_of_all() -> None:
-    """Of a gain that is a share of each cost, up to noise, all of the chance is in the noise."""
-    rng = np.random.default_rng(5)
-    before = rng.gamma(0.5, 1.0, 16)
-    noise = 1e-3 * rng.standard_normal(16)
-    costs = np.stack([before, 0.99 * before, 0.98 * before + noise, 0.9 * before + before**2])
-    assert mean_of(costs[2] - before).error > 3.0 * mean_of(noise).error
-    chosen, change = choose_fraction(costs, 1.0)
-    assert chosen == 2 and change.value == pytest.approx((costs[2] - before).mean())
-    assert change.error < 2.0 * mean_of(noise).error
-
-
-def test_laws_that_are_no_better_are_taken_no_more_often_than_the_confidence_says() -> None:
-    """Four fractions that in truth cost as much as the first law: chance alone, of one kind each."""
-    rng, wrong = np.random.default_rng(12), 0
-    for _ in range(1000):
-        size, change = rng.gamma(2.0, 1.0, 17), rng.standard_normal(17)
-        costs = np.stack([size * (10.0 + share * change) for share in np.linspace(0.0, 1.0, 5)])
-        wrong += choose_fraction(costs, 1.0)[0] > 0
-    assert wrong / 1000 < 0.2
-
-
-def evidence(change: float, deviation: float, *excess: float) -> Evidence:
-    return Evidence(Estimate(change, deviation, 20.0), np.array(excess))
-
-
-@pytest.mark.parametrize(
-    ("known", "chosen"),
-    [
-        ({ADAPTED: evidence(-1.0, 0.1, 0.0, 0.1)}, ADAPTED),
-        ({ADAPTED: evidence(-1.0, 1.1, 0.0, 0.1)}, FIRST),  # may be chance
-        ({ADAPTED: evidence(-1.0, 0.1, 1.5, 1.4)}, FIRST),  # the model was wrong about it
-        ({ADAPTED: evidence(-1.0, 0.1, 0.0, np.inf)}, FIRST),  # it diverged
-        ({NONE: evidence(-0.5, 0.1, 0.0)}, NONE),
-        ({ADAPTED: evidence(-1.0, 0.1, 0.0), NONE: evidence(-2.0, 0.1, 0.0)}, NONE),
-        ({ADAPTED: evidence(-3.0, 0.1, 0.0), NONE: evidence(-2.0, 0.1, 0.0)}, ADAPTED),
-        ({NONE: evidence(np.inf, 0.0, 0.0)}, FIRST),
-        ({FIRST: evidence(0.0, 0.0, np.inf), ADAPTED: evidence(0.1, 0.0, 0.0)}, ADAPTED),
-        ({FIRST: evidence(0.0, 0.0, np.inf), ADAPTED: evidence(-1.0, 0.0, np.inf)}, FIRST),
-        ({FIRST: evidence(0.0, 0.0, 0.7, 0.5), ADAPTED: evidence(0.1, 0.01, 0.0)}, ADAPTED),
-    ],
-)
-def test_the_first_law_is_preferred_unless_the_evidence_says_otherwise(
-    known: dict[str, Evidence], chosen: str
-) -> None:
-    verdict = choose({FIRST: evidence(0.0, 0.0, 0.0, 0.0)} | known, FIRST, 1.0)
-    assert verdict.chosen == chosen and verdict.reason
-    assert np.isfinite([verdict.change, verdict.deviation]).all()
-
-
-@pytest.mark.parametrize("base", [FIRST, NONE])
-@pytest.mark.parametrize(("held_out", "excess"), [(-2.0, 1.0), (-2.0, 3.0), (0.5, -2.0)])
-def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, excess: float) -> None:
-    """A law takes its place where model and measurements favour it; the first law stays."""
-    loop: Any = Costs(lambda x, i: 10.0 + i)
-    laws = {base: np.zeros((1, 1)), ADAPTED: np.ones((1, 1))}
-    fields = np.arange(6.0)[:, None]
-    seen = [  # by chance much more or less than on the model
-        Record(laws[ADAPTED], 10.0 + i + excess + 9.0 * (-1.0) ** i, fields[i : i + 1], fields[:0])
-        for i in range(4)
-    ]
-    known = evidence_of(loop, laws, base, seen, fields, Estimate(held_out, 0.1, 20.0))
-    favoured = held_out < 0.0 and held_out + excess < 0.0
-    assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
-
-
-def test_fields_from_which_both_laws_diverge_are_left_out_of_their_difference() -> None:
-    costs = {FIRST: np.array([np.inf, 3.0, 4.0]), ADAPTED: np.array([np.inf, 2.0, 2.0])}
-    found = evidence_of_pairs(costs, FIRST)[ADAPTED]
-    assert found.change.value == -1.5 and np.array_equal(found.excess, [np.inf])
-
-
-def test_the_reason_says_by_how_much() -> None:
-    known = {FIRST: evidence(0.0, 0.0, 0.0, 0.0)}
-    better = choose(known | {ADAPTED: evidence(-1.0, 0.1, 0.0, 0.0)}, FIRST, 1.0)
-    assert better.reason == "the adapted law costs 1 (standard error 0.1) less than the first law"
-    chance = choose(known | {ADAPTED: evidence(-1.0, 2.0, 0.0, 0.0)}, FIRST, 1.0)
-    assert chance.chosen == FIRST
-    assert chance.reason.endswith(": " + better.reason.replace("0.1", "2"))
-
-
-def test_equal_laws_are_told_apart_by_chance_no_more_often_than_the_confidence_says() -> None:
-    """Two laws of one cost, measured with noise: the other one is taken in one case of six."""
-    rng, wrong = np.random.default_rng(11), 0
-    for _ in range(2000):
-        first = Evidence(ZERO, rng.standard_normal(12))
-        other = Evidence(ZERO, rng.standard_normal(12))
-        wrong += choose({FIRST: first, ADAPTED: other}, FIRST, 1.0).chosen == ADAPTED
-    assert wrong / 2000 < 0.2
 
 
 def test_a_checkpoint_of_something_else_is_refused() -> None:
