@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A plant of a user's own: its states and costs against the formula, and what a bad one is told."""
+"""A plant of a user's own: its states and costs against the formula, its derivatives and copies."""
 
 from __future__ import annotations
 
@@ -12,33 +12,12 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.definition import described
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Instruments, Plant
 from pde_sim_node.plants import DynamicsPlant
 from pdeloop.problem_check import linearisation
-
-A = np.diag([0.5, 0.9, 1.1]) + 0.1 * np.eye(3, k=1)
-B = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, -0.5]])
-
-
-class Linear(pdeloop.Dynamics):
-    n_z, n_a, horizon = 3, 2, 4
-    state_weight, action_weight, divergence_bound = 2.0, 0.5, 100.0
-    target = (1.0, 0.0, -1.0)
-
-    def __init__(self, gain: float = 1.0, *, shape: tuple[int, ...] = (3,)) -> None:
-        self.gain, self.shape = gain, shape
-
-    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
-        return rng.standard_normal(3)
-
-    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
-        return A @ z + self.gain * B @ a
-
-    def pull_back(self, z: Any, a: Any, y: Any) -> Any:
-        return A.T @ y, self.gain * B.T @ y
+from tests.support.linear_dynamics import A, B, Linear
 
 
 class Batch(Linear):
@@ -50,23 +29,6 @@ class Batch(Linear):
 
 def actions(batch: int, steps: int = 4) -> np.ndarray:
     return np.random.default_rng(3).standard_normal((steps, batch, 2))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "meant"),
-    [("sampling_time", "sample_time"), ("action_lo", "action_low"), ("mean_states", "mean_state")],
-)
-def test_a_misspelt_attribute_is_refused_with_the_one_that_was_meant(
-    wrong: str, meant: str
-) -> None:
-    with pytest.raises(ValueError, match=f"Own sets '{wrong}'.*; did you mean '{meant}'"):
-        DynamicsPlant(type("Own", (Linear,), {wrong: 3.0})())
-
-
-@pytest.mark.parametrize("own", ["_sampling_time", "viscosity", "targets"])
-def test_an_attribute_of_ones_own_is_left_alone(own: str) -> None:
-    """`targets` next to `target`, too, which is set."""
-    assert DynamicsPlant(type("Own", (Linear,), {own: 3.0})()).n_a == 2
 
 
 @pytest.mark.parametrize("kind", [Linear, Batch])
@@ -115,76 +77,6 @@ def test_what_diverges_keeps_its_state_and_costs_much() -> None:
     assert np.array_equal(plant.states[1], np.random.default_rng(7).standard_normal(3))
 
 
-class Breaking(Linear):
-    """Fails as it is told, where the last number of the state is beyond 10."""
-
-    def __init__(self, how: str) -> None:
-        super().__init__()
-        self.how = how
-
-    def step(self, z: np.ndarray, a: np.ndarray) -> Any:
-        match self.how:
-            case "nan":
-                return np.full(3, np.nan)
-            case "overflow":
-                return z * 1e308 * 1e308
-            case "shape":
-                return np.zeros((2, 2))
-            case "none":
-                return None
-            case "complex":
-                return z * 1j
-            case "changes z":
-                z += 1
-                return z
-            case "changes a":
-                a[0] = 0.25
-                return z
-            case "exits":
-                raise SystemExit(3)
-        raise KeyError("no such\nmode")
-
-
-@pytest.mark.parametrize("how", ["nan", "overflow"])
-def test_numbers_that_are_not_finite_are_a_divergence(how: str) -> None:
-    plant = DynamicsPlant(Breaking(how))
-    plant.reset([0])
-    plant.step(np.zeros((1, 2)))
-    assert plant.diverged_step.tolist() == [0]
-
-
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        (
-            "shape",
-            r"Breaking.step returned an array of shape \(2, 2\); expected numbers of shape \(3,\)",
-        ),
-        (
-            "none",
-            "Breaking.step returned NoneType, which is not an array of real numbers; expected",
-        ),
-        (
-            "complex",
-            "Breaking.step returned ndarray, which is not an array of real numbers; expected",
-        ),
-        ("changes z", r"Breaking.step changes its argument z, .* work on a copy, z.copy\(\)"),
-        ("changes a", "Breaking.step changes its argument a"),
-        (
-            "raises",
-            r"Breaking.step fails: .*test_dynamics.py, line \d+: KeyError: 'no such\\nmode'$",
-        ),
-        ("exits", r"Breaking.step fails: .*test_dynamics.py, line \d+: SystemExit: 3$"),
-    ],
-)
-def test_a_step_that_is_wrong_is_told_in_one_sentence(how: str, words: str) -> None:
-    plant = DynamicsPlant(Breaking(how))
-    plant.reset([0])
-    with pytest.raises(OwnCodeError, match=words) as refused:
-        plant.step(np.zeros((1, 2)))
-    assert "\n" not in str(refused.value)
-
-
 class Reusing(Linear):
     """Returns the array that it computes in, as solvers do."""
 
@@ -206,75 +98,6 @@ def test_a_plant_may_return_the_array_that_it_computes_the_next_state_in() -> No
     assert np.array_equal(reusing.reset([0, 1, 2]), plant.reset([0, 1, 2]))
     for a in actions(3):
         assert np.array_equal(reusing.step(a), plant.step(a))
-
-
-class Unfit(Linear):
-    def __init__(self, **changes: Any) -> None:
-        super().__init__()
-        vars(self).update(changes)
-
-    def initial_state(self, rng: Any) -> Any:
-        return getattr(self, "begins", np.zeros(3))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"n_z": 0}, "Unfit: expected n_z, the size of a state, or a grid"),
-        ({"n_a": 0}, "Unfit: n_a must be at least 1, got 0"),
-        ({"horizon": 2.5}, "Unfit: horizon must be a whole number, got 2.5"),
-        ({"sample_time": -1.0}, "Unfit: sample_time must be positive and finite"),
-        ({"sample_time": "0.05"}, "Unfit: sample_time must be positive and finite, got '0.05'"),
-        ({"state_weight": "1"}, "Unfit: state_weight must be"),
-        ({"divergence_bound": "1"}, "Unfit: divergence_bound must be positive and finite"),
-        ({"action_low": "1"}, "Unfit: action_low must be"),
-        ({"target": [1.0, 2.0]}, "Unfit: .*shape"),
-        ({"target": np.nan}, "Unfit: target must be finite"),
-        ({"grid": pdeloop.Grid.vector(4)}, "Unfit: n_z is 3, but its grid has 4 numbers"),
-        ({"supports": np.ones((3, 1))}, r"Unfit: supports must have shape \(3, 2\), got \(3, 1\)"),
-    ],
-)
-def test_a_class_that_does_not_fit_is_refused(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        DynamicsPlant(Unfit(**changes))
-
-
-def test_a_class_without_actuators_is_refused() -> None:
-    class Idle(pdeloop.Dynamics):
-        n_z = 3
-
-        def initial_state(self, rng: Any) -> Any:
-            return np.zeros(3)
-
-        def step(self, z: Any, a: Any) -> Any:
-            return z
-
-    with pytest.raises(ValueError, match=r"Idle must set n_a"):
-        DynamicsPlant(Idle())
-
-
-def test_a_number_that_is_a_method_is_refused() -> None:
-    class Method(Linear):
-        def target(self) -> Any:  # type: ignore[override]
-            return np.zeros(3)
-
-    with pytest.raises(ValueError, match=r"Method: target is a method; expected its value"):
-        DynamicsPlant(Method())
-
-
-def test_an_initial_state_that_is_wrong_is_told_and_changes_nothing() -> None:
-    plant = DynamicsPlant(Unfit())
-    plant.reset([0])
-    plant.step(np.ones((1, 2)))
-    before = plant.states.copy()
-    for begins, words in (
-        (np.full(3, np.inf), "Unfit.initial_state returned NaN or infinity"),
-        (np.zeros(2), r"Unfit.initial_state returned an array of shape \(2,\)"),
-    ):
-        plant.dynamics.begins = begins
-        with pytest.raises(OwnCodeError, match=words):
-            plant.reset([1])
-        assert np.array_equal(plant.states, before) and plant.step_index == 1
 
 
 def test_sizes_may_be_whole_numbers_of_numpy() -> None:
