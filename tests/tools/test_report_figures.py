@@ -1,0 +1,89 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Single figures of a report: colours, axes, and what they show of a plant and of explorations."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from loop_interfaces.colour_scale import DARK
+from loop_interfaces.controllers import CONTROLLERS
+from loop_method.reduce.order import study_orders
+from pdeloop.in_process import LocalPair
+from pdeloop.report.dark import BACK, INK, darken
+from pdeloop.report.data import gather
+from pdeloop.report.learning import bars
+from pdeloop.report.style import FIELD_MAP, STYLE
+from tests.support.small import SMALL, parameters
+from tuner_node.build import build_training
+
+
+def test_a_dark_figure_has_the_same_colours_turned_around():
+    figure = Figure()
+    ax = figure.subplots()
+    (black,) = ax.plot([0, 1], color="black")
+    (lqt,) = ax.plot([0, 1], color=CONTROLLERS["lqt"].colour, alpha=0.5)
+    (green,) = ax.plot([0, 1], color="#009e00")
+    field = ax.imshow([[0.0, 0.5, 1.0]], cmap=FIELD_MAP)
+    figure.colorbar(field)
+    darken(figure)
+    assert to_hex(figure.get_facecolor()) == to_hex(ax.get_facecolor()) == BACK
+    assert to_hex(black.get_color()) == to_hex(ax.title.get_color()) == INK
+    assert to_hex(lqt.get_color()) == CONTROLLERS["lqt"].on_dark and lqt.get_alpha() == 0.5
+    assert to_hex(green.get_color()) == "#009e00"
+    levels = [to_hex(field.to_rgba(value)) for value in (0.0, 1.0)]
+    assert levels == [DARK[0], DARK[-1]]
+
+
+@pytest.mark.parametrize(("without", "scale"), [(9.0, "linear"), (11.0, "log")])
+def test_costs_that_differ_tenfold_have_a_logarithmic_axis(without, scale):
+    costs = {
+        "none": np.full((1, 3), without),
+        "lqt": np.full((1, 3), 2.0),
+        "adapted": np.ones((1, 3)),
+    }
+    ax = bars([SimpleNamespace(costs=costs, name="p")]).axes[0]
+    assert ax.get_yscale() == scale
+    low, high = ax.get_ylim()
+    assert low < 1.0 and high > without
+    assert [bar.get_height() for bar in ax.patches] == [without, 2.0, 1.0]
+
+
+def test_a_plant_of_two_fields_shows_both(tmp_path):
+    from pdeloop.cli import main
+    from pdeloop.report.figures import behaviour
+
+    out = tmp_path / "run"
+    command = ["train", "wave", "--iterations", "1", "--optimizer", "two_point", "--in-process"]
+    short = ["--set", "horizon=40", "--evaluation-fields", "1"]
+    assert main([*command, *short, "--out", str(out)]) == 0
+    with matplotlib.rc_context(STYLE):
+        behaviour(gather(out).problems[0]).savefig(tmp_path / "both.svg")
+    svg = (tmp_path / "both.svg").read_text()
+    for words in (">u(x, t)<", ">u_t(x, t)<", ">u(x, T)<", ">u_t(x, T)<"):
+        assert words in svg, words
+    # A map and a profile of each field under every controller, and a target and a colour bar of each.
+    maps = re.findall(r'<g id="axes_\d+">', svg)
+    assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2
+
+
+def test_the_orders_shown_are_those_of_the_explorations_that_the_model_is_from(tmp_path):
+    from pdeloop.cli import main
+
+    words = ["train", str(SMALL), "--in-process", "--rollouts", "10", "--optimizer", "model_based"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    values = parameters(rollouts=10, optimizer="model_based")
+    batch = build_training(values).next_batch()
+    explored = LocalPair(values).run(replace(batch, trajectories=True)).trajectories
+    assert len(explored) == 2
+    expected = study_orders([(one.states, one.actions) for one in explored])
+    found = gather(tmp_path / "run").problems[0].orders
+    np.testing.assert_array_equal(found.singular_values, expected.singular_values)
+    np.testing.assert_array_equal(found.rollout, expected.rollout)
