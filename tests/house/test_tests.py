@@ -43,7 +43,7 @@ SKIPS = {
     "tests/benchmarks/test_baselines.py": ["stable-baselines3 is not installed: extra rl"],
     "tests/tools/test_environment_pictures.py": ["MoviePy is not installed: extra rl"],
     "tests/tools/test_tensorboard.py": ["tensorboardX is not installed: extra tensorboard"],
-    "tests/tools/test_study.py": ["another {name} cannot be had: {done.stderr"],
+    "tests/tools/test_study_on_dask.py": ["another {name} cannot be had: {done.stderr"],
 }
 """Where tests are skipped, and why: rights and programs of the machine, packages that bring PyTorch or
 JAX, a registry that cannot be reached."""

@@ -1,0 +1,35 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A small study: its content, an executor for it, and the files that it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.support.small import FEW_FITS, SMALL
+
+LIMIT = 300.0
+CONTENT: dict[str, Any] = {
+    "problems": [str(SMALL)],
+    "seeds": 2,
+    "settings": {"rollouts": 9},
+    "variants": {"gauss-newton": {"optimizer": "gauss_newton", **FEW_FITS}, "two-point": {}},
+}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files of the finished trainings."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "study.json"
+    }
+
+
+@contextmanager
+def here() -> Iterator[Executor]:
+    with ThreadPoolExecutor(1) as pool:
+        yield pool
