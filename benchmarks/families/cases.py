@@ -187,6 +187,10 @@ OF_FEW_SENSORS: dict[str, Case] = {
     "allen-cahn-modes, unequal strengths": Case(
         "unequal actuators", "allen-cahn-modes", {}, {}, "AllenCahnUnequal"
     ),
+    "allen-cahn with V(x), declared": foreign("AllenCahnInhomogeneousCircle", "coefficients of x"),
+    "reaction-diffusion with D(x), r(x), declared": foreign(
+        "ReactionDiffusionInhomogeneousCircle", "coefficients of x"
+    ),
 }
 """Further ones, where only readings of the field make the difference hard to tell."""
 

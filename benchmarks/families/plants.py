@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.families.rates import RatePlant
 from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Axis, Grid
 from pde_sim_node.dynamics import Dynamics
 
 
@@ -68,6 +69,16 @@ class AllenCahnInhomogeneous(RatePlant):
         return diffused - self.potential * (3 * z**2 - 1) * y, y
 
 
+class AllenCahnInhomogeneousCircle(AllenCahnInhomogeneous):
+    """The same, declared to be a field on a circle with its actuators in place."""
+
+    grid = Grid((Axis("x", 2.0, AllenCahnInhomogeneous.n_z),))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.supports = self.shapes.T
+
+
 class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
     """u_t = (D(x) u_x)_x + r(x) u - u^3 + a: diffusion and growth that depend on x."""
 
@@ -92,6 +103,16 @@ class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
 
     def pull_back_rate(self, z: Array, y: Array) -> tuple[Array, Array]:
         return self.diffused(y) + (self.growth - 3 * z**2) * y, y
+
+
+class ReactionDiffusionInhomogeneousCircle(ReactionDiffusionInhomogeneous):
+    """The same, declared to be a field on a circle with its actuators in place."""
+
+    grid = Grid((Axis("x", 2.0, ReactionDiffusionInhomogeneous.n_z),))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.supports = self.shapes.T
 
 
 class FitzHughNagumo(RatePlant):
