@@ -25,7 +25,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
-from tuner_node.build import build_training
+from tuner_node.build import build_training, remarks_on
 
 __all__ = ["Finding", "Reach", "check", "field_plant", "linearisation", "reach"]
 
@@ -66,6 +66,7 @@ class Finding:
 def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     """The findings about a problem's resolved parameters, one after the other."""
     plant = field_plant(values)
+    yield from (Finding("sensors", True, remark, note=True) for remark in remarks_on(values))
     explored = _explore(plant, values)
     if values["plant"]:
         yield _repeatable(plant, explored)

@@ -37,7 +37,7 @@ from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from pdeloop.unused import refuse_unused
 from spectral_solver import polynomial_step
 from tuner_node import narration
-from tuner_node.build import build_training
+from tuner_node.build import build_training, remarks_on
 from tuner_node.errors import NoModelError
 from tuner_node.optimizer_parameters import kind_of, training_parameters
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
@@ -207,6 +207,8 @@ def carry_out(
     check: Callable[[], None],
 ) -> None:
     """Train in `folder` to the end; `check`, called now and then, may raise to stop it."""
+    for remark in remarks_on(values):
+        display.warn(remark)
     if transport.in_process:
         _train_here(folder, values, display, check)
     else:

@@ -158,6 +158,26 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
     ]
 
 
+def remarks_on(values: Mapping[str, Any]) -> list[str]:
+    """What to say before a training with these parameters begins."""
+    grid = Grid.parse(values["grid"]) if values["grid"] else None
+    few = 0 < values["sensors"] <= field_model_settings(values).sensed_most
+    if grid is None or not few or values["sensors"] >= values["n_z"]:
+        return []
+    if not grid.axes:
+        return [
+            f"the plant declares no axis, so that the readings of {values['sensors']} sensors are "
+            "modelled without the field between them; if its state is a field on an axis, give the "
+            "plant a 'grid', and 'supports' for the places of its actuators (docs/bring-your-own.md)"
+        ]
+    if grid.is_circle and values.get("plant") and not values["actuator_extents"]:
+        return [
+            "the plant does not say where its actuators act, so that they are taken to be equally "
+            "spaced between the sensors; give the plant 'supports' (docs/bring-your-own.md)"
+        ]
+    return []
+
+
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     order = model_order(values)

@@ -32,7 +32,7 @@ from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.ros.suspend_watchdog import sleep_for
 from loop_interfaces.spec import FREE
 from tuner_node import narration
-from tuner_node.build import build_dispatcher, build_training
+from tuner_node.build import build_dispatcher, build_training, remarks_on
 from tuner_node.diagnostics import TunerDiagnostics
 from tuner_node.errors import ContradictionError, DispatchError, NoModelError
 from tuner_node.narration import Narration
@@ -78,6 +78,8 @@ class TunerNode:
         self._problem, self._out = values["problem"], values["out"]
         self._narration = Narration(values["seed"], values["seeds"])
         dispatcher = build_dispatcher(values, training, identity)
+        for remark in remarks_on(values):
+            log.warning(remark)
         if identity.paused:
             dispatcher.pause()
             log.warning("still paused, as when its process ended; call ~/resume to continue")

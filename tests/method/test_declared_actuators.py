@@ -14,7 +14,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt import Context, Trajectory
 from loop_method.models.sensed import Actuators
 from tests.support.sensed import SENSORS
-from tuner_node.build import build_training
+from tuner_node.build import build_training, remarks_on
 
 
 class Unequal(pdeloop.Dynamics):
@@ -97,3 +97,24 @@ def test_actuators_that_a_plant_does_not_place_on_the_ring_are_declared_as_nothi
         declared = _declared(pdeloop.problem(plant=kind(), sensors=SENSORS), 2)
         np.testing.assert_array_equal(declared.centres, [0.25, 0.75])
         assert not declared.declared
+
+
+def _remarks(plant: type[Unequal], sensors: int) -> list[str]:
+    return remarks_on(pdeloop.problem(plant=plant(), sensors=sensors).values)
+
+
+def test_a_plant_that_does_not_say_where_things_are_is_asked_to_before_a_training() -> None:
+    """Else the field between its few sensors is not estimated, or its actuators are misplaced."""
+
+    class Nowhere(Unequal):
+        n_z, grid = 60, None
+
+    class Silent(Unequal):
+        supports = None
+
+    assert "declares no axis" in "".join(_remarks(Nowhere, SENSORS))
+    assert "where its actuators act" in "".join(_remarks(Silent, SENSORS))
+    assert not _remarks(Unequal, SENSORS)
+    # All of the field is measured.
+    assert not _remarks(Nowhere, 0) and not _remarks(Nowhere, 60) and not _remarks(Silent, 0)
+    assert not remarks_on(pdeloop.problem("kdv", sensors=SENSORS).values)
