@@ -133,7 +133,7 @@ def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
     assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.015)
 
 
-def test_actuators_need_not_beequally_spaced() -> None:
+def test_actuators_need_not_be_equally_spaced() -> None:
     positions = [0.1, 0.22, 0.55]
     strong = {"actuator_positions": positions, "n_a": 3, "exploration_variance": 4.0}
     problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=30, **strong)
