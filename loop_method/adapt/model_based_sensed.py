@@ -45,6 +45,8 @@ from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.models.sensed import SensedModel
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
+OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
+"""Entries of a row that describe the law that follows."""
 
 
 class ModelBasedSensed(ModelBasedReadings):
@@ -77,6 +79,8 @@ class ModelBasedSensed(ModelBasedReadings):
             own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]
         ):
             self._progress.policy = self._none.copy()
+            for name in OF_A_LAW:
+                row.pop(name, None)
             row["reason"] = "no equation is found, and the law runs away: no control follows"
 
     def _attempts_left(self, own: int) -> bool:
