@@ -62,7 +62,7 @@ def audit(plan: Plan) -> str:
         ("other costs", end.evaluation, expected.evaluation),
     ):
         if not same_bits(found, wanted):
-            assert history.unopposed, what
+            assert history.network.unopposed, what
             return "forged"
     return "same bits"
 

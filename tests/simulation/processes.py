@@ -141,7 +141,7 @@ class Process:
 
     def publish(self, publications: Iterable[Publication | ModelFailure]) -> None:
         for sent in publications:
-            self.history.send(self, sent, self.pair)
+            self.history.network.send(self, sent, self.pair)
 
     def begin(self) -> None:
         """Say what is said at the start."""
@@ -208,7 +208,7 @@ class PlantProcess(Process):
                 values = sent.frame.values.copy()
                 self._samples.append((STATE, replace(sent.frame, values=values)))
             elif sent.topic is COST:
-                self.history.show(self, self._samples)
+                self.history.network.show(self, self._samples)
                 self._samples = []
             self.publish([sent])
 
@@ -325,7 +325,7 @@ class TunerProcess(Process):
             return
         sent = session.advance(event(self.now), self.now)
         for pair, publication in sent:
-            self.history.send(self, publication, pair)
+            self.history.network.send(self, publication, pair)
         if self._changed and (session.stopped or self.history.rng.random() < 0.5):
             self._disk.save(training_state.arrays_of(session.training))
             self._changed = False
