@@ -135,7 +135,7 @@ def yaml_text(values: Mapping[str, Any], comment: str = "") -> str:
     return "".join(f"# {line}\n" for line in comment.splitlines()) + text
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     """Puts texts in quotes that ROS, unlike YAML, would take for truth or a number."""
 
     def represent_str(self, text: str) -> yaml.ScalarNode:

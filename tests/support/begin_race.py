@@ -28,6 +28,7 @@ from tests.support.small import parameters
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolder, RunFolderError
 from tuner_node.run_store import RunWriter, open_run
+from tuner_node.training import Training
 
 POINTS = ("open", "replace", "unlink", "mkdir")
 """Calls before which a process waits; with them the taking of a lock."""
@@ -94,9 +95,9 @@ def begin(folder: Path, seed: int, how: str, ready: int, go: int) -> int:
             if how == "create":
                 RunFolder(folder).create(values)
                 locks.enter_context(RunFolder(folder).locked())
-                identity = RunWriter(folder, values, build_training(values), warn=print).identity
+                identity = RunWriter(folder, values, TRAININGS[seed], warn=print).identity
             else:
-                _, identity = open_run(values, build_training(values), locks, print)
+                _, identity = open_run(values, TRAININGS[seed], locks, print)
         out.write_text(str(identity.run))
         return 0
     except RunFolderError:
@@ -107,6 +108,8 @@ def begin(folder: Path, seed: int, how: str, ready: int, go: int) -> int:
 
 
 VALUES: dict[str, Any] = {}
+TRAININGS: dict[int, Training] = {}
+"""Those that have not begun, by their seed: a forked process begins a copy."""
 
 
 def judged(folder: Path, codes: tuple[int, int]) -> str:
@@ -128,11 +131,12 @@ def judged(folder: Path, codes: tuple[int, int]) -> str:
 def run(place: Path) -> dict[str, dict[str, Any]]:
     """Every order of every way to begin."""
     VALUES.update(parameters())
+    TRAININGS.update((seed, build_training({**VALUES, "seed": seed})) for seed in (0, 1))
     # What each of them loads, those that are forked find there.
     with ExitStack() as locks:
         first = {**VALUES, "out": str(place / "first"), "resume": False}
         open_run(first, build_training(first), locks, print)
-    gc.freeze()  # what a fork touches is copied
+    gc.disable(), gc.freeze()  # what a forked process touches is copied
     return {how: every_order(place, how) for how in ("run", "create")}
 
 
