@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from loop_interfaces.module_path import safe_environment
 from pdeloop.cli import COMMANDS
 from tests.support.interpreter import python
 from tests.support.loop_harness import Processes, until
@@ -38,11 +38,19 @@ settings: {{evaluation_fields: 1}}
 variants: {{one: {{iterations: 1}}}}
 """
 TRAIN = ("train", str(SMALL), "--iterations", "1", "--evaluation-fields", "1")
+NAMED = ("--equation", "numpy.py:Own")
+OWN = """
+from pde_sim_node.equations import Burgers
+
+class Own(Burgers):
+    name = "own"
+"""
+"""Code that the user names, in a file with the name of a module."""
 WORDS: dict[str, tuple[str, ...]] = {
-    "train": (*TRAIN, "--out", "run", "--record", "--view"),
-    "evaluate": ("evaluate", "run", "--fields", "1"),
+    "train": (*TRAIN, *NAMED, "--out", "run", "--record", "--view"),
+    "evaluate": ("evaluate", "run", *NAMED, "--fields", "1"),
     "identify": ("identify", "--bag", "run"),
-    "bag": ("bag", "verify", "run"),
+    "bag": ("bag", "verify", "run", *NAMED),
     "monitor": ("monitor", "--port", "0"),
     "reproduce": (
         "reproduce",
@@ -56,8 +64,8 @@ WORDS: dict[str, tuple[str, ...]] = {
         "--processes",
         "1",
     ),
-    "report": ("report", "run"),
-    "animate": ("animate", "run", "--out", "run.gif", "--seconds", "0.1"),
+    "report": ("report", "run", *NAMED),
+    "animate": ("animate", "run", *NAMED, "--out", "run.gif", "--seconds", "0.1"),
     "compare": ("compare", "run", "run"),
     "export": ("export", "run", "--out", "law.npz"),
     "study": ("study", "study.yaml", "--out", "study"),
@@ -72,6 +80,9 @@ from pdeloop.cli import main
 
 if __name__ == "__main__":  # processes that it starts load this file, too
     for words in json.loads(sys.argv[1]):
+        if words[0] == "report":  # most of its time: it draws each figure twice, as `check` does one
+            from pdeloop.report import page
+            page._draw = lambda figure, png: png.write(b"a picture")
         sys.argv[1:] = words
         code = main()
         if code:
@@ -106,17 +117,19 @@ def finish(loop: Processes, process: Any) -> None:
     loop.wait(process, LIMIT)
 
 
-def test_no_command_and_no_node_runs_a_file_of_the_working_directory(
+def test_no_command_and_no_node_runs_a_file_of_the_working_directory_but_what_is_named(
     loop: Processes, tmp_path: Path
 ) -> None:
     assert set(WORDS) == set(COMMANDS)
     (tmp_path / "study.yaml").write_text(STUDY)
     taken = set_traps(tmp_path, third_party() | set(sys.stdlib_module_names))
+    (tmp_path / "numpy.py").write_text(OWN)  # an import of NumPy that finds it fails, too
     folder = tmp_path / "bin"
     folder.mkdir()
     (folder / "commands.py").write_text(ONE_AFTER_THE_OTHER)
     in_script = [words for name, words in WORDS.items() if name not in ("train", "monitor")]
-    loop.wait(loop.program(str(BIN / "pdeloop"), *WORDS["train"]), LIMIT)
+    said = loop.wait(loop.program(str(BIN / "pdeloop"), *WORDS["train"]), LIMIT)
+    assert "mean stage cost after adaptation" in said
     started = [loop.program(str(BIN / SCRIPT), "--help")]
     started.append(loop.program(str(BIN / "pdeloop"), *WORDS["monitor"]))
     started.append(loop.program(sys.executable, str(folder / "commands.py"), json.dumps(in_script)))
@@ -158,10 +171,14 @@ def test_code_that_the_user_names_runs_from_the_working_directory_and_no_other(
     # As of `export PYTHONPATH=$PYTHONPATH:/some/folder` where it was not set.
     loop.environment["PYTHONPATH"] = f":{loop.environment['PYTHONPATH']}"
     taken = set_traps(tmp_path, {"scipy", "numba", "yaml", "rich", "rclpy", "std_msgs"})
-    own = "from pde_sim_node.equations import Burgers\nclass Own(Burgers):\n    name = 'own'\n"
-    (tmp_path / "numpy.py").write_text(own)
-    said = loop.wait(
-        loop.program(str(BIN / "pdeloop"), *TRAIN, "--equation", "numpy.py:Own"), LIMIT
-    )
-    assert re.search("mean stage cost after adaptation", said)
+    (tmp_path / "numpy.py").write_text(OWN)
+    words = (*TRAIN, *NAMED, "--in-process")
+    said = loop.wait(loop.program(str(BIN / "pdeloop"), *words), LIMIT)
+    assert "mean stage cost after adaptation" in said
     assert not taken.exists(), taken.read_text()
+
+
+def test_what_a_process_starts_leaves_the_working_directory_out_as_well() -> None:
+    path = os.pathsep.join(["", "/a", "", "/b", ""])
+    found = safe_environment({"HOME": "/home", "PYTHONPATH": path})
+    assert found == {"HOME": "/home", "PYTHONPATH": "/a:/b", "PYTHONSAFEPATH": "1"}
