@@ -21,17 +21,17 @@ PARAMETERS = {
     "n_a": 3,
     "actuator_width": 0.2,
     "reduced_order": 4,
-    "horizon": 20,
+    "horizon": 10,
     "exploration_variance": 4.0,
     "rollouts": 5,
     "evaluation_fields": 2,
 }
 SETTINGS = {
-    "optimizer_settings": {"iterations": 5, "mixtures": 2, "judging": 1},
+    "optimizer_settings": {"iterations": 2, "mixtures": 1, "judging": 1},
     "field_model_settings": {
-        "sensed_iterations": 4,
-        "sensed_last_iterations": 6,
-        "sensed_newest": 3,
+        "sensed_iterations": 2,
+        "sensed_last_iterations": 3,
+        "sensed_newest": 2,
         "sensed_learning": 1,
         "sensed_again": 0,
     },

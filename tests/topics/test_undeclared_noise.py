@@ -21,8 +21,10 @@ from tuner_node.build import build_training
 
 pytestmark = pytest.mark.topics
 QUICK: dict[str, Any] = {
-    "n_z": 128,
-    "horizon": 40,
+    "n_z": 96,
+    "n_a": 6,
+    "horizon": 20,
+    "reduced_order": 8,
     "rollouts": 6,
     "evaluation_fields": 1,
     "exploration_variance": 1.0,
