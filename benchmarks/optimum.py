@@ -111,7 +111,7 @@ def run(
     fields: int = 16,
     evaluation_seed: Sequence[int] = (0,),
     evaluation_fields: int = 10,
-    tolerance: float = 2e-4,
+    tolerance: float = 2e-5,
     jobs: int | None = None,
     settings: Sequence[str] = (),
     save: Path | None = None,
