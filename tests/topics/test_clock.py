@@ -114,7 +114,7 @@ def test_clocks_that_jump_forth_and_back_and_differ_change_nothing(
         use_clock("controller")
         loop.node("controller_node", *PARAMETERS)
         use_clock("tuner")
-        tuner = start_tuner(loop, out, iterations=100)
+        tuner = start_tuner(loop, out, iterations=40)
         until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         for turn, days in enumerate(DAYS["tuner"]):
             set_clocks(turn)
@@ -122,4 +122,4 @@ def test_clocks_that_jump_forth_and_back_and_differ_change_nothing(
             until(lambda d=wanted: abs(newest_time(out) - time.time() - d) < 3600, LIMIT, "jump")
         full_speed(desk)
         loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=100))
+    assert_same_training(out, in_process(iterations=40))

@@ -15,7 +15,7 @@ import pytest
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
 from tests.support.loop_harness import until
-from tests.support.small import SMALL
+from tests.support.small import SMALL, paced
 from tests.support.small_disk import small_disk
 from tests.support.small_loop import (
     LIMIT,
@@ -62,26 +62,28 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
 
 def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
     out = tmp_path / "run"
-    run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
-    for count, name in ((10, "pde_sim_node"), (40, "controller_node"), (70, "tuner_node")):
+    problem = str(paced(tmp_path, 50.0))  # 30 ms an episode
+    run = loop.pdeloop("train", problem, "--iterations", "50", "--out", str(out))
+    for count, name in ((5, "pde_sim_node"), (10, "controller_node"), (15, "tuner_node")):
         until(lambda n=count: adapted(out) >= n, LIMIT, f"iteration {count}")
         (pid,) = loop.pids(name)
         os.kill(pid, signal.SIGKILL)
     text = loop.wait(run, LIMIT)
-    assert_same_training(out, in_process(iterations=150))
+    assert_same_training(out, in_process(iterations=50))
     for name in ("pde_sim_node", "controller_node", "tuner_node"):
         assert f"{name} was killed by SIGKILL; starting it again" in text
 
 
 def test_everything_dies_at_once_and_the_run_continues(loop, tmp_path):
     out = tmp_path / "run"
-    run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
-    until(lambda: adapted(out) >= 20, LIMIT, "iteration 20")
+    problem = str(paced(tmp_path, 50.0))  # 30 ms an episode
+    run = loop.pdeloop("train", problem, "--iterations", "50", "--out", str(out))
+    until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
     os.kill(run.pid, signal.SIGKILL)  # its children die with it
     until(lambda: loop.left_behind() == [], LIMIT, "end of the killed supervisor's nodes")
     run.wait()
     loop.wait(loop.pdeloop("train", "--resume", str(out)), LIMIT)
-    assert_same_training(out, in_process(iterations=150))
+    assert_same_training(out, in_process(iterations=50))
 
 
 def test_a_node_that_keeps_dying_is_given_up(loop, tmp_path):
@@ -122,17 +124,17 @@ def fill(disk: Path) -> None:
 
 
 def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
-    start_pair(loop, real_time_factor=50.0)  # 30 ms an episode: it lasts longer than the full disk
+    start_pair(loop, real_time_factor=25.0)  # 60 ms an episode: it lasts longer than the full disk
     with small_disk(tmp_path / "disk", megabytes=8) as disk:
         out = disk / "run"
-        tuner = start_tuner(loop, out, iterations=300)
+        tuner = start_tuner(loop, out, iterations=100)
         until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
         fill(disk)
         until(lambda: "cannot write the checkpoint" in loop.output(tuner), LIMIT, "warning")
         (disk / "filler").unlink()
         loop.wait(tuner, LIMIT)
         kept = shutil.copytree(out, tmp_path / "kept")
-    assert_same_training(kept, in_process(iterations=300))
+    assert_same_training(kept, in_process(iterations=100))
 
 
 def test_a_full_disk_at_the_end_is_an_error_and_the_run_continues_later(

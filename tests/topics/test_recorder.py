@@ -75,7 +75,7 @@ def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop,
 def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
     # 2000 steps of 0.8 kB a second, less than the 4 MB of the recorder's socket. On a fast machine this
     # loop sends several times as much, if it may.
-    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 150, pace=100.0)
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 100, pace=100.0)
     until(lambda: adapted(hand.out) >= 5, LIMIT, "iteration 5")
     hand.recorder.send_signal(signal.SIGSTOP)
     before = adapted(hand.out)
@@ -86,7 +86,7 @@ def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
     hand.recorder.send_signal(signal.SIGINT)
     loop.wait(hand.recorder, LIMIT)
     report = verify(hand.bag)
-    assert (report.count, report.incomplete, report.episodes) == (0, [], 153)
+    assert (report.count, report.incomplete, report.episodes) == (0, [], 103)
 
 
 INTAKE = """
@@ -136,12 +136,12 @@ def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp
 
 
 @pytest.mark.parametrize(
-    ("recorder", "iterations", "pace"), [("start", 300, 300.0), ("required", 100_000, 100.0)]
+    ("recorder", "iterations", "pace"), [("start", 150, 300.0), ("required", 100_000, 100.0)]
 )
 def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
     loop, tmp_path, recorder, iterations, pace
 ):
-    with small_disk(tmp_path / "disk", megabytes=2) as disk:
+    with small_disk(tmp_path / "disk", megabytes=1) as disk:
         # At this pace the disk takes several chunks: what is cut short is the last of them alone.
         hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, iterations, pace=pace)
         text = loop.wait(hand.recorder, LIMIT, code=3)
