@@ -4,8 +4,10 @@
 {"know": [SERVICE, ...]}            look for these already, so that a call is quick
 {"call": SERVICE}                   a std_srvs/Trigger; [success, message]
 {"set": [NODE, PARAMETER, VALUE]}   [successful, reason]
+{"set_each": [NODE, {PARAMETER: VALUE}]}   in one request: {parameter: [successful, reason]}
 {"malform": NODE}                   sends a request to set a parameter of no type there is
 {"get": [NODE, PARAMETER]}          the value
+{"get_each": [NODE, [PARAMETER, ...]]}     in one request: {parameter: value}
 {"describe": NODE}                  {parameter: read_only}
 {"diagnostics": None}               {status name: [reports so far, level, message, {key: value}]}
 {"topics": None}                    {topic: [types]}
@@ -74,10 +76,14 @@ class Operator:
             return [result.success, result.message]
         if what == "set":
             node, name, value = argument
-            parameter = Parameter(name, value=value).to_parameter_msg()
-            request = SetParameters.Request(parameters=[parameter])
-            (result,) = self.request(SetParameters, f"{node}/set_parameters", request).results
-            return [result.successful, result.reason]
+            return self.answer({"set_each": [node, {name: value}]})[name]
+        if what == "set_each":
+            node, values = argument
+            wanted = [Parameter(name, value=values[name]).to_parameter_msg() for name in values]
+            request = SetParameters.Request(parameters=wanted)
+            results = self.request(SetParameters, f"{node}/set_parameters", request).results
+            told = ([result.successful, result.reason] for result in results)
+            return dict(zip(values, told, strict=True))
         if what == "malform":
             client = self.node.create_client(SetParameters, f"{argument}/set_parameters")
             assert client.wait_for_service(LIMIT)
@@ -86,10 +92,12 @@ class Operator:
             return None
         if what == "get":
             node, name = argument
-            request = GetParameters.Request(names=[name])
-            (value,) = self.request(GetParameters, f"{node}/get_parameters", request).values
-            assert isinstance(value, ParameterValue)
-            return parameter_value_to_python(value)
+            return self.answer({"get_each": [node, [name]]})[name]
+        if what == "get_each":
+            node, names = argument
+            request = GetParameters.Request(names=names)
+            values = self.request(GetParameters, f"{node}/get_parameters", request).values
+            return dict(zip(names, map(parameter_value_to_python, values), strict=True))
         if what == "describe":
             names = self.request(
                 ListParameters, f"{argument}/list_parameters", ListParameters.Request()

@@ -192,13 +192,12 @@ def test_only_what_no_result_depends_on_may_be_set_and_setting_it_changes_no_res
     loop.node("recorder_node", "-p", f"bag:={tmp_path / 'bag'}")
     out = tmp_path / "run"
     with operator(loop) as desk:
-        tuner = start_tuner(loop, out, iterations=150)
+        tuner = start_tuner(loop, out, iterations=60)
         for node, live in LIVE.items():
             described = desk.ask(describe=node)
             assert {n for n, read_only in described.items() if not read_only} - ROS_OWN == live
-            for name in sorted(set(described) - live - ROS_OWN):
-                value = desk.ask(get=[node, name])
-                accepted, reason = desk.ask(set=[node, name, value])
+            values = desk.ask(get_each=[node, sorted(set(described) - live - ROS_OWN)])
+            for name, (accepted, reason) in desk.ask(set_each=[node, values]).items():
                 assert not accepted, (node, name)
                 assert "read-only" in reason
         plant = "/pde_sim_node"
@@ -224,7 +223,7 @@ def test_only_what_no_result_depends_on_may_be_set_and_setting_it_changes_no_res
         assert desk.ask(get=["/tuner_node", "max_attempts"]) == 3
         assert desk.ask(set=[plant, "real_time_factor", 0.0])[0]
         loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=150))
+    assert_same_training(out, in_process(iterations=60))
 
 
 SIM_TIME = ("-p", "use_sim_time:=true")
