@@ -18,10 +18,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from multiprocessing import forkserver
+from multiprocessing import forkserver, reduction
 from pathlib import Path
 from typing import Any
 
@@ -62,19 +63,41 @@ def udp_sockets(pid: int) -> list[tuple[str, int]]:
     return [(address, int(port, 16)) for address, port in own]
 
 
+class Duplicated:
+    """A descriptor of this process, of which one that is forked gets a duplicate: its number."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _number, (reduction.DupFd(self._descriptor),)
+
+
+def _number(duplicate: Any) -> int:
+    number: int = duplicate.detach()
+    return number
+
+
 class Forked:
     """A node or a program in a process that was forked, not executed; used like a Popen.
 
     name: one of tests.support.preloaded.MAINS, or "-c" and the first argument is Python, as for an
-    interpreter. Its output goes into the file `log`.
+    interpreter. Its output goes into the file `log`, and it works in the folder of that. terminal:
+    descriptor of one of which it is in charge, with its input and output.
     """
 
     def __init__(
-        self, name: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]
+        self,
+        name: str,
+        arguments: Sequence[str],
+        log: Path,
+        environment: Mapping[str, str],
+        terminal: int | None = None,
     ) -> None:
         self.name, self.args, self.log = name, [name, *arguments], log
         log.touch()
-        self._process = forked(run_main, name, list(arguments), log, dict(environment))
+        own = () if terminal is None else (Duplicated(terminal),)
+        self._process = forked(run_main, name, list(arguments), log, dict(environment), *own)
         assert self._process.pid is not None
         self.pid = self._process.pid
 
@@ -130,9 +153,26 @@ def become(log: Path, environment: Mapping[str, str]) -> None:
     os.chdir(log.parent)
 
 
-def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
+def take_over(terminal: int) -> None:
+    """Let this process, which leads a session, be in charge of a terminal."""
+    fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+    for number in range(3):
+        os.dup2(terminal, number)
+    os.close(terminal)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[attr-defined]  # as Python has it
+
+
+def run_main(
+    name: str,
+    arguments: list[str],
+    log: Path,
+    environment: dict[str, str],
+    terminal: int | None = None,
+) -> None:
     """What `Forked` runs, in the forked process."""
     become(log, environment)
+    if terminal is not None:
+        take_over(terminal)
     if name == "-c":
         code, *arguments = arguments
         sys.argv = [name, *arguments]

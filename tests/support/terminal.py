@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from tests.support.interpreter import ROOT
+from tests.support.loop_harness import Forked
 
 PDELOOP = [sys.executable, "-m", "pdeloop.cli"]
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")
@@ -39,20 +40,29 @@ def run(*words: str, environment: Mapping[str, str] | None = None, cwd: Path | N
 
 
 class Terminal:
-    """A process on a pseudo-terminal: what is typed and what is shown."""
+    """A process on a pseudo-terminal: what is typed and what is shown.
+
+    `pdeloop` is forked from a process that has everything loaded, other programs are executed.
+    """
 
     def __init__(self, *command: str, cwd: Path, environment: Mapping[str, str]) -> None:
         self.master, slave = pty.openpty()
-        self.process = subprocess.Popen(
-            command,
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-            cwd=cwd,
-            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **environment},
-            start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # of which it is in charge
-        )
+        own = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **environment}
+        self.process: Forked | subprocess.Popen[bytes]
+        if list(command[: len(PDELOOP)]) == PDELOOP:
+            words = command[len(PDELOOP) :]
+            self.process = Forked("pdeloop", words, cwd / "pdeloop.log", own, terminal=slave)
+        else:
+            self.process = subprocess.Popen(
+                command,
+                stdin=slave,
+                stdout=slave,
+                stderr=slave,
+                cwd=cwd,
+                env=own,
+                start_new_session=True,
+                preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # of which it is in charge
+            )
         os.close(slave)
         self.shown = ""
 

@@ -22,7 +22,7 @@ from tests.support.small_loop import (
 )
 
 pytestmark = pytest.mark.topics
-ITERATIONS, PACE = 40, 40.0
+ITERATIONS, PACE = 40, "real_time_factor:=40.0"
 """So many, of 37 ms an episode, that the server is gone for most of them."""
 
 
@@ -36,7 +36,7 @@ def test_two_pairs_train_through_a_server_and_wait_until_it_is_there(
     loop.environment["ROS_DISCOVERY_SERVER"] = address
     pairs = namespaces(2)
     for name in pairs:
-        own = ("-p", f"real_time_factor:={PACE}", "-p", f"publish_clock:={str(name == pairs[0]).lower()}")
+        own = ("-p", f"publish_clock:={str(name == pairs[0]).lower()}", "-p", PACE)
         for package, given in zip(PAIR, (own, ()), strict=True):
             loop.node(package, *PARAMETERS, *given, "-r", f"__ns:=/{name}")
     out = tmp_path / "run"
