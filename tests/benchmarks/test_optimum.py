@@ -28,7 +28,7 @@ from tests.support.made_once import made_once
 from tests.support.plants import Advection, plant_of
 from tests.support.small import SMALL
 
-FIELDS = 3
+FIELDS = 2
 GIVEN = {"fields": 4, "tolerance": 1e-6, "jobs": 1}
 
 

@@ -116,7 +116,8 @@ def test_a_random_walk_smooth_waves_and_too_few_numbers_have_no_level() -> None:
 
 def test_noise_is_found_within_a_tenth_on_a_known_plant() -> None:
     sigma = 0.05
-    rollouts, target = explored("allen-cahn-modes", n_z=96, horizon=50, measurement_noise=sigma)
+    plant = {"n_z": 96, "n_a": 6, "horizon": 40}
+    rollouts, target = explored("allen-cahn-modes", **plant, measurement_noise=sigma)
     assert found_in(rollouts, target) == pytest.approx(sigma, rel=0.1)
     # Declared nearly right, it is left as it was declared.
     assert found_in(rollouts, target, declared=1.5 * sigma) == 0.0
@@ -153,7 +154,7 @@ def test_a_front_that_looks_like_noise_in_its_short_waves_is_none(
 
 def test_noise_that_is_found_is_told_and_makes_no_first_law() -> None:
     """A model of short pieces takes it for the field, and one for noise has the wrong actuators."""
-    sigma, plant = 0.05, {"n_z": 96, "horizon": 80}
+    sigma, plant = 0.05, {"n_z": 96, "n_a": 6, "horizon": 64}
     rollouts, target = explored("allen-cahn-modes", measurement_noise=sigma, **plant)
     values = pdeloop.problem("allen-cahn-modes", **plant).values
 
@@ -201,7 +202,8 @@ def test_gauss_newton_goes_on_with_the_noise_that_a_model_shows(
 
 
 QUICK = {
-    **{"n_z": 128, "horizon": 40, "rollouts": 6, "evaluation_fields": 1},
+    **{"n_z": 96, "n_a": 6, "horizon": 20, "reduced_order": 8},
+    **{"rollouts": 6, "evaluation_fields": 1},
     **{"field_model_settings.folds": 2, "field_model_settings.passes": 2},
     **{"exploration_variance": 1.0, "identification": "regression"},
     **{"field_model_settings.largest_degree": 3},
