@@ -12,7 +12,6 @@ import signal
 import sys
 import tempfile
 from collections.abc import Generator, Iterator
-from multiprocessing.util import get_temp_dir
 from pathlib import Path
 
 import pytest
@@ -54,7 +53,6 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 @pytest.fixture(scope="session", autouse=True)
 def temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The temporary folder of whatever the tests run, of this worker alone; see `leftovers`."""
-    get_temp_dir()  # that of multiprocessing, which removes it when this process has ended its tests
     folder = tmp_path_factory.mktemp("tmp", numbered=False)  # short: sockets are in it
     os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
     return folder
