@@ -3,10 +3,12 @@
 
 It is the step of `kernel` and the adjoint of `adjoint`, with
 
-    N(v) = sum_q m_q F[g_q(u)] + F_a,        g_q(u) = sum_{p = 2}^P C_qp u^p
+    N(v) = sum_q m_q F[g_q(u)] + sum_l n_l F[h_l(x, u)] + F_a,
+           g_q(u) = sum_{p = 2}^P C_qp u^p,        h_l(x, u) = sum_{p = 1}^P c_lp(x) u^p
 
-in place of m F[g(u)] + F_a: each g_q has a multiplier of its own, and neither they nor the polynomials
-are compiled, so that one machine code serves all such equations. u can be cut to +-clip before.
+in place of m F[g(u)] + F_a: each g_q and h_l has a multiplier of its own, and neither they nor the
+polynomials are compiled, so that one machine code serves all such equations. u can be cut to +-clip
+before.
 """
 
 from typing import Any
@@ -41,6 +43,7 @@ PLAN = np.dtype(
     [
         ("parts", np.int64),  # Q
         ("degree", np.int64),  # P
+        ("varying", np.int64),  # number of h_l
         ("clip", np.float64),
         ("steps", np.int64),  # internal steps of a sampling time
         ("n_x", np.int64),  # grid points
@@ -56,7 +59,8 @@ PLAN = np.dtype(
                 "constants_apart",
                 "scratch",
                 "scratch_apart",
-                # Offsets in c. Spectra of the step, as in `kernel`; m_q; C_qp and p C_qp.
+                # Offsets in c. Spectra of the step, as in `kernel`; m_q; C_qp and p C_qp; n_l; c_lp at
+                # the even points of the dealiased grid, and at the odd ones in the other plane.
                 "e",
                 "e2",
                 "q",
@@ -69,6 +73,8 @@ PLAN = np.dtype(
                 "multipliers",
                 "polynomials",
                 "slopes",
+                "factors",
+                "coefficients",
                 "analysis",  # unused, like the next
                 "synthesis",
                 # Of the integrals of powers along a path.
@@ -121,8 +127,21 @@ def horner(coefficients: int, terms: int, c: int, u: Any) -> Any:
 
 
 @jit
+def horner_at(plan: Any, part: int, j: int, c: int, e: int, u: Any, slope: int) -> Any:
+    """Lanes of h_l(x, u)/u = c_l1 + c_l2 u + ..; with slope = 1 of dh_l/du = c_l1 + 2 c_l2 u + .."""
+    real, imaginary, terms = splat(0.0), splat(0.0), plan.degree
+    for p in range(terms - 1, -1, -1):
+        own, factor = (
+            get(c, plan.coefficients + (part * terms + p) * plan.fine.m + j, e),
+            splat(1.0 + slope * p),
+        )
+        real, imaginary = real * u[0] + factor * own[0], imaginary * u[1] + factor * own[1]
+    return real, imaginary
+
+
+@jit
 def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Address of the sum of m_q F[g_q(u)], u being the field of the spectrum x, kept at `tape`."""
+    """Address of N but for F_a, u being the field of the spectrum x, kept at `tape`."""
     t, clip, modes, terms = plan.fine, splat(plan.clip), plan.modes, plan.degree - 1
     field_to(tape, w, plan.x, d, plan, c, e)
     for k in range(0, modes, 8):
@@ -147,6 +166,22 @@ def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
                 d,
                 plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g),
             )
+    for part in range(plan.varying):
+        multiplier = plan.factors + part * modes
+        for j in range(0, t.m, 8):
+            u = get(w, tape + j, d)
+            u = clamp(u[0], clip), clamp(u[1], clip)
+            total = horner_at(plan, part, j, c, e, u, 0)
+            put(w, plan.z1 + j, d, (u[0] * total[0], u[1] * total[1]))
+        z = forward(w, plan.z1, plan.z2, d, t, c, e)
+        for k in range(0, modes, 8):
+            g = rfft_pack(w, z, d, t.m, t.split, k, c, e)
+            put(
+                w,
+                plan.sum + k,
+                d,
+                plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g),
+            )
     at: int = plan.sum
     return at
 
@@ -162,12 +197,15 @@ integrate = internal_step(nonlinear, modes_at)
 
 @jit
 def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Address of the transform of sum_q g_q'(u) times the field of m_q* x."""
+    """Address of the transform of sum_q g_q'(u) times the field of m_q* x, and of dh_l/du likewise."""
     t, clip, modes, terms = plan.fine, splat(plan.clip), plan.modes, plan.degree - 1
-    last = plan.parts - 1
+    last = plan.parts + plan.varying - 1
     # The products are gathered in what the next field leaves free: z1, z2 and a third plane.
-    for part in range(plan.parts):
-        own, multiplier = plan.slopes + part * terms, plan.multipliers + part * modes
+    for part in range(plan.parts + plan.varying):
+        own, further = plan.slopes + part * terms, part - plan.parts
+        multiplier = plan.multipliers + part * modes
+        if further >= 0:
+            multiplier = plan.factors + further * modes
         for k in range(0, modes, 8):
             value = conjugate_product(c, multiplier + k, e, get(w, plan.x + k, d))
             put(w, plan.part + k, d, value)
@@ -176,17 +214,18 @@ def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
         for j in range(0, t.m, 8):
             u, y = get(w, tape + j, d), get(w, z + j, d)
             ur, ui = clamp(u[0], clip), clamp(u[1], clip)
-            total = (
-                where_equal(ur, u[0], horner(own, terms, c, ur)) * y[0],
-                where_equal(ui, u[1], horner(own, terms, c, ui)) * y[1],
-            )
+            if further >= 0:
+                slope = horner_at(plan, further, j, c, e, (ur, ui), 1)
+            else:
+                slope = horner(own, terms, c, ur), horner(own, terms, c, ui)
+            total = where_equal(ur, u[0], slope[0]) * y[0], where_equal(ui, u[1], slope[1]) * y[1]
             if part:
                 total = plus(get(w, plan.power + j, d), total)
             if part == last:
                 put(w, plan.z1 + j, d, total)
             else:
                 put(w, plan.power + j, d, total)
-    if plan.parts == 0:
+    if last < 0:
         for j in range(0, t.m, 8):
             put(w, plan.z1 + j, d, (splat(0.0), splat(0.0)))
     return forward(w, plan.z1, plan.z2, d, t, c, e)

@@ -36,10 +36,14 @@ class Polynomials(NamedTuple):
     constant: Array
     steps: int
     clip: float
+    factors: Spectrum | None = None
+    coefficients: Array | None = None
 
 
 class PolynomialStep:
-    """A sampling time, the unit of time, of d/dt F[u] = L F[u] + sum_q m_q F[g_q(u)] + F[Phi a + c].
+    """A sampling time, the unit of time, of an equation with polynomial nonlinear parts.
+
+        d/dt F[u] = L F[u] + sum_q m_q F[g_q(u)] + sum_l n_l F[h_l(x, u)] + F[Phi a + c]
 
     One thread may use it at a time.
 
@@ -47,8 +51,9 @@ class PolynomialStep:
     ----------
     equation
         linear L (modes,), multipliers m_q (Q, modes), polynomials C_qp (Q, P - 1) for p = 2 .. P,
-        supports Phi (n_x, n_a), constant c (n_x,), steps: internal ones, clip: of u in g_q; modes =
-        n_x//2 + 1.
+        supports Phi (n_x, n_a), constant c (n_x,), steps: internal ones, clip: of u in g_q and h_l,
+        factors n_l (N, modes) and coefficients c_lp (N, P, n_x) for p = 1 .. P, or none of both;
+        modes = n_x//2 + 1.
 
     Raises
     ------
@@ -63,7 +68,8 @@ class PolynomialStep:
         self._n_x, self._last, self._degree = n_x, n_x // 2, degree
         self._whole = n_x % 2 == 0 and is_transform_length(n_x // 2)
         supports = np.column_stack([equation.supports, equation.constant])
-        kept, planes, size = layout(n_x, degree, parts, supports.shape[1], steps)
+        varying = 0 if equation.factors is None else len(equation.factors)
+        kept, planes, size = layout(n_x, degree, parts, supports.shape[1], steps, varying)
         self._plans, self._constants = kept.copy(), aligned(planes.size)
         self._scratch, self._weighted = aligned(2 * size), False
         self._constants[:] = planes
@@ -75,6 +81,10 @@ class PolynomialStep:
         self._put("multipliers", equation.multipliers)
         self._put("polynomials", equation.polynomials.reshape(1, -1))
         self._put("slopes", (equation.polynomials * np.arange(2, degree + 1)).reshape(1, -1))
+        if equation.factors is not None and equation.coefficients is not None:
+            rows = equation.coefficients.reshape(-1, n_x)
+            self._put("factors", equation.factors)
+            self._put("coefficients", on_fine_grid(rows, fine))
         plan["constants"] = self._constants.ctypes.data
         plan["scratch"] = self._scratch.ctypes.data
 
@@ -209,7 +219,9 @@ def fine_length(n_x: int, degree: int) -> int:
 
 
 @lru_cache(maxsize=16)  # a fit makes thousands of steps of one size
-def layout(n_x: int, degree: int, parts: int, n_a: int, steps: int) -> tuple[Any, Array, int]:
+def layout(
+    n_x: int, degree: int, parts: int, n_a: int, steps: int, varying: int = 0
+) -> tuple[Any, Array, int]:
     """What steps of one size have in common: their plan, their constants, the numbers of a scratch.
 
     Without addresses, and without the numbers of an equation, for which there is room.
@@ -217,7 +229,7 @@ def layout(n_x: int, degree: int, parts: int, n_a: int, steps: int) -> tuple[Any
     plans, constants, modes = np.zeros(1, PLAN), Constants(), n_x // 2 + 1
     plan, fine, own = plans[0], fine_length(n_x, degree), whole_lanes(n_x // 2 + 1)
     plan["parts"], plan["degree"], plan["steps"] = parts, degree, steps
-    plan["n_x"], plan["n_a"], plan["modes"] = n_x, n_a, own
+    plan["n_x"], plan["n_a"], plan["modes"], plan["varying"] = n_x, n_a, own, varying
     if n_x % 2 == 0 and is_transform_length(n_x // 2):
         plan["coarse"] = constants.add_transform(n_x // 2, modes)
     plan["fine"] = constants.add_transform(fine, modes)
@@ -227,6 +239,8 @@ def layout(n_x: int, degree: int, parts: int, n_a: int, steps: int) -> tuple[Any
     plan["multipliers"] = constants.add_spectra(np.zeros((parts, own)))
     for name in ("polynomials", "slopes"):
         plan[name] = constants.add(np.zeros(parts * (degree - 1)))
+    plan["factors"] = constants.add_spectra(np.zeros((varying, own)))
+    plan["coefficients"] = constants.add(np.zeros(varying * degree * fine))
     size = lay_out(
         plan,
         {
@@ -255,6 +269,14 @@ def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> Spe
             c.f1 + 4 * c.f2 + c.f3,
         )
     )
+
+
+def on_fine_grid(rows: Array, length: int) -> NDArray[np.complex128]:
+    """Functions (..., n_x) of x on the dealiased grid: its even points, and i times the odd ones."""
+    spectra = np.fft.rfft(rows) * (2 * length / rows.shape[-1])
+    values = np.fft.irfft(spectra, n=2 * length)
+    fine: NDArray[np.complex128] = values[..., ::2] + 1j * values[..., 1::2]
+    return fine
 
 
 def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:

@@ -49,7 +49,7 @@ class SensedProposals:
 
     Attributes
     ----------
-    equation : (24 + n_a,) array
+    equation : (44 + n_a,) array
         The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 

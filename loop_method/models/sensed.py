@@ -1,13 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation of a field of which a few points are measured.
 
-    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,    B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + sum_p v_p(x) z^p + d(v(x) z)/dx + d(D(x) dz/dx)/dx + c + B a,
+                    B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
                     x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = q_i + w / n_a
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i and widths
-q_i of the actuators. Nothing else depends on where on the domain something happens, so that there are
-a dozen unknowns and one for each actuator, however fine the grid. `loop_method.models.sensed_fit` finds
-them.
+q_i of the actuators. v_p, v and D are sums of the first two cosines and sines, and zero where constant
+coefficients reproduce the readings. There are a few dozen unknowns and one for each actuator, however
+fine the grid. `loop_method.models.sensed_fit` finds them.
 
 A sampling time has internal steps, the more the larger the field: a front moves through several grid
 points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
@@ -43,8 +44,17 @@ TERMS = FIRST + tuple(
     if (p, j) not in FIRST
 )
 """Those of every equation that a model of the whole field may have."""
-COEFFICIENTS = len(TERMS) + 1
-"""Their number, and 1 for the constant."""
+VARIATIONS = tuple(
+    (p, j, m, sine)
+    for p, j in ((1, 0), (1, 1), (1, 2), (2, 0), (3, 0))
+    for m in (1, 2)
+    for sine in (False, True)
+)
+"""p and j of a term whose coefficient depends on x, and the wave of which the unknown is the size."""
+EQUATION = len(TERMS) + len(VARIATIONS)
+"""Number of the coefficients of both."""
+COEFFICIENTS = EQUATION + 1
+"""The same, and 1 for the constant."""
 # b, x_0, s and w.
 _ACTUATORS = 4
 KIND = "sensed"
@@ -57,6 +67,8 @@ _TIME = 100.0
 _SIZE = 4.0
 WAVES = 16
 """Cosines and sines of an initial field, in addition to its mean."""
+# The least share of a coefficient of x that a bound leaves, so that it stays an unknown.
+_KEPT = 1e-6
 # The least number of grid points.
 _POINTS = 64
 
@@ -69,7 +81,7 @@ def unknowns(n_a: int) -> int:
 def open_unknowns(shared: Array) -> NDArray[np.intp]:
     """The unknowns that a fit starting from these finds: all but those terms that are not used yet."""
     own = np.arange(len(shared))
-    return np.flatnonzero((own < len(FIRST)) | (own >= len(TERMS)) | (shared != 0.0))
+    return np.flatnonzero((own < len(FIRST)) | (own >= EQUATION) | (shared != 0.0))
 
 
 def well_posed(shared: Array) -> Array:
@@ -88,6 +100,12 @@ def well_posed(shared: Array) -> Array:
     for p in range(len(ORDERS), 2, -2):
         if bound((p, 0), -1.0):
             break
+    # The same at every x.
+    for term, sign, other in (((3, 0), -1.0, (5, 0)), ((1, 2), 1.0, (1, 4))):
+        varied = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
+        reached, most = float(np.abs(found[varied]).sum()), sign * found[TERMS.index(term)]
+        if reached > most and not found[TERMS.index(other)]:
+            found[varied] *= max(most / reached, _KEPT)
     return found
 
 
@@ -140,7 +158,7 @@ class SensedModel(SpectralModel):
 
     Attributes
     ----------
-    shared : (24 + n_a,) array
+    shared : (44 + n_a,) array
         Its unknowns, in their units.
     actuators : Actuators
         What is declared of them.
@@ -223,15 +241,16 @@ def _widths_of(arrays: Arrays, n_a: int) -> Array:
 
 
 def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
-    """The unknowns of `arrays`; older ones have the first terms alone, or equal actuators as well."""
-    further, known = SHARED - len(TERMS) + len(FIRST), arrays.get(name)
-    if known is None or known.shape not in ((further,), (further + n_a,)):
+    """The unknowns of `arrays`; older ones have no coefficients of x, or the first terms alone."""
+    known, others = arrays.get(name), SHARED - EQUATION
+    older = {(terms + others + n,): terms for terms in (len(FIRST), len(TERMS)) for n in (0, n_a)}
+    if known is None or known.shape not in older:
         return numbers_of(arrays, name, unknowns(n_a))
-    older = np.zeros(unknowns(n_a))
+    terms, found = older[known.shape], np.zeros(unknowns(n_a))
     own = numbers_of(arrays, name, len(known))
-    older[: len(FIRST)] = own[: len(FIRST)]
-    older[len(TERMS) : len(TERMS) + len(own) - len(FIRST)] = own[len(FIRST) :]
-    return older
+    found[:terms] = own[:terms]
+    found[EQUATION : EQUATION + len(own) - terms] = own[terms:]
+    return found
 
 
 def sensed_model(
@@ -246,7 +265,7 @@ def sensed_model(
 
     Parameters
     ----------
-    shared : (24 + n_a,) array
+    shared : (44 + n_a,) array
         The unknowns that all rollouts share, in their units.
     sensors : int
         n_y.
@@ -263,6 +282,13 @@ def sensed_model(
     equation = SensedEquation(shared, n, actuators, settings)
     symbols, followed = equation.symbols, equation.followed(largest)
     substeps = substeps_of(followed, largest, settings)
+    fewer = fewer_of(followed, largest, substeps, settings)
+    if equation.coefficients is not None:
+        rates = equation.varying_rates(np.append(fewer[:, 0], largest)) / settings.reach
+        more = np.ceil(np.minimum(rates, settings.substeps))
+        substeps = min(substeps + int(more[-1]), settings.substeps)
+        fewer = np.column_stack([fewer[:, 0], fewer[:, 1] + more[:-1]])
+        fewer = fewer[fewer[:, 1] < substeps]
     return SensedModel(
         KIND,
         symbols[0],
@@ -271,7 +297,9 @@ def sensed_model(
         equation.supports * equation.strengths,
         np.full(n, equation.constant),
         substeps=substeps,
-        fewer=fewer_of(followed, largest, substeps, settings),
+        fewer=fewer,
+        factors=equation.factors,
+        coefficients=equation.coefficients,
         shared=shared,
         actuators=actuators,
         sensors=sensors,
@@ -281,7 +309,7 @@ def sensed_model(
 
 
 class SensedEquation:
-    """The equation in Fourier space, for unknowns (24 + n_a,)."""
+    """The equation in Fourier space, for unknowns (44 + n_a,)."""
 
     def __init__(
         self,
@@ -300,6 +328,13 @@ class SensedEquation:
             wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
             unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
             self.symbols[p - 1] += unit * shared[i] * derivatives[j]
+        varied = shared[len(TERMS) : EQUATION]
+        self.factors: Spectrum | None = None
+        self.coefficients: Array | None = None
+        """Of the terms whose coefficients depend on x, (3, modes) and (3, degree, n); None without."""
+        if varied.any():
+            self.factors = np.stack(derivatives[:3])
+            self.coefficients = _coefficients(n, degree, varied.tobytes())
         self._fourth = bool(shared[TERMS.index((1, 4))])
         # What grows faster would overflow within an episode.
         grown = self.symbols[0]
@@ -315,10 +350,21 @@ class SensedEquation:
     def substeps(self, sizes: Array) -> NDArray[np.int64]:
         """Internal steps for fields of these sizes."""
         symbols = self.followed(float(sizes.max()))[1:, : 2 * self.symbols.shape[1] // 3]
-        rates = _rates(symbols, sizes).max(axis=1)
+        rates = _rates(symbols, sizes).max(axis=1) + self.varying_rates(sizes)
         most = self._settings.substeps
         steps = np.nan_to_num(np.ceil(rates / self._settings.reach), nan=most)
         return np.asarray(np.clip(steps, 1, most), dtype=np.int64)
+
+    def varying_rates(self, sizes: Array) -> Array:
+        """How fast the terms whose coefficients depend on x act on fields of these sizes, at most."""
+        if self.factors is None or self.coefficients is None:
+            return np.zeros(len(sizes))
+        waves = np.abs(self.factors[:, : 2 * self.symbols.shape[1] // 3]).max(axis=1)
+        rates = waves @ np.abs(self.coefficients).max(axis=2)
+        found: Array = sum(
+            p * rate * sizes ** (p - 1) for p, rate in enumerate(rates.tolist(), start=1)
+        )
+        return found
 
     def followed(self, size: float) -> Spectrum:
         """The symbols whose rates, for fields of this size, the internal steps follow.
@@ -346,6 +392,8 @@ class SensedEquation:
             np.ones(len(supports)),
             substeps,
             clip,
+            self.factors,
+            self.coefficients,
         )
         return PolynomialStep(equation)
 
@@ -362,6 +410,23 @@ def _supports(n: int, centres: bytes, widths: bytes, x_0: float, s: float, w: fl
     shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
     shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])
     found: Array = np.fft.irfft(shifted, n).T
+    found.setflags(write=False)  # it is shared
+    return found
+
+
+@lru_cache(maxsize=64)
+def _coefficients(n: int, degree: int, varied: bytes) -> Array:
+    """Those that depend on x, of d^j(z^p)/dx^j on the grid, (3, degree, n), j = 0, 1, 2.
+
+    d(D dz/dx)/dx = d^2(D z)/dx^2 - d(D' z)/dx.
+    """
+    x, found = 2.0 * np.pi * np.arange(n) / n, np.zeros((3, degree, n))
+    for (p, j, m, sine), own in zip(VARIATIONS, np.frombuffer(varied), strict=True):
+        size = own / (_TIME * _WAVENUMBER**j)
+        found[j, p - 1] += size * (np.sin(m * x) if sine else np.cos(m * x))
+        if j == 2:
+            slope = np.cos(m * x) if sine else -np.sin(m * x)
+            found[1, p - 1] -= 2.0 * np.pi * m * size * slope
     found.setflags(write=False)  # it is shared
     return found
 

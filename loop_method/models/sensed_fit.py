@@ -12,6 +12,10 @@ by the method of Levenberg and Marquardt, first over the beginning of the rollou
 and longer parts: over a whole rollout at once, a front makes the error flat in most unknowns. The field
 between the sensors is observed later, when it passes one.
 
+Where constant coefficients leave an error that is not noise, all rollouts are fitted once more from
+nothing, with coefficients that depend on x; these count if they halve the error, also of rollouts that
+they were not fitted to.
+
 After each part the ridge of an unknown becomes s^2/(x^2 + C), with C its variance given the readings
 and s^2 that of a residual. An unknown that is not significant, such as a growth that a few calm
 rollouts cannot tell from none, goes to zero and does not make other rollouts run away.
@@ -33,8 +37,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import TERMS, Actuators, coefficients_of, field_of, grid_points
-from loop_method.models.sensed_growth import Found, further_terms, grown, start_with
+from loop_method.models.sensed import (
+    EQUATION,
+    TERMS,
+    Actuators,
+    coefficients_of,
+    field_of,
+    grid_points,
+)
+from loop_method.models.sensed_growth import USED, Found, further_terms, grown, start_with
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -67,7 +78,7 @@ def fit_sensed(
         What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
-    start : (24 + n_a,) array, optional
+    start : (44 + n_a,) array, optional
         The shared unknowns to begin with; from several equations, with no actuators, if there are none.
     target : (n_y,) array, optional
         z_r at the sensors.
@@ -83,7 +94,7 @@ def fit_sensed(
 
     Returns
     -------
-    (24 + n_a,) array, (rollouts, n) array and float
+    (44 + n_a,) array, (rollouts, n) array and float
         The shared unknowns with the least error, the initial fields, and the error: what is minimised,
         but for the ridge and for what noise has in it. It is infinite where no equation reproduces even
         the beginning of the rollouts.
@@ -106,7 +117,7 @@ def fit_sensed(
             # A fit to all rollouts takes long: only from what is an equation of these few.
             own = _from_few(problem, few, settings, enough)
             found = min(found, own, key=lambda each: each[0])
-    error, shared, fields = found
+    error, shared, fields = with_coefficients_of_x(problem, found, settings)
     return shared, field_of(fields, n), max(error, 0.0)
 
 
@@ -221,6 +232,48 @@ def part_by_part(
     if not np.isfinite(error):
         return error, shared, fields
     return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
+
+
+def with_coefficients_of_x(
+    problem: SensedProblem, first: Found, settings: FieldModelSettings
+) -> Found:
+    """The fit with coefficients that depend on x, if its error is less than half of the first one's.
+
+    All of them are unknowns from the beginning: from an equation that makes up for them, as with wider
+    actuators, no descent leads to the right one.
+    """
+    count = len(problem.y)
+    if first[0] <= unexplained(problem, settings) or count < 2:
+        return first
+    start = np.zeros(problem.shared)
+    start[len(TERMS) : EQUATION] = USED
+    some, others = (problem.part(range(own, count, 2)) for own in (0, 1))
+    most = settings.sensed_hopeless
+    error, shared, _ = part_by_part(some, start, some.interpolated(), settings, most)
+    if not np.isfinite(error):
+        return first
+    before = foretold(others, first[1]) if np.isfinite(first[0]) else np.inf
+    if not halved(before, foretold(others, shared), settings):
+        return first
+    found = _refined(problem, shared, problem.interpolated(), None, settings)
+    return found if halved(first[0], found[0], settings) else first
+
+
+def foretold(problem: SensedProblem, shared: Array) -> float:
+    """The error of this equation in rollouts that it was not fitted to, from their likeliest fields."""
+    return problem.fit(shared, problem.interpolated(), known=True)[0] - problem.noise
+
+
+def unexplained(problem: SensedProblem, settings: FieldModelSettings) -> float:
+    """The least error that is due neither to the grid nor to chance in the noise."""
+    chance = settings.sensed_alike_chi * problem.noise * np.sqrt(2.0 / problem.y.size)
+    return max(settings.sensed_varying, float(chance))
+
+
+def halved(before: float, after: float, settings: FieldModelSettings) -> bool:
+    """True if an error is less than half of another, beside what the grid does not resolve."""
+    unresolved = settings.sensed_unresolved**2
+    return after <= settings.sensed_reproduced and after + unresolved < 0.5 * (before + unresolved)
 
 
 def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:

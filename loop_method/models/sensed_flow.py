@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import COEFFICIENTS, SHARED, TERMS, WAVES, Actuators, SensedEquation
+from loop_method.models.sensed import (
+    COEFFICIENTS,
+    EQUATION,
+    SHARED,
+    WAVES,
+    Actuators,
+    SensedEquation,
+)
 from loop_method.models.settings import FieldModelSettings
 from spectral_solver.polynomial_step import PolynomialStep, PolynomialSteps
 
@@ -23,11 +30,11 @@ _FASTEST = 1e50
 
 
 class SensedFlow:
-    """The equation with the unknowns (24 + n_a,), and with some of them less by a difference each.
+    """The equation with the unknowns (44 + n_a,), and with some of them less by a difference each.
 
     Parameters
     ----------
-    shared : (24 + n_a,) array
+    shared : (44 + n_a,) array
         The unknowns.
     n : int
         Number of grid points.
@@ -61,7 +68,7 @@ class SensedFlow:
         equations = [SensedEquation(shared - own, n, actuators, settings) for own in changes]
         first, self._terms = (
             equations[0],
-            [own for i, own in zip(varied, equations[1:], strict=True) if i < len(TERMS)],
+            [own for i, own in zip(varied, equations[1:], strict=True) if i < EQUATION],
         )
         self.finite = all(
             bool(np.abs(each.symbols[0]).max() < _FASTEST) for each in [first, *self._terms]

@@ -20,14 +20,14 @@ from __future__ import annotations
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import FIRST, TERMS, well_posed
+from loop_method.models.sensed import EQUATION, FIRST, well_posed
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import FieldModelSettings
 
 Found = tuple[float, Array, Array]
 """The error without that of the noise, the shared unknowns and the fields."""
-# A coefficient that is zero but for the sign: its term is used.
-_USED = 1e-9
+USED = 1e-9
+"""A coefficient that is zero but for the sign: its term is used."""
 
 
 def further_terms(problem: SensedProblem, first: Found, settings: FieldModelSettings) -> Array:
@@ -107,10 +107,10 @@ def start_with(shared: Array, added: tuple[int, float] | None = None) -> Array:
     added: which one, and its coefficient.
     """
     start = np.zeros(len(shared))
-    further = slice(len(FIRST), len(TERMS))
-    start[further] = _USED * np.sign(shared[further])
+    further = slice(len(FIRST), EQUATION)
+    start[further] = USED * np.sign(shared[further])
     if added is not None:
-        start[added[0]] = _USED * np.sign(added[1])
+        start[added[0]] = USED * np.sign(added[1])
     bounded = well_posed(start)
     # On the side where it is well posed.
     return np.where((start != 0.0) & (bounded == 0.0), -start, bounded)

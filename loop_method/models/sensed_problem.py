@@ -124,29 +124,33 @@ class SensedProblem:
                 return np.inf, shared, fields
         return self._error(shared, fields, lengths[-1]), shared, fields
 
-    def missing(self, shared: Array, fields: Array, steps: int) -> tuple[int, float, float]:
-        """The term that promises the largest fall of the error, its coefficient, and the fall.
+    def missing(
+        self, shared: Array, fields: Array, steps: int, among: Sequence[int] = range(len(TERMS))
+    ) -> tuple[int, float, float]:
+        """Which of these unknowns promises the largest fall of the error, its value, and the fall.
 
         That of a step of Gauss and Newton in this term and all other unknowns; the fall is 0 where
         nothing is finite.
         """
-        own, self._open = self._open, np.arange(self.shared)
+        own, used = self._open, open_unknowns(shared)
+        self._open = np.union1d(used, np.asarray(among, dtype=np.intp))
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 residual, J = self._linearised(shared, fields, steps, known=False)
             H, g = self._normal(residual, J, steps)
-            g = g + self._ridges(steps) * np.concatenate([shared, fields.ravel()])
+            g = g + self._ridges(steps) * np.concatenate([shared[self._open], fields.ravel()])
         finally:
             self._open = own
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
             return 0, 0.0, 0.0
-        known = np.append(open_unknowns(shared), np.arange(self.shared, len(H)))
+        columns = np.union1d(used, np.asarray(among, dtype=np.intp))
+        known = np.append(np.searchsorted(columns, used), np.arange(len(columns), len(H)))
         inverse, best = np.linalg.inv(H[np.ix_(known, known)]), (0, 0.0, 0.0)
-        for i in np.setdiff1d(np.arange(len(TERMS)), known).tolist():
+        for i in np.setdiff1d(np.arange(len(columns)), known).tolist():
             explained = inverse @ H[known, i]
             slope, curvature = g[i] - explained @ g[known], H[i, i] - explained @ H[known, i]
             if curvature > 0.0 and slope**2 / curvature > best[2]:
-                best = i, float(-slope / curvature), float(slope**2 / curvature)
+                best = int(columns[i]), float(-slope / curvature), float(slope**2 / curvature)
         return best
 
     def _relevant(self, shared: Array, fields: Array, steps: int) -> Array:
@@ -285,7 +289,7 @@ class SensedProblem:
     def _residuals(
         self, shared: Array, fields: Array, steps: int, varied: Sequence[int] = ()
     ) -> Array:
-        """Errors for unknowns (24 + n_a,) and fields (P, R, 33), as shares of the whole.
+        """Errors for unknowns (44 + n_a,) and fields (P, R, 33), as shares of the whole.
 
         (P, R, errors): those of the readings and, over whole rollouts, that of the distance. P is
         followed by the first fields with each of the varied unknowns less by a difference.

@@ -199,6 +199,12 @@ class FieldModelSettings(Settings):
     sensed_further_worse: float = setting(
         2.0, "growth of the error at which no further term is added", 1, 1000
     )
+    sensed_varying: float = setting(
+        3e-4,
+        "error of constant coefficients above which ones that depend on x are tried",
+        0,
+        1,
+    )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
     sensed_attempts: int = setting(
         5, "maximum number of times that an equation is looked for in vain", 1, 1000

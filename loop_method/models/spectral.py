@@ -3,6 +3,7 @@
 
     d/dt F[z] = L F[z] + sum_q m_q F[g_q(z)] + F[B a + c],        g_q(z) = sum_{p >= 2} C_qp z^p,
 
+and, where there are coefficients that depend on x, sum_l n_l F[sum_p c_lp(x) z^p] in addition,
 F the discrete Fourier transform, L and m_q numbers of every wavenumber, and time in sampling times. A
 sampling time is integrated by ETDRK4 in equal internal steps, the fewer the smaller the field, and the
 nonlinear part on a finer grid that has room for its products, by the solver of the plants
@@ -48,6 +49,8 @@ class SpectralModel:
         z is cut to +-clip in g_q; infinite: it is not.
     fewer : (n, 2) array
         Rows max |z|, steps, both ascending: as many are enough where the field begins no larger.
+    factors, coefficients : (N, n_z // 2 + 1) complex and (N, P, n_z) arrays, or None
+        n_l and c_lp; None: no coefficient depends on x.
     """
 
     kind: str
@@ -59,6 +62,8 @@ class SpectralModel:
     substeps: int
     clip: float = np.inf
     fewer: Array = field(default_factory=lambda: np.empty((0, 2)))
+    factors: Spectrum | None = None
+    coefficients: Array | None = None
 
     @property
     def n_z(self) -> int:
@@ -97,6 +102,8 @@ class SpectralModel:
             self.constant,
             substeps,
             self.clip,
+            self.factors,
+            self.coefficients,
         )
         return PolynomialStep(equation)
 
@@ -125,7 +132,9 @@ class SpectralModel:
         return linearised(self, state, action)
 
     def arrays(self) -> Arrays:
-        return {
+        varying = {"factors": self.factors, "coefficients": self.coefficients}
+        known = {name: value for name, value in varying.items() if value is not None}
+        return known | {
             "form": np.array("spectral"),
             "kind": np.array(self.kind),
             "linear": self.linear,
@@ -144,6 +153,9 @@ class SpectralModel:
         constant = numbers_of(arrays, "constant", None)
         n_z, modes = len(constant), len(constant) // 2 + 1
         multipliers = _spectrum_of(arrays, "multipliers", None, modes)
+        polynomials = numbers_of(arrays, "polynomials", len(multipliers), None)
+        factors = _spectrum_of(arrays, "factors", None, modes) if "factors" in arrays else None
+        shape = (0 if factors is None else len(factors)), polynomials.shape[1] + 1, n_z
         substeps, fewer = steps_of(arrays), numbers_of(arrays, "fewer", None, 2)
         if ((fewer[:, 1] < 1) | (fewer[:, 1] > substeps)).any():
             raise ValueError(
@@ -153,12 +165,14 @@ class SpectralModel:
             text_of(arrays, "kind"),
             _spectrum_of(arrays, "linear", modes),
             multipliers,
-            numbers_of(arrays, "polynomials", len(multipliers), None),
+            polynomials,
             numbers_of(arrays, "B", n_z, None),
             constant,
             substeps=substeps,
             clip=float(checked_array(arrays, "clip", "f", (), finite=False)),
             fewer=fewer,
+            factors=factors,
+            coefficients=None if factors is None else numbers_of(arrays, "coefficients", *shape),
         )
 
 

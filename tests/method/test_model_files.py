@@ -19,6 +19,7 @@ from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
 from loop_method.models.sensed import (
+    EQUATION,
     FIRST,
     SHARED,
     TERMS,
@@ -115,17 +116,22 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     assert all(np.array_equal(again[name], arrays[name]) for name in arrays)
 
 
+VARIED = np.arange(len(TERMS), EQUATION)
+"""The unknowns of coefficients that depend on x."""
+
+
 def test_an_older_model_between_sensors_has_equal_actuators_of_no_declared_width() -> None:
     arrays = MODELS["sensed"].arrays()
     older = {name: own for name, own in arrays.items() if name != "widths"}
     own = arrays["shared"]
-    first = np.append(own[: len(FIRST)], own[len(TERMS) :])
-    for known in (first, first[: len(first) - N_A]):
+    first, terms = np.append(own[: len(FIRST)], own[EQUATION:]), np.delete(own, VARIED)
+    for known in (terms, first, first[: len(first) - N_A]):
         found = model_of({**older, "shared": known}).arrays()
         shared = found["shared"]
-        assert shared.shape == own.shape and not shared[len(FIRST) : len(TERMS)].any()
+        assert shared.shape == own.shape and not shared[VARIED].any()
+        assert shared[len(FIRST) : len(TERMS)].any() == (known is terms)
         np.testing.assert_array_equal(shared[: len(FIRST)], own[: len(FIRST)])
-        np.testing.assert_array_equal(shared[len(TERMS) : SHARED], own[len(TERMS) : SHARED])
+        np.testing.assert_array_equal(shared[EQUATION:SHARED], own[EQUATION:SHARED])
         equal = len(known) < len(first)
         np.testing.assert_array_equal(shared[SHARED:], 0.0 if equal else own[SHARED:])
     np.testing.assert_array_equal(found["widths"], np.zeros(N_A))

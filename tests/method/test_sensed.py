@@ -19,6 +19,7 @@ from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.models import sensed_fit
 from loop_method.models.sensed import (
     COEFFICIENTS,
+    EQUATION,
     FIRST,
     SHARED,
     TERMS,
@@ -170,7 +171,7 @@ def _coefficients(model: SpectralModel) -> Array:
 def test_an_action_moves_the_field_as_the_input_matrix_says() -> None:
     shared = np.zeros(unknowns(5))
     shared[: len(FIRST)] = [2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1]
-    shared[len(TERMS) :] = [0.1, 5.0, -1.0, 0.5, 2.0, 1.0, -2.0, 0.0, 0.5, 3.0]
+    shared[EQUATION:] = [0.1, 5.0, -1.0, 0.5, 2.0, 1.0, -2.0, 0.0, 0.5, 3.0]
     model = sensed_model(shared, SENSORS, equally_spaced(5), 1.0)
     z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
     moved = _step(model, z, action) - _step(model, z, 0.0 * action)
@@ -222,7 +223,7 @@ def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
     rng = np.random.default_rng(2)
     actuators, n, T, R = equally_spaced(3), grid_points(SENSORS), 6, 2
     shared = rng.standard_normal(unknowns(3))
-    shared[len(FIRST) : len(TERMS)] *= 1e-3  # else nothing stays finite
+    shared[len(FIRST) : EQUATION] *= 1e-3  # else nothing stays finite
     fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
     sizes = np.linspace(3.0, 0.1, T)
 
@@ -335,11 +336,11 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
 def test_a_checkpoint_of_the_first_terms_alone_is_continued() -> None:
     loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
     proposals = SensedProposals(loop, equally_spaced(2), noise=0.0, largest_cost=np.inf)
-    older = np.arange(1.0, unknowns(2) - len(TERMS) + len(FIRST) + 1)
+    older = np.arange(1.0, unknowns(2) - EQUATION + len(FIRST) + 1)
     proposals.restore({"equation": older})
     np.testing.assert_array_equal(proposals.equation[: len(FIRST)], older[: len(FIRST)])
-    assert not proposals.equation[len(FIRST) : len(TERMS)].any()
-    np.testing.assert_array_equal(proposals.equation[len(TERMS) :], older[len(FIRST) :])
+    assert not proposals.equation[len(FIRST) : EQUATION].any()
+    np.testing.assert_array_equal(proposals.equation[EQUATION:], older[len(FIRST) :])
     with pytest.raises(ValueError):
         proposals.restore({"equation": older[:-1]})
 
@@ -451,8 +452,8 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         patch.setattr(sensed_fit, "_first_guess", guessed)
         patch.setattr(SensedProblem, "implausibility", lambda _, x, fields: abs(x[0] - wanted))
         # Of noise alone, which any equation explains.
-        few = {"settings": replace(FEW_ITERATIONS, sensed_starts=1)}
-        worse, wanted = 10.0, 0.0
+        few = {"settings": replace(FEW_ITERATIONS, sensed_starts=1, sensed_varying=1.0)}
+        worse, wanted = 1.0, 0.0
         shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
         assert same_bits(shared, likelier) and len(starts) == 2
         worse, wanted = 0.0, 1e9

@@ -1,0 +1,189 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Coefficients that depend on x, of an equation of which a few points are measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from threadpoolctl import threadpool_limits
+
+from loop_interfaces.arrays import Array
+from loop_method.models.files import model_of
+from loop_method.models.sensed import (
+    COEFFICIENTS,
+    EQUATION,
+    TERMS,
+    VARIATIONS,
+    SensedModel,
+    sensed_model,
+    unknowns,
+    well_posed,
+)
+from loop_method.models.sensed_fit import with_coefficients_of_x
+from loop_method.models.sensed_problem import SensedProblem
+from loop_method.models.settings import DEFAULTS
+from tests.support.sensed import DECLARED, SENSORS, readings_of
+from tests.support.small import same_bits
+
+SETTINGS = replace(DEFAULTS, sensed_varying=2.5e-5, sensed_iterations=10, sensed_last_iterations=20)
+VARYING = {
+    (1, 0, 2, True): 3.0,
+    (1, 1, 1, True): 0.5,
+    (1, 2, 1, False): 9.0,
+    (1, 2, 2, True): -1.0,
+    (2, 0, 1, True): -0.5,
+    (3, 0, 1, False): -0.4,
+}
+"""p, j, wave and whether it is a sine, of the unknowns that are not zero, in their units."""
+
+
+def _unknowns(varying: dict[tuple[int, int, int, bool], float]) -> Array:
+    """u_t = (D(x) u_x)_x + r(x) u - u^3 and more, driven by three actuators."""
+    shared = np.zeros(unknowns(3))
+    for term, value in {(1, 0): 1.0, (1, 2): 12.0, (2, 1): -2.0, (3, 0): -1.0}.items():
+        shared[TERMS.index(term)] = value
+    for variation, value in varying.items():
+        shared[len(TERMS) + VARIATIONS.index(variation)] = value
+    shared[COEFFICIENTS] = 10.0
+    return shared
+
+
+def _model(varying: dict[tuple[int, int, int, bool], float]) -> SensedModel:
+    return sensed_model(_unknowns(varying), SENSORS, DECLARED, 4.0)
+
+
+def _batch(model: SensedModel) -> tuple[Array, Array]:
+    """Fields and actions of two rows."""
+    x = np.arange(model.n_z) / model.n_z
+    fields = [np.cos(2 * np.pi * x) - 0.5 * np.sin(6 * np.pi * x), 0.8 + np.sin(4 * np.pi * x)]
+    return np.stack(fields), np.array([[1.0, 0.0, -2.0], [0.5, 1.5, 0.0]])
+
+
+def _rate(model: SensedModel, z: Array, a: Array) -> Array:
+    """dz/dt with d(D dz/dx)/dx as it is written, on a grid that has room for the products."""
+    n, fine = model.n_z, 4 * model.n_z
+    k = 2j * np.pi * np.arange(fine // 2 + 1)
+    x = 2 * np.pi * np.arange(fine) / fine
+
+    def along(u: Array) -> Array:
+        return np.fft.irfft(k * np.fft.rfft(u), fine)
+
+    u = np.fft.irfft(4 * np.fft.rfft(z), fine)
+    wave = 2 * np.pi * 8
+    rate = 0.01 * (u - 2.0 / wave * along(u**2) - u**3) + 0.12 / wave**2 * along(along(u))
+    for (p, j, m, sine), size in VARYING.items():
+        own = 0.01 / wave**j * size * (np.sin(m * x) if sine else np.cos(m * x))
+        rate += own * u**p if j == 0 else along(own * (u if j == 1 else along(u)))
+    spectrum = np.fft.rfft(rate)[: n // 2 + 1] / 4
+    return np.fft.irfft(spectrum, n) + model.B @ a
+
+
+def test_a_step_is_that_of_the_equation_as_it_is_written() -> None:
+    model = replace(_model(VARYING), substeps=16, fewer=np.empty((0, 2)))
+    fields, actions = _batch(model)
+    for z, a, found in zip(fields, actions, model.step(fields, actions), strict=True):
+        exact = solve_ivp(lambda _, z, a=a: _rate(model, z, a), (0, 1), z, rtol=1e-9, atol=1e-10)
+        resolved = [np.fft.rfft(u)[:-4] / model.n_z for u in (found, exact.y[:, -1])]
+        np.testing.assert_allclose(*resolved, atol=1e-6)
+        assert np.abs(found - _model({}).step(z[None], a[None])[0]).max() > 0.02
+
+
+def test_the_internal_steps_follow_them() -> None:
+    model = _model(VARYING)
+    fine = replace(model, substeps=8 * model.substeps, fewer=np.empty((0, 2)))
+    fields, actions = _batch(model)
+    for scale in (0.05, 1.0):  # small fields have fewer steps
+        exact = fine.step(scale * fields, actions)
+        np.testing.assert_allclose(model.step(scale * fields, actions), exact, atol=2e-3)
+    varying, plain = (sensed_model(_unknowns(v), SENSORS, DECLARED, 20.0) for v in (VARYING, {}))
+    assert varying.substeps > plain.substeps
+    assert varying.fewer[0, 1] > plain.fewer[0, 1] == 1
+
+
+def test_derivatives_of_a_step_are_its_slopes() -> None:
+    model, rng = _model(VARYING), np.random.default_rng(0)
+    fields, actions = _batch(model)
+    y, dz = rng.standard_normal((2, *fields.shape))
+    da, h = rng.standard_normal(actions.shape), 1e-6
+    on_z, on_a = model.pull_back(fields, actions, y)
+    ahead, behind = (model.step(fields + s * h * dz, actions + s * h * da) for s in (1.0, -1.0))
+    expected = np.sum(y * (ahead - behind), axis=1) / (2 * h)
+    np.testing.assert_allclose(
+        np.sum(on_z * dz, axis=1) + np.sum(on_a * da, axis=1), expected, rtol=1e-6
+    )
+
+
+def test_a_model_with_them_comes_back_from_its_arrays() -> None:
+    model = _model(VARYING)
+    again = model_of(model.arrays())
+    assert isinstance(again, SensedModel) and same_bits(again.shared, model.shared)
+    batch = _batch(model)
+    assert same_bits(again.step(*batch), model.step(*batch))
+    assert "coefficients" not in _model({}).arrays()
+    with pytest.raises(ValueError, match="coefficients"):
+        model_of({**model.arrays(), "coefficients": np.zeros((3, 2, model.n_z))})
+
+
+def test_large_fields_and_short_waves_are_damped_at_every_x() -> None:
+    shared = _unknowns({(1, 2, 1, True): 9.0, (1, 2, 2, True): 9.0, (3, 0, 1, False): -0.5})
+    found = well_posed(shared)
+    of_D = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == (1, 2)]
+    assert np.abs(found[of_D]).sum() == pytest.approx(12.0)
+    others = np.delete(np.arange(len(shared)), of_D)
+    assert same_bits(found[others], shared[others])
+    shared[TERMS.index((1, 2))] = 0.0
+    assert 0.0 < np.abs(well_posed(shared)[of_D]).sum() < 1e-4
+
+
+def _problem(varying: dict[tuple[int, int, int, bool], float], sigma: float) -> SensedProblem:
+    """Readings of four rollouts."""
+    model, rng = _model(varying), np.random.default_rng(4)
+    x = np.arange(model.n_z) / model.n_z
+    drawn = rng.uniform(-1, 1, (4, 5))
+    actions = 2.0 * rng.standard_normal((4, 40, 3))
+    fields = [
+        2.0 * a * np.cos(2 * np.pi * (x - b)) + c * np.cos(4 * np.pi * (x - d)) + e
+        for a, b, c, d, e in drawn
+    ]
+    readings = np.stack([readings_of(model, *pair) for pair in zip(actions, fields, strict=True)])
+    readings += sigma * rng.standard_normal(readings.shape)
+    zero, unknown = np.zeros(SENSORS), np.full(4, np.nan)
+    return SensedProblem(readings, actions, DECLARED, sigma, zero, unknown, SETTINGS)
+
+
+def _fitted(problem: SensedProblem) -> tuple[float, Array, Array]:
+    """With constant coefficients."""
+    error, shared, fields = problem.fit(np.zeros(problem.shared), problem.interpolated())
+    return error - problem.noise, shared, fields
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_they_are_found_where_constant_ones_do_not_suffice(known: bool) -> None:
+    """Diffusion and growth that depend on x; also where no equation was found."""
+    varying = {(1, 0, 2, True): 8.0, (1, 2, 1, False): 9.0}
+    problem = _problem(varying, 0.0)
+    with threadpool_limits(1):
+        first = _fitted(problem) if known else (np.inf, np.zeros(problem.shared), np.zeros((4, 33)))
+        error, shared, _ = with_coefficients_of_x(problem, first, SETTINGS)
+    assert error < 1e-3 and error < 0.1 * first[0]
+    for variation, size in varying.items():
+        assert shared[len(TERMS) + VARIATIONS.index(variation)] == pytest.approx(size, rel=0.1)
+    assert shared[TERMS.index((1, 2))] == pytest.approx(12.0, rel=0.1)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.1])
+def test_constant_ones_stay_where_they_suffice(sigma: float) -> None:
+    problem = _problem({}, sigma)
+    with threadpool_limits(1):
+        first = _fitted(problem)
+        assert with_coefficients_of_x(problem, first, SETTINGS) is first
+    assert not first[1][len(TERMS) : EQUATION].any()
+
+
+def test_one_rollout_is_not_enough_for_them() -> None:
+    problem = _problem({(1, 0, 2, True): 3.0}, 0.0).part([0])
+    first = 0.04, np.zeros(problem.shared), problem.interpolated()
+    assert with_coefficients_of_x(problem, first, SETTINGS) is first
