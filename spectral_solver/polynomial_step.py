@@ -17,10 +17,10 @@ from spectral_solver.polynomial import (
     PLAN,
     advance,
     analysed,
-    integrals,
     pull_back,
     synthesised,
 )
+from spectral_solver.polynomial_integrals import integrals
 
 COEFFICIENTS = ("e", "e2", "q", "qm", "f1m", "f2m", "f3m", "f")
 WEIGHTS = ("weight_begin", "weight_middle", "weight_end")

@@ -23,6 +23,8 @@ from loop_method.models.sensed import (
     Actuators,
     interpolated,
     sensed_model,
+)
+from loop_method.models.sensed_unknowns import (
     unknowns,
     unknowns_of,
 )

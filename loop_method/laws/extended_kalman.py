@@ -17,9 +17,11 @@ from loop_method.models.sensed import (
     Actuators,
     grid_points,
     sensed_model,
-    unknowns,
 )
 from loop_method.models.sensed_filter import SensedFilter
+from loop_method.models.sensed_unknowns import (
+    unknowns,
+)
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 FIELD_COEFFICIENTS = 1 + 2 * WAVES

@@ -16,7 +16,6 @@ points in it. Below the grid the second derivative does what a finer one would: 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -27,6 +26,14 @@ from numpy.typing import NDArray
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Arrays, numbers_of
+from loop_method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    EQUATION,
+    SHARED,
+    TERMS,
+    VARIATIONS,
+    unknowns_of,
+)
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import fewer_of, substeps_of
@@ -35,31 +42,7 @@ from spectral_solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
 
-FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
-"""p and j of the terms that every fit begins with."""
-TERMS = FIRST + tuple(
-    (p, j)
-    for p, highest in enumerate(ORDERS, start=1)
-    for j in range(highest + 1)
-    if (p, j) not in FIRST
-)
-"""Those of every equation that a model of the whole field may have."""
-VARIATIONS = tuple(
-    (p, j, m, sine)
-    for p, j in ((1, 0), (1, 1), (1, 2), (2, 0), (3, 0))
-    for m in (1, 2)
-    for sine in (False, True)
-)
-"""p and j of a term whose coefficient depends on x, and the wave of which the unknown is the size."""
-EQUATION = len(TERMS) + len(VARIATIONS)
-"""Number of the coefficients of both."""
-COEFFICIENTS = EQUATION + 1
-"""The same, and 1 for the constant."""
-# b, x_0, s and w.
-_ACTUATORS = 4
 KIND = "sensed"
-SHARED = COEFFICIENTS + _ACTUATORS
-"""Unknowns that all rollouts share, besides one for each actuator."""
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
@@ -67,46 +50,8 @@ _TIME = 100.0
 _SIZE = 4.0
 WAVES = 16
 """Cosines and sines of an initial field, in addition to its mean."""
-# The least share of a coefficient of x that a bound leaves, so that it stays an unknown.
-_KEPT = 1e-6
 # The least number of grid points.
 _POINTS = 64
-
-
-def unknowns(n_a: int) -> int:
-    """Number of unknowns that all rollouts share."""
-    return SHARED + n_a
-
-
-def open_unknowns(shared: Array) -> NDArray[np.intp]:
-    """The unknowns that a fit starting from these finds: all but those terms that are not used yet."""
-    own = np.arange(len(shared))
-    return np.flatnonzero((own < len(FIRST)) | (own >= EQUATION) | (shared != 0.0))
-
-
-def well_posed(shared: Array) -> Array:
-    """The nearest unknowns whose short waves do not grow and whose large fields are not driven on."""
-    found = shared.copy()
-
-    def bound(term: tuple[int, int], sign: float) -> float:
-        i = TERMS.index(term)
-        found[i] = sign * max(sign * shared[i], 0.0)
-        return float(found[i])
-
-    # The highest even derivative damps, the diffusion of large fields as well.
-    if not bound((1, 4), -1.0):
-        bound((1, 2), 1.0)
-    bound((3, 2), 1.0)
-    for p in range(len(ORDERS), 2, -2):
-        if bound((p, 0), -1.0):
-            break
-    # The same at every x.
-    for term, sign, other in (((3, 0), -1.0, (5, 0)), ((1, 2), 1.0, (1, 4))):
-        varied = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
-        reached, most = float(np.abs(found[varied]).sum()), sign * found[TERMS.index(term)]
-        if reached > most and not found[TERMS.index(other)]:
-            found[varied] *= max(most / reached, _KEPT)
-    return found
 
 
 def grid_points(sensors: int) -> int:
@@ -238,19 +183,6 @@ def _widths_of(arrays: Arrays, n_a: int) -> Array:
             f"a model has actuators of the width {widths.min():g}; expected at least 0"
         )
     return widths
-
-
-def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
-    """The unknowns of `arrays`; older ones have no coefficients of x, or the first terms alone."""
-    known, others = arrays.get(name), SHARED - EQUATION
-    older = {(terms + others + n,): terms for terms in (len(FIRST), len(TERMS)) for n in (0, n_a)}
-    if known is None or known.shape not in older:
-        return numbers_of(arrays, name, unknowns(n_a))
-    terms, found = older[known.shape], np.zeros(unknowns(n_a))
-    own = numbers_of(arrays, name, len(known))
-    found[:terms] = own[:terms]
-    found[EQUATION : EQUATION + len(own) - terms] = own[terms:]
-    return found
 
 
 def sensed_model(

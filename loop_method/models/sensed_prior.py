@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import COEFFICIENTS, FIRST, SHARED, TERMS, WAVES, unknowns
+from loop_method.models.sensed import WAVES
+from loop_method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    FIRST,
+    SHARED,
+    TERMS,
+    unknowns,
+)
 from loop_method.models.settings import FieldModelSettings
 
 

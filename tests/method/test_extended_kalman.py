@@ -19,17 +19,19 @@ from loop_method.laws import ExtendedKalman, Law, Observer
 from loop_method.laws.base import differentiable
 from loop_method.laws.calls import MAX_NUMBER, action, along
 from loop_method.models.sensed import (
-    COEFFICIENTS,
-    TERMS,
     WAVES,
     Actuators,
     SensedModel,
     coefficients_of,
     field_of,
     sensed_model,
-    unknowns,
 )
 from loop_method.models.sensed_filter import SensedFilter
+from loop_method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    TERMS,
+    unknowns,
+)
 from loop_method.models.settings import DEFAULTS
 from tests.support.small import same_bits
 

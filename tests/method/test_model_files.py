@@ -19,13 +19,15 @@ from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
 from loop_method.models.sensed import (
+    Actuators,
+    SensedModel,
+    grid_points,
+)
+from loop_method.models.sensed_unknowns import (
     EQUATION,
     FIRST,
     SHARED,
     TERMS,
-    Actuators,
-    SensedModel,
-    grid_points,
     unknowns,
 )
 from loop_method.models.spectral import SpectralModel

@@ -18,22 +18,24 @@ from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.models import sensed_fit
 from loop_method.models.sensed import (
-    COEFFICIENTS,
-    EQUATION,
-    FIRST,
-    SHARED,
-    TERMS,
     Actuators,
     SensedEquation,
     grid_points,
     interpolated,
     sensed_model,
-    unknowns,
 )
 from loop_method.models.sensed_fit import fit_sensed, part_by_part
 from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_growth import Found
 from loop_method.models.sensed_problem import SensedProblem
+from loop_method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    EQUATION,
+    FIRST,
+    SHARED,
+    TERMS,
+    unknowns,
+)
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout

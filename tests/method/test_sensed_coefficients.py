@@ -12,18 +12,17 @@ from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
 from loop_method.models.files import model_of
-from loop_method.models.sensed import (
+from loop_method.models.sensed import SensedModel, sensed_model
+from loop_method.models.sensed_fit import with_coefficients_of_x
+from loop_method.models.sensed_problem import SensedProblem
+from loop_method.models.sensed_unknowns import (
     COEFFICIENTS,
     EQUATION,
     TERMS,
     VARIATIONS,
-    SensedModel,
-    sensed_model,
     unknowns,
     well_posed,
 )
-from loop_method.models.sensed_fit import with_coefficients_of_x
-from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 from tests.support.small import same_bits

@@ -34,16 +34,18 @@ from loop_method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
 from loop_method.laws import Observer
 from loop_method.models.files import model_of
 from loop_method.models.sensed import (
-    COEFFICIENTS,
-    TERMS,
     Actuators,
     SensedModel,
     interpolated,
     sensed_model,
-    unknowns,
 )
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
+from loop_method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    TERMS,
+    unknowns,
+)
 from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
