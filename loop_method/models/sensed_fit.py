@@ -119,7 +119,8 @@ def fit_sensed(
             # A fit to all rollouts takes long: only from what is an equation of these few.
             own = _from_few(problem, few, settings, enough)
             found = min(found, own, key=lambda each: each[0])
-    error, shared, fields = with_coefficients_of_x(problem, found, settings)
+        found = with_coefficients_of_x(problem, found, settings)
+    error, shared, fields = found
     return shared, field_of(fields, n), max(error, 0.0)
 
 
@@ -254,16 +255,19 @@ def with_coefficients_of_x(
     error, shared, _ = part_by_part(some, start, some.interpolated(), settings, most)
     if not np.isfinite(error):
         return first
-    before = foretold(others, first[1]) if np.isfinite(first[0]) else np.inf
-    if not halved(before, foretold(others, shared), settings):
+    before = foretold(others, first[1], np.inf) if np.isfinite(first[0]) else np.inf
+    if not halved(before, foretold(others, shared, most), settings):
         return first
     found = _refined(problem, shared, problem.interpolated(), None, settings)
     return found if halved(first[0], found[0], settings) else first
 
 
-def foretold(problem: SensedProblem, shared: Array) -> float:
-    """The error of this equation in rollouts that it was not fitted to, from their likeliest fields."""
-    return problem.fit(shared, problem.interpolated(), known=True)[0] - problem.noise
+def foretold(problem: SensedProblem, shared: Array, most: float) -> float:
+    """The error of this equation in rollouts that it was not fitted to, from their likeliest fields.
+
+    most: as of `SensedProblem.fit`.
+    """
+    return problem.fit(shared, problem.interpolated(), known=True, most=most)[0] - problem.noise
 
 
 def unexplained(problem: SensedProblem, settings: FieldModelSettings) -> float:

@@ -26,7 +26,7 @@ from loop_method.models.prediction import errors, pieces, predicted
 from loop_method.models.spectral import SpectralModel
 from pdeloop.training_run import load_compiled, resolve
 from spectral_solver import polynomial as compiled
-from spectral_solver import polynomial_step
+from spectral_solver import polynomial_integrals, polynomial_step
 from tests.support.small import SMALL
 
 
@@ -265,5 +265,5 @@ def test_what_is_compiled_for_a_small_grid_serves_every_other() -> None:
     model.pull_back(z, a, z)
     model.compiled.integrals(z, a, z)
     kernels = compiled.advance, compiled.analysed, compiled.synthesised
-    for kernel in (*kernels, compiled.integrals, compiled.pull_back):
+    for kernel in (*kernels, polynomial_integrals.integrals, compiled.pull_back):
         assert len(kernel.signatures) == 1
