@@ -41,7 +41,7 @@ class Polynomials(NamedTuple):
 
 
 class PolynomialStep:
-    """A sampling time, the unit of time, of an equation with polynomial nonlinear parts.
+    """A sampling time, the unit of time, of an equation with polynomial nonlinear parts::
 
         d/dt F[u] = L F[u] + sum_q m_q F[g_q(u)] + sum_l n_l F[h_l(x, u)] + F[Phi a + c]
 
@@ -52,13 +52,13 @@ class PolynomialStep:
     equation
         linear L (modes,), multipliers m_q (Q, modes), polynomials C_qp (Q, P - 1) for p = 2 .. P,
         supports Phi (n_x, n_a), constant c (n_x,), steps: internal ones, clip: of u in g_q and h_l,
-        factors n_l (N, modes) and coefficients c_lp (N, P, n_x) for p = 1 .. P, or none of both;
+        factors n_l (N, modes) and coefficients c_lp (N, P, n_x) for p = 1 .. P, or neither;
         modes = n_x//2 + 1.
 
     Raises
     ------
     ValueError
-        L grows beyond all bounds within an internal step.
+        There is no internal step, or L grows beyond all bounds within one.
     """
 
     def __init__(self, equation: Polynomials) -> None:
@@ -68,6 +68,8 @@ class PolynomialStep:
         self._n_x, self._last, self._degree = n_x, n_x // 2, degree
         self._whole = n_x % 2 == 0 and is_transform_length(n_x // 2)
         supports = np.column_stack([equation.supports, equation.constant])
+        if steps < 1:
+            raise ValueError(f"expected at least 1 internal step, got {steps}")
         varying = 0 if equation.factors is None else len(equation.factors)
         kept, planes, size = layout(n_x, degree, parts, supports.shape[1], steps, varying)
         self._plans, self._constants = kept.copy(), aligned(planes.size)
@@ -227,7 +229,11 @@ def layout(
     Without addresses, and without the numbers of an equation, for which there is room.
     """
     plans, constants, modes = np.zeros(1, PLAN), Constants(), n_x // 2 + 1
-    plan, fine, own = plans[0], fine_length(n_x, degree), whole_lanes(n_x // 2 + 1)
+    plan, fine, own = (
+        plans[0],
+        fine_length(n_x, max(degree, 2) if varying else degree),
+        whole_lanes(n_x // 2 + 1),
+    )
     plan["parts"], plan["degree"], plan["steps"] = parts, degree, steps
     plan["n_x"], plan["n_a"], plan["modes"], plan["varying"] = n_x, n_a, own, varying
     if n_x % 2 == 0 and is_transform_length(n_x // 2):
@@ -273,7 +279,12 @@ def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> Spe
 
 def on_fine_grid(rows: Array, length: int) -> NDArray[np.complex128]:
     """Functions (..., n_x) of x on the dealiased grid: its even points, and i times the odd ones."""
-    spectra = np.fft.rfft(rows) * (2 * length / rows.shape[-1])
+    spectra, n_x = np.fft.rfft(rows), rows.shape[-1]
+    if (
+        n_x % 2 == 0 and 2 * length > n_x
+    ):  # half of its last wavenumber is that of minus the wavenumber
+        spectra[..., -1] *= 0.5
+    spectra *= 2 * length / n_x
     values = np.fft.irfft(spectra, n=2 * length)
     fine: NDArray[np.complex128] = values[..., ::2] + 1j * values[..., 1::2]
     return fine

@@ -164,6 +164,9 @@ def remarks_on(values: Mapping[str, Any]) -> list[str]:
     few = 0 < values["sensors"] <= field_model_settings(values).sensed_most
     if grid is None or not few or values["sensors"] >= values["n_z"]:
         return []
+    models = kind_of(values).needs_trajectories
+    if not models or values["sensor_delays"] > 1 or len(grid.components) > 1:
+        return []  # no field between sensors is ever modelled
     if not grid.axes:
         return [
             f"the plant declares no axis, so that the readings of {values['sensors']} sensors are "
@@ -173,7 +176,7 @@ def remarks_on(values: Mapping[str, Any]) -> list[str]:
     if grid.is_circle and values.get("plant") and not values["actuator_extents"]:
         return [
             "the plant does not say where its actuators act, so that they are taken to be equally "
-            "spaced between the sensors; give the plant 'supports' (docs/bring-your-own.md)"
+            "spaced; give the plant 'supports' (docs/bring-your-own.md)"
         ]
     return []
 

@@ -20,7 +20,7 @@ from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.laws.observer import Observer
 from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
-from loop_method.models.sensed_fit import fit_sensed
+from loop_method.models.sensed_fit import fit_sensed, halved
 from loop_method.models.sensed_smoothing import Smoothing, settled
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -245,8 +245,7 @@ def differ(held: float, free: float, chance: float, settings: FieldModelSettings
 
     chance: the least change of an error that noise does not explain.
     """
-    unresolved = settings.sensed_unresolved**2
-    return held - free > chance and free + unresolved < 0.5 * (held + unresolved)
+    return held - free > chance and halved(held, free, settings)
 
 
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:

@@ -1,12 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation of a field of which a few points are measured.
 
-    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + sum_p v_p(x) z^p + d(v(x) z)/dx + d(D(x) dz/dx)/dx + c + B a,
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a
+            + sum_{p = 1}^3 r_p(x) z^p + d(w(x) z)/dx + d(D(x) dz/dx)/dx,
                     B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
                     x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = q_i + w / n_a
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i and widths
-q_i of the actuators. v_p, v and D are sums of the first two cosines and sines, and zero where constant
+q_i of the actuators. r_p, w and D are sums of the first two cosines and sines, and zero where constant
 coefficients reproduce the readings. There are a few dozen unknowns and one for each actuator, however
 fine the grid. `loop_method.models.sensed_fit` finds them.
 
@@ -217,7 +218,8 @@ def sensed_model(
     fewer = fewer_of(followed, largest, substeps, settings)
     if equation.coefficients is not None:
         rates = equation.varying_rates(np.append(fewer[:, 0], largest)) / settings.reach
-        more = np.ceil(np.minimum(rates, settings.substeps))
+        most = settings.substeps
+        more = np.ceil(np.minimum(np.nan_to_num(rates, nan=most), most))
         substeps = min(substeps + int(more[-1]), settings.substeps)
         fewer = np.column_stack([fewer[:, 0], fewer[:, 1] + more[:-1]])
         fewer = fewer[fewer[:, 1] < substeps]
@@ -263,7 +265,7 @@ class SensedEquation:
         varied = shared[len(TERMS) : EQUATION]
         self.factors: Spectrum | None = None
         self.coefficients: Array | None = None
-        """Of the terms whose coefficients depend on x, (3, modes) and (3, degree, n); None without."""
+        """Of terms whose coefficients depend on x, (3, modes) and (3, degree, n); None: without."""
         if varied.any():
             self.factors = np.stack(derivatives[:3])
             self.coefficients = _coefficients(n, degree, varied.tobytes())
@@ -292,9 +294,9 @@ class SensedEquation:
         if self.factors is None or self.coefficients is None:
             return np.zeros(len(sizes))
         waves = np.abs(self.factors[:, : 2 * self.symbols.shape[1] // 3]).max(axis=1)
-        rates = waves @ np.abs(self.coefficients).max(axis=2)
+        rates, z = waves @ np.abs(self.coefficients).max(axis=2), np.abs(sizes)
         found: Array = sum(
-            p * rate * sizes ** (p - 1) for p, rate in enumerate(rates.tolist(), start=1)
+            p * rate * z ** (p - 1) for p, rate in enumerate(rates.tolist(), start=1)
         )
         return found
 
@@ -313,7 +315,8 @@ class SensedEquation:
     def compiled(self, substeps: int, supports: Array, clip: float = np.inf) -> PolynomialStep:
         """The step, with these internal steps and supports, and a constant forcing of 1.
 
-        clip: z is cut to it in powers above the first, so that a wrong equation is far off but finite.
+        clip: z is cut to it in powers above the first, and where coefficients depend on x, so that a
+        wrong equation is far off but finite.
         ValueError if the unknowns are not finite.
         """
         equation = Polynomials(

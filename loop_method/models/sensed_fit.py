@@ -13,8 +13,8 @@ and longer parts: over a whole rollout at once, a front makes the error flat in 
 between the sensors is observed later, when it passes one.
 
 Where constant coefficients leave an error that is not noise, all rollouts are fitted once more from
-nothing, with coefficients that depend on x; these count if they halve the error, also of rollouts that
-they were not fitted to.
+nothing, with coefficients that depend on x. These count if they halve the error, and if, fitted to
+every other rollout, they reproduce the rest better than constant ones that were fitted to all.
 
 After each part the ridge of an unknown becomes s^2/(x^2 + C), with C its variance given the readings
 and s^2 that of a residual. An unknown that is not significant, such as a growth that a few calm
@@ -256,14 +256,17 @@ def with_coefficients_of_x(
     if not np.isfinite(error):
         return first
     before = foretold(others, first[1], np.inf) if np.isfinite(first[0]) else np.inf
-    if not halved(before, foretold(others, shared, most), settings):
+    # These rollouts are among those that the first equation was fitted to.
+    if not foretold(others, shared, most) < min(before, settings.sensed_reproduced):
         return first
+    problem.prior.forget()
     found = _refined(problem, shared, problem.interpolated(), None, settings)
-    return found if halved(first[0], found[0], settings) else first
+    reproduced = found[0] <= settings.sensed_reproduced
+    return found if reproduced and halved(first[0], found[0], settings) else first
 
 
 def foretold(problem: SensedProblem, shared: Array, most: float) -> float:
-    """The error of this equation in rollouts that it was not fitted to, from their likeliest fields.
+    """The error of this equation in these rollouts, from their likeliest fields.
 
     most: as of `SensedProblem.fit`.
     """
@@ -279,7 +282,7 @@ def unexplained(problem: SensedProblem, settings: FieldModelSettings) -> float:
 def halved(before: float, after: float, settings: FieldModelSettings) -> bool:
     """True if an error is less than half of another, beside what the grid does not resolve."""
     unresolved = settings.sensed_unresolved**2
-    return after <= settings.sensed_reproduced and after + unresolved < 0.5 * (before + unresolved)
+    return after + unresolved < 0.5 * (before + unresolved)
 
 
 def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:

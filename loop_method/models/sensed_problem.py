@@ -126,16 +126,14 @@ class SensedProblem:
                 return np.inf, shared, fields
         return self._error(shared, fields, lengths[-1]), shared, fields
 
-    def missing(
-        self, shared: Array, fields: Array, steps: int, among: Sequence[int] = range(len(TERMS))
-    ) -> tuple[int, float, float]:
-        """Which of these unknowns promises the largest fall of the error, its value, and the fall.
+    def missing(self, shared: Array, fields: Array, steps: int) -> tuple[int, float, float]:
+        """The term that promises the largest fall of the error, its coefficient, and the fall.
 
         That of a step of Gauss and Newton in this term and all other unknowns; the fall is 0 where
         nothing is finite.
         """
         own, used = self._open, open_unknowns(shared)
-        self._open = np.union1d(used, np.asarray(among, dtype=np.intp))
+        self._open = columns = np.union1d(used, np.arange(len(TERMS)))
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 residual, J = self._linearised(shared, fields, steps, known=False)
@@ -145,7 +143,6 @@ class SensedProblem:
             self._open = own
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
             return 0, 0.0, 0.0
-        columns = np.union1d(used, np.asarray(among, dtype=np.intp))
         known = np.append(np.searchsorted(columns, used), np.arange(len(columns), len(H)))
         inverse, best = np.linalg.inv(H[np.ix_(known, known)]), (0, 0.0, 0.0)
         for i in np.setdiff1d(np.arange(len(columns)), known).tolist():

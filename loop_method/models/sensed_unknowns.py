@@ -31,7 +31,7 @@ VARIATIONS = tuple(
     for m in (1, 2)
     for sine in (False, True)
 )
-"""p and j of a term whose coefficient depends on x, and the wave of which the unknown is the size."""
+"""p and j of a term whose coefficient depends on x; m and whether it is a sine: the unknown's wave."""
 EQUATION = len(TERMS) + len(VARIATIONS)
 """Number of the coefficients of both."""
 COEFFICIENTS = EQUATION + 1
@@ -71,11 +71,12 @@ def well_posed(shared: Array) -> Array:
     for p in range(len(ORDERS), 2, -2):
         if bound((p, 0), -1.0):
             break
-    # The same at every x.
-    for term, sign, other in (((3, 0), -1.0, (5, 0)), ((1, 2), 1.0, (1, 4))):
+    # The same at every x, as far as the amplitudes of the waves tell.
+    for term, sign, others in (((3, 0), -1.0, ((5, 0), (7, 0))), ((1, 2), 1.0, ((1, 4),))):
         varied = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
-        reached, most = float(np.abs(found[varied]).sum()), sign * found[TERMS.index(term)]
-        if reached > most and not found[TERMS.index(other)]:
+        cosines, sines = found[varied].reshape(-1, 2).T
+        reached, most = float(np.hypot(cosines, sines).sum()), sign * found[TERMS.index(term)]
+        if reached > most and not any(found[TERMS.index(other)] for other in others):
             found[varied] *= max(most / reached, _KEPT)
     return found
 
@@ -83,7 +84,8 @@ def well_posed(shared: Array) -> Array:
 def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
     """The unknowns of `arrays`; older ones have no coefficients of x, or the first terms alone."""
     known, others = arrays.get(name), SHARED - EQUATION
-    older = {(terms + others + n,): terms for terms in (len(FIRST), len(TERMS)) for n in (0, n_a)}
+    pairs = (len(FIRST), 0), (len(FIRST), n_a), (len(TERMS), n_a)
+    older = {(terms + others + strengths,): terms for terms, strengths in pairs}
     if known is None or known.shape not in older:
         return numbers_of(arrays, name, unknowns(n_a))
     terms, found = older[known.shape], np.zeros(unknowns(n_a))

@@ -201,7 +201,7 @@ class FieldModelSettings(Settings):
     )
     sensed_varying: float = setting(
         3e-4,
-        "error of constant coefficients above which ones that depend on x are tried",
+        "error of constant coefficients, fitted from nothing, above which ones of x are tried",
         0,
         1,
     )
@@ -286,7 +286,7 @@ class FieldModelSettings(Settings):
     sensed_alike_chi: float = setting(
         4.0,
         "standard deviations of what noise has in an error by which it must fall for differences "
-        "between actuators to count",
+        "between actuators, or coefficients of x, to count",
         0,
         1000,
     )

@@ -1,12 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A partial differential equation with constant coefficients on a periodic grid, as a model.
+"""A partial differential equation on a periodic grid, as a model.
 
     d/dt F[z] = L F[z] + sum_q m_q F[g_q(z)] + F[B a + c],        g_q(z) = sum_{p >= 2} C_qp z^p,
 
-and, where there are coefficients that depend on x, sum_l n_l F[sum_p c_lp(x) z^p] in addition,
-F the discrete Fourier transform, L and m_q numbers of every wavenumber, and time in sampling times. A
-sampling time is integrated by ETDRK4 in equal internal steps, the fewer the smaller the field, and the
-nonlinear part on a finer grid that has room for its products, by the solver of the plants
+and, where coefficients depend on x, sum_l n_l F[h_l(x, z)] in addition, h_l = sum_p c_lp(x) z^p.
+F is the discrete Fourier transform, L, m_q and n_l numbers of every wavenumber, and time in sampling
+times. A sampling time is integrated by ETDRK4 in equal internal steps, the fewer the smaller the field,
+and the nonlinear part on a finer grid that has room for its products, by the solver of the plants
 (`spectral_solver.polynomial_step`).
 """
 
@@ -46,11 +46,11 @@ class SpectralModel:
     substeps : int
         Internal steps of a sampling time.
     clip : float
-        z is cut to +-clip in g_q; infinite: it is not.
+        z is cut to +-clip in g_q and h_l; infinite: it is not.
     fewer : (n, 2) array
         Rows max |z|, steps, both ascending: as many are enough where the field begins no larger.
     factors, coefficients : (N, n_z // 2 + 1) complex and (N, P, n_z) arrays, or None
-        n_l and c_lp; None: no coefficient depends on x.
+        n_l and c_lp; None: there are none.
     """
 
     kind: str
@@ -154,8 +154,11 @@ class SpectralModel:
         n_z, modes = len(constant), len(constant) // 2 + 1
         multipliers = _spectrum_of(arrays, "multipliers", None, modes)
         polynomials = numbers_of(arrays, "polynomials", len(multipliers), None)
-        factors = _spectrum_of(arrays, "factors", None, modes) if "factors" in arrays else None
-        shape = (0 if factors is None else len(factors)), polynomials.shape[1] + 1, n_z
+        factors = coefficients = None
+        if "factors" in arrays or "coefficients" in arrays:
+            factors = _spectrum_of(arrays, "factors", None, modes)
+            shape = len(factors), polynomials.shape[1] + 1, n_z
+            coefficients = numbers_of(arrays, "coefficients", *shape)
         substeps, fewer = steps_of(arrays), numbers_of(arrays, "fewer", None, 2)
         if ((fewer[:, 1] < 1) | (fewer[:, 1] > substeps)).any():
             raise ValueError(
@@ -172,7 +175,7 @@ class SpectralModel:
             clip=float(checked_array(arrays, "clip", "f", (), finite=False)),
             fewer=fewer,
             factors=factors,
-            coefficients=None if factors is None else numbers_of(arrays, "coefficients", *shape),
+            coefficients=coefficients,
         )
 
 

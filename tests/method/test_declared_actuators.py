@@ -118,3 +118,20 @@ def test_a_plant_that_does_not_say_where_things_are_is_asked_to_before_a_trainin
     # All of the field is measured.
     assert not _remarks(Nowhere, 0) and not _remarks(Nowhere, 60) and not _remarks(Silent, 0)
     assert not remarks_on(pdeloop.problem("kdv", sensors=SENSORS).values)
+
+
+def test_a_plant_whose_field_is_never_modelled_between_sensors_is_not_asked() -> None:
+    class Nowhere(Unequal):
+        n_z, grid = 60, None
+
+    class Pair(Unequal):
+        grid = pdeloop.Grid(pdeloop.Axis("x", 3.0, 30), ("u", "v"))
+        supports = None
+
+    assert not _remarks(Pair, SENSORS)
+    for given in (
+        {"optimizer": "two_point", "law": "affine"},
+        {"sensor_delays": 2, "law": "affine"},
+    ):
+        problem = pdeloop.problem(plant=Nowhere(), sensors=SENSORS, **given)
+        assert not remarks_on(problem.values)

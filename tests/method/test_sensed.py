@@ -335,10 +335,11 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     assert not proposals.equation.any()
 
 
-def test_a_checkpoint_of_the_first_terms_alone_is_continued() -> None:
+@pytest.mark.parametrize("n_a", [2, 12])
+def test_a_checkpoint_of_the_first_terms_alone_is_continued(n_a: int) -> None:
     loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
-    proposals = SensedProposals(loop, equally_spaced(2), noise=0.0, largest_cost=np.inf)
-    older = np.arange(1.0, unknowns(2) - EQUATION + len(FIRST) + 1)
+    proposals = SensedProposals(loop, equally_spaced(n_a), noise=0.0, largest_cost=np.inf)
+    older = np.arange(1.0, unknowns(n_a) - EQUATION + len(FIRST) + 1)
     proposals.restore({"equation": older})
     np.testing.assert_array_equal(proposals.equation[: len(FIRST)], older[: len(FIRST)])
     assert not proposals.equation[len(FIRST) : EQUATION].any()

@@ -102,6 +102,18 @@ def test_the_internal_steps_follow_them() -> None:
     assert varying.fewer[0, 1] > plain.fewer[0, 1] == 1
 
 
+@pytest.mark.parametrize("largest", [-5.0, np.inf, np.nan])
+def test_a_size_that_is_none_leaves_steps_that_can_be_made(largest: float) -> None:
+    """Compiled code has no room for fewer than one."""
+    shared = _unknowns({(2, 0, 1, True): 50.0, (1, 2, 1, True): 9.0})
+    with np.errstate(all="ignore"):
+        model = sensed_model(shared, SENSORS, DECLARED, largest)
+    assert 1 <= model.substeps <= DEFAULTS.substeps
+    assert np.isfinite(model.step(*(0.1 * rows for rows in _batch(model)))).all()
+    with pytest.raises(ValueError, match="at least 1 internal step"):
+        replace(model, substeps=0, fewer=np.empty((0, 2))).step(*_batch(model))
+
+
 def test_derivatives_of_a_step_are_its_slopes() -> None:
     model, rng = _model(VARYING), np.random.default_rng(0)
     fields, actions = _batch(model)
@@ -135,6 +147,30 @@ def test_large_fields_and_short_waves_are_damped_at_every_x() -> None:
     assert same_bits(found[others], shared[others])
     shared[TERMS.index((1, 2))] = 0.0
     assert 0.0 < np.abs(well_posed(shared)[of_D]).sum() < 1e-4
+
+
+def test_the_bound_does_not_depend_on_where_x_begins() -> None:
+    """D = D_0 (1 + 0.9 cos(2 pi x - pi / 4)) is positive everywhere."""
+    size = 12.0 * 0.9 / np.sqrt(2.0)
+    shared = _unknowns({(1, 2, 1, False): size, (1, 2, 1, True): size})
+    assert same_bits(well_posed(shared), shared)
+
+
+def test_a_power_that_damps_more_leaves_the_third_free() -> None:
+    shared = _unknowns({(3, 0, 1, False): 0.5})
+    shared[[TERMS.index((3, 0)), TERMS.index((7, 0))]] = 1.0, -1.0
+    assert same_bits(well_posed(shared), shared)
+
+
+def test_a_cut_field_has_the_derivatives_of_one() -> None:
+    model, rng = replace(_model(VARYING), clip=0.7), np.random.default_rng(1)
+    fields, actions = _batch(model)
+    y, dz, h = *rng.standard_normal((2, *fields.shape)), 1e-6
+    ahead, behind = (model.step(fields + s * h * dz, actions) for s in (1.0, -1.0))
+    expected = np.sum(y * (ahead - behind), axis=1) / (2 * h)
+    found = np.sum(model.pull_back(fields, actions, y)[0] * dz, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert np.abs(model.step(fields, actions) - _model(VARYING).step(fields, actions)).max() > 1e-3
 
 
 def _problem(varying: dict[tuple[int, int, int, bool], float], sigma: float) -> SensedProblem:
