@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from loop_method.adapt import RolloutResult, Trajectory, model_based_sensed
-from tests.method.test_sensed_observer import measured, optimiser, told
+from tests.support.sensed_optimiser import measured, optimiser, told
 
 
 def _scaled(result: RolloutResult, factor: float) -> RolloutResult:

@@ -27,11 +27,7 @@ from loop_method.models.sensed import (
     sensed_model,
 )
 from loop_method.models.sensed_filter import SensedFilter
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    TERMS,
-    unknowns,
-)
+from loop_method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
 from loop_method.models.settings import DEFAULTS
 from tests.support.small import same_bits
 

@@ -16,11 +16,7 @@ from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory, mo
 from loop_method.adapt.belief import believe
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import (
-    ADAPTED,
-    FIRST,
-    NONE,
-)
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE
 from loop_method.design.lqt import track
 from loop_method.models.settings import FieldModelSettings
 from loop_method.reduce.reduced_model import ReducedModel

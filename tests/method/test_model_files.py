@@ -18,18 +18,8 @@ from loop_method.models.finite_difference import (
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
 from loop_method.models.readings import ReadingsModel
-from loop_method.models.sensed import (
-    Actuators,
-    SensedModel,
-    grid_points,
-)
-from loop_method.models.sensed_unknowns import (
-    EQUATION,
-    FIRST,
-    SHARED,
-    TERMS,
-    unknowns,
-)
+from loop_method.models.sensed import Actuators, SensedModel, grid_points
+from loop_method.models.sensed_unknowns import EQUATION, FIRST, SHARED, TERMS, unknowns
 from loop_method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2

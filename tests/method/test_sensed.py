@@ -12,10 +12,6 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import pdeloop
-from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from loop_method.adapt.base import Record
-from loop_method.adapt.closed_loop import ClosedLoopProblem
-from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.models import sensed_fit
 from loop_method.models.sensed import (
     Actuators,
@@ -25,17 +21,9 @@ from loop_method.models.sensed import (
     sensed_model,
 )
 from loop_method.models.sensed_fit import fit_sensed, part_by_part
-from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_growth import Found
 from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    EQUATION,
-    FIRST,
-    SHARED,
-    TERMS,
-    unknowns,
-)
+from loop_method.models.sensed_unknowns import COEFFICIENTS, SHARED, TERMS, unknowns
 from loop_method.models.settings import DEFAULTS
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
@@ -170,79 +158,6 @@ def _coefficients(model: SpectralModel) -> Array:
     return np.array([transport, diffusion, dispersion, quadratic])
 
 
-def test_an_action_moves_the_field_as_the_input_matrix_says() -> None:
-    shared = np.zeros(unknowns(5))
-    shared[: len(FIRST)] = [2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1]
-    shared[EQUATION:] = [0.1, 5.0, -1.0, 0.5, 2.0, 1.0, -2.0, 0.0, 0.5, 3.0]
-    model = sensed_model(shared, SENSORS, equally_spaced(5), 1.0)
-    z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
-    moved = _step(model, z, action) - _step(model, z, 0.0 * action)
-    effect = model.B @ action
-    assert np.linalg.norm(moved - effect) < 0.05 * np.linalg.norm(effect)
-
-
-def test_each_actuator_may_be_as_strong_as_it_is() -> None:
-    """The second of three is reversed and the third does nothing."""
-    actuators, rng = equally_spaced(3), np.random.default_rng(2)
-    shared = np.zeros(unknowns(3))
-    shared[[TERMS.index((1, 0)), TERMS.index((1, 2)), COEFFICIENTS]] = 1.0, 0.5, 5.0
-    shared[SHARED:] = 0.0, -10.0, -5.0
-    model = sensed_model(shared, SENSORS, actuators, 4.0)
-    x = np.arange(model.n_z) / model.n_z
-    actions = 5.0 * rng.standard_normal((2, 20, 3))
-    fields = [np.cos(2 * np.pi * x), 0.5 + np.sin(4 * np.pi * x)]
-    readings = [readings_of(model, *pair) for pair in zip(actions, fields, strict=True)]
-    with threadpool_limits(1):
-        found, _, error = fit_sensed(readings, list(actions), actuators)
-    assert error < 1e-4
-    B = sensed_model(found, SENSORS, actuators, 4.0).B
-    assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
-
-
-def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() -> None:
-    """Burgers' equation, of which one internal step would be beyond the stability limit."""
-    shared = np.zeros(unknowns(1))
-    shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
-    n, actuators = grid_points(16), equally_spaced(1)
-    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
-    field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
-    (substeps,) = equation.substeps(largest)
-    assert 1 < substeps < 64 and equation.substeps(0.01 * largest) == 1
-
-    def after(substeps: int) -> Array:
-        step = equation.compiled(substeps, equation.supports)
-        z = step.spectra(field)
-        for _ in range(10):
-            step.advance(z, np.zeros((1, 2)))
-        return step.states(z)
-
-    exact, found = after(64), after(int(substeps))
-    assert np.abs(np.diff(exact)).max() > 0.1  # a front
-    np.testing.assert_allclose(found, exact, atol=1e-2)
-
-
-def test_neighbours_of_an_equation_are_simulated_as_each_by_itself() -> None:
-    rng = np.random.default_rng(2)
-    actuators, n, T, R = equally_spaced(3), grid_points(SENSORS), 6, 2
-    shared = rng.standard_normal(unknowns(3))
-    shared[len(FIRST) : EQUATION] *= 1e-3  # else nothing stays finite
-    fields, actions = 0.3 * rng.standard_normal((2, R, 33)), rng.standard_normal((R, T, 3))
-    sizes = np.linspace(3.0, 0.1, T)
-
-    def last(unknowns: Array, fields: Array, varied: list[int]) -> Array:
-        flow = SensedFlow(unknowns, n, actuators, sizes, DEFAULTS, 10.0, varied, 0.5)
-        found = [z.copy() for z in flow.path(fields, actions, T)]
-        return found[-1]
-
-    varied = [i for i in range(len(shared)) if i % 5]
-    together = last(shared, fields, varied)
-    assert len(together) == len(fields) + len(varied)
-    np.testing.assert_array_equal(together[:2], last(shared, fields, []))
-    for own, change in zip(together[2:], 0.5 * np.eye(len(shared))[varied], strict=True):
-        expected = last(shared - change, fields[:1], [])[0]
-        np.testing.assert_allclose(own, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_the_burgers_equation_is_found_from_fronts() -> None:
     """u_t = -u u_x + nu u_xx; nu is that of a coarse grid."""
     problem = pdeloop.problem("burgers", sensors=16, horizon=12, measurement_noise=0.03)
@@ -313,79 +228,6 @@ def test_readings_that_no_equation_explains_are_given_up_early() -> None:
         )
     assert error == np.inf and np.isfinite(fields).all()
     assert max(simulated) < 40
-
-
-def test_readings_are_interpolated_by_the_lowest_wavenumbers() -> None:
-    n = grid_points(SENSORS)
-    sensors = (np.arange(SENSORS) + 0.5) / SENSORS
-    field = interpolated(np.cos(2 * np.pi * sensors) + 0.5)
-    np.testing.assert_allclose(field, np.cos(2 * np.pi * np.arange(n) / n) + 0.5, atol=1e-12)
-
-
-def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the_next() -> None:
-    rng = np.random.default_rng(0)
-    states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
-    records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
-    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
-    proposals = SensedProposals(
-        loop, equally_spaced(2), noise=0.0, largest_cost=np.inf, settings=FEW_ITERATIONS
-    )
-    with threadpool_limits(1):
-        assert proposals.propose(records, records[0].policy, damping=1.0) is None
-    assert not proposals.equation.any()
-
-
-@pytest.mark.parametrize("n_a", [2, 12])
-def test_a_checkpoint_of_the_first_terms_alone_is_continued(n_a: int) -> None:
-    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
-    proposals = SensedProposals(loop, equally_spaced(n_a), noise=0.0, largest_cost=np.inf)
-    older = np.arange(1.0, unknowns(n_a) - EQUATION + len(FIRST) + 1)
-    proposals.restore({"equation": older})
-    np.testing.assert_array_equal(proposals.equation[: len(FIRST)], older[: len(FIRST)])
-    assert not proposals.equation[len(FIRST) : EQUATION].any()
-    np.testing.assert_array_equal(proposals.equation[EQUATION:], older[len(FIRST) :])
-    with pytest.raises(ValueError):
-        proposals.restore({"equation": older[:-1]})
-
-
-def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16)
-    plant = problem.plant()
-    explored, actions = problem.explore(0)
-    U = np.eye(SENSORS)
-    context = Context(
-        U,
-        plant.target,
-        plant.state_weight,
-        plant.action_weight,
-        plant.horizon,
-        Trajectory(explored[:-1], actions),
-        sensors=SENSORS,
-        field_models=replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15),
-    )
-
-    def make() -> GaussNewton:
-        start = np.zeros((plant.n_a, 2 * SENSORS))
-        return GaussNewton(start, seed=0, rollouts=10, context=context)
-
-    def measure(asked: Rollout) -> RolloutResult:
-        K = asked.policy[:, :SENSORS]
-        b = asked.policy[:, SENSORS:] @ plant.target
-        episode = rollout(plant, lambda k, y: y @ K.T + b, [asked.field_seed])
-        seen = Trajectory(episode.states[:, 0], episode.actions[:, 0])
-        return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
-
-    first, later = make(), make()
-    row = first.tell([measure(asked) for asked in first.ask()])
-    assert row["model"] == "sensed"
-    for _ in range(2):
-        first.tell([measure(first.ask()[0])])
-    later.restore(first.state())
-    rows = [optimizer.tell([measure(optimizer.ask()[0])]) for optimizer in (first, later)]
-    assert rows[0] == rows[1] and rows[0]["accepted"] and rows[0]["relative_cost"] < 0.8
-    for optimizer in (first, later):
-        optimizer.tell([measure(asked) for asked in optimizer.ask()])
-    assert same_bits(first.ask()[0].policy, later.ask()[0].policy)
 
 
 def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> None:

@@ -3,57 +3,28 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import replace
-from functools import cache
-from typing import Any
-
 import numpy as np
 import pytest
 
-import pdeloop
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import (
-    Context,
-    ModelBased,
-    Optimizer,
-    Record,
-    Rollout,
-    RolloutResult,
-    Trajectory,
-    model_based_sensed,
-)
+from loop_method.adapt import Context, Record, Trajectory
 from loop_method.adapt.belief import Belief
-from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.model_based_sensed import ModelBasedSensed, cheapest, gained, weighted
+from loop_method.adapt.model_based_sensed import cheapest, weighted
 from loop_method.adapt.observer_design import compensators, law_theta
-from loop_method.adapt.progress import JUDGING
-from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop
+from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
 from loop_method.laws import Observer
 from loop_method.models.files import model_of
-from loop_method.models.sensed import (
-    Actuators,
-    SensedModel,
-    interpolated,
-    sensed_model,
-)
+from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed
 from loop_method.models.sensed_smoothing import Smoothing
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    TERMS,
-    unknowns,
-)
-from loop_method.models.settings import DEFAULTS
-from pdeloop.episode import rollout
+from loop_method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
+from tests.support.sensed import SENSORS
+from tests.support.sensed_optimiser import FEW_ITERATIONS, N_A, rows_of
 from tests.support.small import same_bits
 
 Array = np.ndarray
-SENSORS, N_A, T = 8, 3, 24
-FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15)
-"""For claims that need no exact equation."""
+T = 24
 ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.zeros(N_A))
 RNG = np.random.default_rng(17)
 
@@ -92,14 +63,6 @@ def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
     explored = Trajectory(np.zeros((T + 1, SENSORS)), none)
     context = Context(U, target, 1.0, 0.1, T, explored, sensors=SENSORS, law=Observer(rows, T))
     return sensed_loop(context, model)
-
-
-def rows_of(n_s: int, U: Array, n_a: int = N_A) -> ModelRows:
-    """Of a law that does nothing."""
-    rng = np.random.default_rng(2)
-    A, B = 0.3 * rng.standard_normal((n_s, n_s)), rng.standard_normal((n_s, n_a))
-    gains = np.zeros((n_a, n_s))
-    return ModelRows(A=A, B=B, U=U, K_a=gains, K_b=gains, s_r=np.zeros(n_s))
 
 
 def test_the_initial_field_is_what_the_readings_came_from() -> None:
@@ -219,199 +182,6 @@ def test_the_model_survives_a_checkpoint() -> None:
     assert isinstance(model_of(model.arrays()), SensedModel)
 
 
-@cache
-def small() -> tuple[pdeloop.Problem, Context]:
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=10, exploration_variance=4.0)
-    plant = problem.plant()
-    explored = [problem.explore(seed) for seed in (0, 1)]
-    U = np.random.default_rng(3).standard_normal((SENSORS, 10))
-    law = Observer(rows_of(10, U, plant.n_a), plant.horizon)
-    first, second = (Trajectory(states, actions) for states, actions in explored)
-    context = Context(
-        law.model.U,
-        plant.target,
-        plant.state_weight,
-        plant.action_weight,
-        plant.horizon,
-        first,
-        sensors=SENSORS,
-        further=[second],
-        law=law,
-        field_models=FEW_ITERATIONS,
-    )
-    return problem, context
-
-
-def measured(asked: Rollout) -> RolloutResult:
-    problem, context = small()
-    law = context.law
-    assert isinstance(law, Observer)
-    theta, memory = law.parts(np.ravel(asked.policy)), law.memory_start()
-
-    def act(k: int, y: Array) -> Array:
-        nonlocal memory
-        a = law.action(theta, y[0], memory, k)
-        memory = law.memory_update(theta, y[0], memory, a, k)
-        return a[None]
-
-    episode = rollout(problem.plant(), act, [asked.field_seed])
-    seen = Trajectory(episode.states[:, 0], episode.actions[:, 0])
-    return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
-
-
-def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -> Optimizer:
-    _, context = small()
-    kind = ModelBased.for_context(context)
-    assert kind is ModelBasedSensed
-    settings = ModelBasedSettings(iterations=5, observer_iterations=5, mixtures=2, judging=judging)
-    law = context.law
-    assert law is not None
-    start = law.theta_start if first is None else first
-    return kind(start, seed=0, rollouts=rollouts, settings=settings, context=context)
-
-
-@cache
-def _told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
-    own = optimiser(**given)
-    results = [measured(asked) for asked in own.ask()]
-    return own, results, dict(own.tell(results))
-
-
-def told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
-    """A copy of an optimiser after its first rollouts, these, and its row: most of what it does."""
-    return copy.deepcopy(_told(**given))
-
-
-def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -> None:
-    later = optimiser()
-    assert len(later.ask()) == 1
-    first, _, row = told()
-    assert row["model"] == "sensed" and float(row["predicted_change"]) < 0.0
-    later.restore(first.state())
-    rows = []
-    for each in first, later:
-        while not each.done:
-            rows.append(each.tell([measured(asked) for asked in each.ask()]))
-    half = len(rows) // 2
-    assert rows[:half] == rows[half:] and rows[-1]["chosen"] == "adapted"
-    assert same_bits(first.policy, later.policy)
-
-
-def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
-    """An equation that reproduces the readings may be wrong between them."""
-    before, *_ = told()
-    own, costs = optimiser(rollouts=7, judging=3, first=before.policy), {}
-    for number in range(100):
-        asked = own.ask()
-        results = [measured(each) for each in asked]
-        if number == 0:
-            costs = {each.field_seed: r.cost for each, r in zip(asked, results, strict=True)}
-            assert len(costs) > 1
-        elif own._progress.stage == JUDGING:
-            again = [each.field_seed for each in asked]
-            assert again == list(costs)[: len(again)] and len(again) == 3
-            # A little more than chance explains.
-            results = [
-                replace(result, cost=costs[each.field_seed] + 5.0 + 0.1 * i)
-                for i, (each, result) in enumerate(zip(asked, results, strict=True))
-            ]
-        row = own.tell(results)
-        if own.done:
-            break
-    assert row["chosen"] == "first" and same_bits(own.policy, own._first)
-
-
-def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields() -> None:
-    """The first law does nothing either."""
-    own, *_ = told(rollouts=7, judging=3)
-    asked = own.ask()
-    assert not own._progress.safe and asked and not any(each.policy.any() for each in asked)
-    own.tell([measured(each) for each in asked])
-    judged = own.ask()
-    assert own._progress.stage == JUDGING and all(each.policy.any() for each in judged)
-    assert {each.field_seed for each in judged} == {each.field_seed for each in asked}
-
-
-def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
-    """Of three pairs chance explains the difference, of all of its rollouts it does not."""
-    own, (result, *_), row = told(rollouts=7, judging=3)
-    assert not own._progress.safe
-    final, checked = own._progress.policy, [70.0, np.inf]  # before, and in an exploration
-    few = np.zeros((1, SENSORS)), np.zeros((0, N_A))
-    own._context = replace(
-        own._context, measured=[Record(own._none, cost, *few) for cost in checked]
-    )
-    known, costs = [34.0, 47.0, 103.0, 47.0, 93.0, 113.0], [55.0, 52.0, 48.0]
-    for law, every in ((own._none, known), (final, costs)):
-        for cost in every:
-            own._records.add(law, replace(result, cost=cost), set())
-    own._judge(row)
-    assert row["chosen"] == "adapted"
-    assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
-
-
-def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
-    better, *_ = told()
-    own = optimiser(rollouts=7, judging=3, first=better.policy)
-    own.tell([measured(asked) for asked in own.ask()])
-    before, final = own._first + 1e-6, own._first + 2e-6
-    own._progress.policy = final
-    asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
-    results = [measured(each) for each in asked]
-    for more, best in ((0.1, final), (10.0, before)):
-        again, row = copy.deepcopy(own), {}
-        for each, result in zip(asked, results, strict=True):
-            # That of the first law on the same field, or of one that runs away.
-            known = again._records.all()[int(each.field_seed) - 1].cost
-            cost = known * (more if np.array_equal(each.policy, final) else 0.1)
-            again._records.add(each.policy, replace(result, cost=cost), set())
-        again._judge(row)
-        assert same_bits(again.policy, best) and row["chosen"] == "adapted"
-
-
-def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
-    attempts = []
-
-    def late(*given: Any) -> tuple[SensedModel, float] | None:
-        attempts.append(given)
-        return None if len(attempts) <= 3 else sensed_from(*given)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model_based_sensed, "sensed_from", late)
-        own, models = optimiser(rollouts=7), []
-        while not own.done:
-            row = own.tell([measured(asked) for asked in own.ask()])
-            models.append(row.get("model"))
-    assert models[2] == "innovations" and models[3] == "sensed"
-
-
-@pytest.mark.parametrize("far", [1.0, 100.0])
-def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far: float) -> None:
-    """Its rollouts show none; those of a law that stays near may."""
-    before, *_ = told()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model_based_sensed, "sensed_from", lambda *_: None)
-        own = optimiser(rollouts=20, judging=3, first=before.policy)
-        assert all(asked.policy.any() for asked in own.ask())
-        results = [measured(asked) for asked in own.ask()]
-        seen = [result.trajectory for result in results if result.trajectory is not None]
-        row = own.tell(
-            [
-                replace(result, trajectory=Trajectory(far * known.states, far * known.actions))
-                for result, known in zip(results, seen, strict=True)
-            ]
-        )
-        runs_away = far > 1.0
-        assert ("no control follows" in str(row.get("reason"))) is runs_away
-        assert all(asked.policy.any() is not np.bool_(runs_away) for asked in own.ask())
-
-
-def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
-    _, context = small()
-    other = Context(**{**vars(context), "periodic": False})
-    assert ModelBased.for_context(other) is ModelBasedReadings
-
-
 def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> None:
     loop = loop_of(model_with(CUBIC, 0.0))
     readings = np.vstack(
@@ -419,9 +189,3 @@ def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> Non
     )
     lost = Record(np.zeros(1), np.inf, readings, np.zeros((1, N_A)))
     assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0]))
-
-
-def test_a_change_is_that_of_the_fields_from_which_both_laws_are_finite() -> None:
-    change = gained(np.array([1.0, np.inf, 3.0]), np.array([2.0, np.inf, 5.0]))
-    assert change.value == -1.5 and change.error == pytest.approx(0.5)
-    assert np.isnan(gained(np.array([np.inf]), np.array([1.0])).value)

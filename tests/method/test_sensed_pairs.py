@@ -7,10 +7,7 @@ import numpy as np
 
 from loop_method.models.sensed import sensed_model
 from loop_method.models.sensed_fit import few_rollouts, fit_sensed
-from loop_method.models.sensed_unknowns import (
-    TERMS,
-    unknowns,
-)
+from loop_method.models.sensed_unknowns import TERMS, unknowns
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 
 STEPS, N_A = 30, 3

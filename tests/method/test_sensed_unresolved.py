@@ -13,10 +13,7 @@ from loop_interfaces.actuators import extents
 from loop_method.adapt import Context, Record, Trajectory
 from loop_method.adapt.sensed_loop import differ, sensed_from
 from loop_method.models.sensed import SensedModel
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    SHARED,
-)
+from loop_method.models.sensed_unknowns import COEFFICIENTS, SHARED
 from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
 from tests.support.sensed import SENSORS

@@ -9,22 +9,12 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame
-from loop_interfaces.topics import (
-    ACTION,
-    START,
-    TARGET,
-    Topic,
-)
+from loop_interfaces.topics import ACTION, START, TARGET, Topic
 from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
 from pdeloop.conformance.probing import Message
 from pdeloop.conformance.tuner import TunerCheck
-from tests.support.conformance_harness import (
-    MAKERS,
-    findings,
-    named,
-    plant,
-)
+from tests.support.conformance_harness import MAKERS, findings, named, plant
 
 ONE_FIELD = {f"physical.amplitude_{end}": 1.0 for end in ("min", "max")}
 ONE_FIELD |= {f"physical.spread_{end}": 0.05 for end in ("min", "max")}

@@ -13,12 +13,7 @@ from pdeloop.in_process import LocalPair
 from tests.support.small import parameters
 from tests.support.training_summary import summary
 from tuner_node.build import build_training
-from tuner_node.narration import (
-    Narration,
-    closing_lines,
-    failed,
-    warnings,
-)
+from tuner_node.narration import Narration, closing_lines, failed, warnings
 from tuner_node.rollouts import CHECK
 
 

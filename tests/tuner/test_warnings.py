@@ -13,14 +13,7 @@ from pdeloop.in_process import LocalPair
 from tests.support.small import SMALL, parameters
 from tests.support.training_summary import summary
 from tuner_node.build import build_training
-from tuner_node.narration import (
-    IDLE,
-    closing_lines,
-    exit_code,
-    failed,
-    misjudged_noise,
-    warnings,
-)
+from tuner_node.narration import IDLE, closing_lines, exit_code, failed, misjudged_noise, warnings
 
 
 def test_several_publishers_of_a_topic_are_a_warning():
