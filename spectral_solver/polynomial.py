@@ -129,10 +129,8 @@ def horner_at(plan: Any, part: int, j: int, c: int, e: int, u: Any, slope: int) 
     """Lanes of h_l(x, u)/u = c_l1 + c_l2 u + ..; with slope = 1 of dh_l/du = c_l1 + 2 c_l2 u + .."""
     real, imaginary, terms = splat(0.0), splat(0.0), plan.degree
     for p in range(terms - 1, -1, -1):
-        own, factor = (
-            get(c, plan.coefficients + (part * terms + p) * plan.fine.m + j, e),
-            splat(1.0 + slope * p),
-        )
+        own = get(c, plan.coefficients + (part * terms + p) * plan.fine.m + j, e)
+        factor = splat(1.0 + slope * p)
         real, imaginary = real * u[0] + factor * own[0], imaginary * u[1] + factor * own[1]
     return real, imaginary
 
@@ -195,7 +193,7 @@ integrate = internal_step(nonlinear, modes_at)
 
 @jit
 def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """Address of the transform of sum_q g_q'(u) times the field of m_q* x, and of dh_l/du likewise."""
+    """Address of the transform of all slopes of g_q and h_l times the fields of m_q* x and n_l* x."""
     t, clip, modes, terms = plan.fine, splat(plan.clip), plan.modes, plan.degree - 1
     last = plan.parts + plan.varying - 1
     # The products are gathered in what the next field leaves free: z1, z2 and a third plane.

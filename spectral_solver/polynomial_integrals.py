@@ -72,7 +72,7 @@ def propagate(w: int, d: int, plan: Any, c: int, e: int) -> None:
             put(w, at, d, product(c, plan.e + k, e, half))
 
 
-@cached_njit(*SOURCES, polynomial)  # whose functions are in another module here
+@cached_njit(*SOURCES, polynomial)
 def integrals(
     spectra: Array, actions: Array, ends: Array, found: Array, plans: NDArray[np.void]
 ) -> None:

@@ -13,13 +13,7 @@ from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
 from spectral_solver.fft import is_transform_length, plane_size
 from spectral_solver.memory import Constants, aligned, lay_out
-from spectral_solver.polynomial import (
-    PLAN,
-    advance,
-    analysed,
-    pull_back,
-    synthesised,
-)
+from spectral_solver.polynomial import PLAN, advance, analysed, pull_back, synthesised
 from spectral_solver.polynomial_integrals import integrals
 
 COEFFICIENTS = ("e", "e2", "q", "qm", "f1m", "f2m", "f3m", "f")
@@ -229,11 +223,9 @@ def layout(
     Without addresses, and without the numbers of an equation, for which there is room.
     """
     plans, constants, modes = np.zeros(1, PLAN), Constants(), n_x // 2 + 1
-    plan, fine, own = (
-        plans[0],
-        fine_length(n_x, max(degree, 2) if varying else degree),
-        whole_lanes(n_x // 2 + 1),
-    )
+    # A coefficient of x times the field is a product as well.
+    fine = fine_length(n_x, max(degree, 2) if varying else degree)
+    plan, own = plans[0], whole_lanes(n_x // 2 + 1)
     plan["parts"], plan["degree"], plan["steps"] = parts, degree, steps
     plan["n_x"], plan["n_a"], plan["modes"], plan["varying"] = n_x, n_a, own, varying
     if n_x % 2 == 0 and is_transform_length(n_x // 2):
@@ -280,9 +272,8 @@ def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> Spe
 def on_fine_grid(rows: Array, length: int) -> NDArray[np.complex128]:
     """Functions (..., n_x) of x on the dealiased grid: its even points, and i times the odd ones."""
     spectra, n_x = np.fft.rfft(rows), rows.shape[-1]
-    if (
-        n_x % 2 == 0 and 2 * length > n_x
-    ):  # half of its last wavenumber is that of minus the wavenumber
+    # Half of the last wavenumber is that of minus the wavenumber.
+    if n_x % 2 == 0 and 2 * length > n_x:
         spectra[..., -1] *= 0.5
     spectra *= 2 * length / n_x
     values = np.fft.irfft(spectra, n=2 * length)

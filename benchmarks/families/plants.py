@@ -105,14 +105,10 @@ class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
         return self.diffused(y) + (self.growth - 3 * z**2) * y, y
 
 
-class ReactionDiffusionInhomogeneousCircle(ReactionDiffusionInhomogeneous):
-    """The same, declared to be a field on a circle with its actuators in place."""
-
-    grid = Grid((Axis("x", 2.0, ReactionDiffusionInhomogeneous.n_z),))
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.supports = self.shapes.T
+class ReactionDiffusionInhomogeneousCircle(
+    AllenCahnInhomogeneousCircle, ReactionDiffusionInhomogeneous
+):
+    """The same, declared as the class before it is."""
 
 
 class FitzHughNagumo(RatePlant):

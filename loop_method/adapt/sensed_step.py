@@ -18,16 +18,8 @@ from loop_method.adapt.field_step import extrapolated_fields, improved
 from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.sensed_loop import fit_rollouts, whole_rollouts
 from loop_method.adapt.settings import GaussNewtonSettings
-from loop_method.models.sensed import (
-    KIND,
-    Actuators,
-    interpolated,
-    sensed_model,
-)
-from loop_method.models.sensed_unknowns import (
-    unknowns,
-    unknowns_of,
-)
+from loop_method.models.sensed import KIND, Actuators, interpolated, sensed_model
+from loop_method.models.sensed_unknowns import unknowns, unknowns_of
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 

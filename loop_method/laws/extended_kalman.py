@@ -12,16 +12,9 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.laws.base import Law, Parts
 from loop_method.laws.observer import Observer
-from loop_method.models.sensed import (
-    WAVES,
-    Actuators,
-    grid_points,
-    sensed_model,
-)
+from loop_method.models.sensed import WAVES, Actuators, grid_points, sensed_model
 from loop_method.models.sensed_filter import SensedFilter
-from loop_method.models.sensed_unknowns import (
-    unknowns,
-)
+from loop_method.models.sensed_unknowns import unknowns
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 FIELD_COEFFICIENTS = 1 + 2 * WAVES

@@ -262,13 +262,13 @@ class SensedEquation:
             wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
             unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
             self.symbols[p - 1] += unit * shared[i] * derivatives[j]
-        varied = shared[len(TERMS) : EQUATION]
+        of_x = shared[len(TERMS) : EQUATION]
         self.factors: Spectrum | None = None
         self.coefficients: Array | None = None
         """Of terms whose coefficients depend on x, (3, modes) and (3, degree, n); None: without."""
-        if varied.any():
+        if of_x.any():
             self.factors = np.stack(derivatives[:3])
-            self.coefficients = _coefficients(n, degree, varied.tobytes())
+            self.coefficients = _coefficients(n, degree, of_x.tobytes())
         self._fourth = bool(shared[TERMS.index((1, 4))])
         # What grows faster would overflow within an episode.
         grown = self.symbols[0]
@@ -350,13 +350,13 @@ def _supports(n: int, centres: bytes, widths: bytes, x_0: float, s: float, w: fl
 
 
 @lru_cache(maxsize=64)
-def _coefficients(n: int, degree: int, varied: bytes) -> Array:
+def _coefficients(n: int, degree: int, of_x: bytes) -> Array:
     """Those that depend on x, of d^j(z^p)/dx^j on the grid, (3, degree, n), j = 0, 1, 2.
 
     d(D dz/dx)/dx = d^2(D z)/dx^2 - d(D' z)/dx.
     """
     x, found = 2.0 * np.pi * np.arange(n) / n, np.zeros((3, degree, n))
-    for (p, j, m, sine), own in zip(VARIATIONS, np.frombuffer(varied), strict=True):
+    for (p, j, m, sine), own in zip(VARIATIONS, np.frombuffer(of_x), strict=True):
         size = own / (_TIME * _WAVENUMBER**j)
         found[j, p - 1] += size * (np.sin(m * x) if sine else np.cos(m * x))
         if j == 2:

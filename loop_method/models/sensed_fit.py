@@ -37,18 +37,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import (
-    Actuators,
-    coefficients_of,
-    field_of,
-    grid_points,
-)
+from loop_method.models.sensed import Actuators, coefficients_of, field_of, grid_points
 from loop_method.models.sensed_growth import USED, Found, further_terms, grown, start_with
 from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import (
-    EQUATION,
-    TERMS,
-)
+from loop_method.models.sensed_unknowns import EQUATION, TERMS
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # Shares of the declared dispersion that fits begin with: no descent leads from waves that run one way

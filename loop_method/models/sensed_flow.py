@@ -14,16 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import (
-    WAVES,
-    Actuators,
-    SensedEquation,
-)
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    EQUATION,
-    SHARED,
-)
+from loop_method.models.sensed import WAVES, Actuators, SensedEquation
+from loop_method.models.sensed_unknowns import COEFFICIENTS, EQUATION, SHARED
 from loop_method.models.settings import FieldModelSettings
 from spectral_solver.polynomial_step import PolynomialStep, PolynomialSteps
 

@@ -21,11 +21,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import (
-    EQUATION,
-    FIRST,
-    well_posed,
-)
+from loop_method.models.sensed_unknowns import EQUATION, FIRST, well_posed
 from loop_method.models.settings import FieldModelSettings
 
 Found = tuple[float, Array, Array]

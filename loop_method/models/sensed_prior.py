@@ -8,13 +8,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import WAVES
-from loop_method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    FIRST,
-    SHARED,
-    TERMS,
-    unknowns,
-)
+from loop_method.models.sensed_unknowns import COEFFICIENTS, FIRST, SHARED, TERMS, unknowns
 from loop_method.models.settings import FieldModelSettings
 
 

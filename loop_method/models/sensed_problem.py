@@ -8,21 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.sensed import (
-    WAVES,
-    Actuators,
-    coefficients_of,
-    grid_points,
-    interpolated,
-)
+from loop_method.models.sensed import WAVES, Actuators, coefficients_of, grid_points, interpolated
 from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_prior import SensedPrior
-from loop_method.models.sensed_unknowns import (
-    TERMS,
-    open_unknowns,
-    unknowns,
-    well_posed,
-)
+from loop_method.models.sensed_unknowns import TERMS, open_unknowns, unknowns, well_posed
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 # The part of rollouts that the fields of a known equation are fitted to before the whole.

@@ -71,13 +71,13 @@ def well_posed(shared: Array) -> Array:
     for p in range(len(ORDERS), 2, -2):
         if bound((p, 0), -1.0):
             break
-    # The same at every x, as far as the amplitudes of the waves tell.
+    # At every x as well, where coefficients depend on it: no sum of waves exceeds their amplitudes.
     for term, sign, others in (((3, 0), -1.0, ((5, 0), (7, 0))), ((1, 2), 1.0, ((1, 4),))):
-        varied = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
-        cosines, sines = found[varied].reshape(-1, 2).T
+        waves = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
+        cosines, sines = found[waves].reshape(-1, 2).T
         reached, most = float(np.hypot(cosines, sines).sum()), sign * found[TERMS.index(term)]
         if reached > most and not any(found[TERMS.index(other)] for other in others):
-            found[varied] *= max(most / reached, _KEPT)
+            found[waves] *= max(most / reached, _KEPT)
     return found
 
 

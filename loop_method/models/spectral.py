@@ -132,8 +132,8 @@ class SpectralModel:
         return linearised(self, state, action)
 
     def arrays(self) -> Arrays:
-        varying = {"factors": self.factors, "coefficients": self.coefficients}
-        known = {name: value for name, value in varying.items() if value is not None}
+        of_x = {"factors": self.factors, "coefficients": self.coefficients}
+        known = {name: value for name, value in of_x.items() if value is not None}
         return known | {
             "form": np.array("spectral"),
             "kind": np.array(self.kind),
