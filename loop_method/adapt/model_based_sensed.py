@@ -13,6 +13,7 @@ Where no equation reproduces the rollouts, it continues with a model of the read
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.estimate import Estimate, mean_of
-from loop_method.adapt.estimated_loop import estimated_laws
+from loop_method.adapt.estimated_loop import estimated_laws, least_trusting
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
@@ -123,6 +124,7 @@ class ModelBasedSensed(ModelBasedReadings):
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
+        further: list[Array] = []
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
             models = self._context.field_models
             further, more = estimated_laws(loop, law, every, weights, settings, models)
@@ -133,6 +135,9 @@ class ModelBasedSensed(ModelBasedReadings):
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
         theta = cheapest(loop, [now, *laws], held_out, equal)
+        if isinstance(law, ExtendedKalman) and theta is not now:
+            most = settings.filter_indifferent
+            theta = least_trusting(loop, law, further, theta, held_out, most)
         if theta is not now:
             progress.policy = loop.policy(theta, self._first)
         first = loop.costs(loop.theta(self._first), held_out)
@@ -192,7 +197,9 @@ class ModelBasedSensed(ModelBasedReadings):
         base, stays = self._base
         if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
             self._compare_pairs(row, base, stays, final)
-        if row["chosen"] != ADAPTED:
+        if row["chosen"] == ADAPTED:
+            self._prefer_earlier(row, final)
+        else:
             self._look_back(row, base, stays, final)
 
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
@@ -218,16 +225,39 @@ class ModelBasedSensed(ModelBasedReadings):
         """Return the law that measured best before the final one, if it is better than what stays."""
         others = [own for own in self._records.all() if not np.array_equal(own.policy, final)]
         before = best_measured(others, stays)
-        own, known = ([record.cost for record in self._of(law)] for law in (before, stays))
+        own, known = (costs_of(self._of(law)) for law in (before, stays))
         if len(known) < FEWEST or not np.isfinite(known).all():
             return
-        change = mean_of(np.array(own)) - mean_of(np.array(known))
+        change = mean_of(own) - mean_of(known)
         if change.is_negative(self._settings.confidence):
             names = ((FIRST, self._first), (NONE, self._none), (ADAPTED, before))
             name = next(name for name, law in names if np.array_equal(law, before))
             size = change.value, change.error
             self._progress.policy = before.copy()
             self._report(row, Verdict(name, *size, size_of(name, base, *size)))
+
+    def _prefer_earlier(self, row: Row, final: Array) -> None:
+        """Return the law that measured best before the final one, if it is better than that.
+
+        Rollouts of one law tell a fit little of the equation, so that a law may be renewed for the worse.
+        """
+        others = [own for own in self._records.all() if self._is_renewed(own.policy, final)]
+        earlier = best_measured(others, final)
+        own, known = (costs_of(self._of(law)) for law in (earlier, final))
+        if earlier is final or len(known) < FEWEST or not np.isfinite(known).all():
+            return
+        change = mean_of(own) - mean_of(known)
+        if change.is_negative(self._settings.confidence):
+            self._progress.policy = earlier.copy()
+            size = f"{-change.value:.4g} (standard error {change.error:.2g})"
+            reason = f"{row['reason']}; an earlier one costs {size} less and is returned"
+            error = float(np.hypot(float(row["deviation"]), change.error))
+            gain = float(row["predicted_change"]) + change.value
+            self._report(row, Verdict(ADAPTED, gain, error, reason))
+
+    def _is_renewed(self, law: Array, final: Array) -> bool:
+        """True of a law between the first and the final one."""
+        return not any(np.array_equal(law, own) for own in (self._first, self._none, final))
 
     @staticmethod
     def _report(row: Row, verdict: Verdict) -> None:
@@ -255,6 +285,11 @@ def _observers(
     gain = longer.least_gain if final else longer.first_gain
     found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
     return ([], 0) if found is None else ([start, found.theta], found.steps)
+
+
+def costs_of(records: Sequence[Record]) -> Array:
+    """The cost of each rollout."""
+    return np.array([record.cost for record in records])
 
 
 def gained(costs: Array, base: Array) -> Estimate:

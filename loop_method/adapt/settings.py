@@ -178,6 +178,12 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         10.0,
     )
+    filter_indifferent: float = setting(
+        0.03,
+        "share of the cost on the model that a law may cost more if its filter trusts the model less",
+        0.0,
+        1.0,
+    )
     readings_trust: float = setting(
         1.0,
         "weight of the distance from the start of a step on a model of readings; for a linear "

@@ -10,7 +10,13 @@ import pytest
 
 from loop_interfaces.model_rows import ModelRows
 from loop_method.adapt import Context, ModelBased, Trajectory
-from loop_method.adapt.estimated_loop import estimated_laws, prior, root_mean_square
+from loop_method.adapt.estimated_loop import (
+    UNPREDICTED,
+    estimated_laws,
+    least_trusting,
+    prior,
+    root_mean_square,
+)
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
@@ -199,6 +205,32 @@ def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> No
     best = whole.loop.costs(whole.theta, others) @ equal
     assert best < 0.9 * none
     assert max(own) - best < 0.1 * (none - best)
+
+
+def test_of_laws_that_cost_as_much_the_one_that_trusts_the_equation_least_is_used() -> None:
+    loop, law = loop_of(CUBIC)
+    every, weights = fields(8), np.full(8, 1.0 / 8.0)
+    settings = ModelBasedSettings(iterations=2)
+    laws, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    noise = [known.noise for theta in laws if (known := law.filter(law.parts(theta)))]
+    assert len(set(noise)) == len(UNPREDICTED)
+    costs = [loop.costs(theta, every).mean() for theta in laws]
+    best = int(np.argmin(costs))
+
+    def used(most: float) -> int:
+        found = least_trusting(loop, law, laws, laws[best], every, most)
+        return next(i for i, theta in enumerate(laws) if theta is found)
+
+    within = used(1e6)
+    assert noise[within] == max(noise)
+    assert costs[within] == min(c for c, n in zip(costs, noise, strict=True) if n == max(noise))
+    for most in (0.0, 0.001, 0.01, 0.1):
+        own = used(most)
+        assert costs[own] <= (1.0 + most) * costs[best] and noise[own] >= noise[best]
+        as_cheap = np.array(costs) <= (1.0 + most) * costs[best]
+        assert noise[own] == np.max(np.array(noise)[as_cheap])
+    for other in law.theta_start, np.zeros((N_A, N_S + 1)):
+        assert least_trusting(loop, law, laws, other, every, 1e6) is other
 
 
 def test_the_prior_has_the_moments_of_the_fields() -> None:

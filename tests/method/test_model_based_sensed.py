@@ -108,6 +108,32 @@ def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
         assert same_bits(again.policy, best) and row["chosen"] == "adapted"
 
 
+@pytest.mark.parametrize("more", [0.5, 2.0])
+def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beats_the_first(
+    more: float,
+) -> None:
+    """What a law is renewed from may tell less of the plant than what is known already."""
+    better, *_ = told()
+    own = optimiser(rollouts=7, judging=3, first=better.policy)
+    own.tell([measured(asked) for asked in own.ask()])
+    before, final, row = own._first + 1e-6, own._first + 2e-6, dict[str, Any]()
+    own._progress.policy = final
+    first = [record.cost for record in own._of(own._first)]
+    assert len(first) == 3
+    for law, share in ((before, 0.4), (final, 0.4 * more)):
+        for seed, cost in enumerate(first, start=1):
+            result = measured(Rollout(law, seed))
+            # Alike from field to field, so that three rollouts decide.
+            level = share * (np.mean(first) + 0.01 * (cost - np.mean(first)))
+            own._records.add(law, replace(result, cost=float(level)), set())
+    own._judge(row)
+    assert row["chosen"] == "adapted"
+    assert same_bits(own.policy, before if more > 1.0 else final)
+    assert ("an earlier one costs" in str(row["reason"])) is (more > 1.0)
+    expected = 0.4 * min(more, 1.0) * np.mean(first) - np.mean(first)
+    assert row["predicted_change"] == pytest.approx(expected)
+
+
 def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
     attempts = []
 
