@@ -87,7 +87,7 @@ def least_trusting(
 ) -> Array:
     """The law on an estimate whose filter trusts the equation least, among those that cost no more.
 
-    In simulations the filter's equation is that of the plant, so that laws which trust it look too good.
+    In simulations the filter's equation is that of the plant: laws that trust it look too good.
 
     best: the cheapest one; another kind of law stays; most: how much more one may cost, as a share of
     its cost.

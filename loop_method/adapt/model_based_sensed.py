@@ -239,7 +239,7 @@ class ModelBasedSensed(ModelBasedReadings):
     def _prefer_earlier(self, row: Row, final: Array) -> None:
         """Return the law that measured best before the final one, if it is better than that.
 
-        Rollouts of one law tell a fit little of the equation, so that a law may be renewed for the worse.
+        Rollouts of one law tell little of the equation: the law may have been renewed for the worse.
         """
         others = [own for own in self._records.all() if self._is_renewed(own.policy, final)]
         earlier = best_measured(others, final)
