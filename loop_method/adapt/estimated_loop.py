@@ -14,7 +14,6 @@ Trans. Automatic Control 19(5), 1974.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,8 +31,8 @@ from loop_method.models.settings import FieldModelSettings
 INDEPENDENT = (0.3, 1.0)
 """Shares of the standard deviation of each wave that initial fields are assumed to have besides the
 covariance of those that were estimated; each makes a filter."""
-UNPREDICTED = (1.0, 3.0, 6.0)
-"""Multiples of `filter_unpredicted`; each makes a filter with each of these shares."""
+UNPREDICTED = (6.0, 3.0)
+"""Multiples of `filter_unpredicted` with which a law is tried in place of the cheapest one."""
 
 
 def estimated_laws(
@@ -47,8 +46,7 @@ def estimated_laws(
     """Theta of laws on the estimate, and the steps of L-BFGS that they took; none if none is finite.
 
     That of the whole field, and one that is optimised with noise on what it sees, so that it depends
-    less on what an estimate has wrong; each with filters that know the initial fields well, and less,
-    and that trust the equation more and less.
+    less on what an estimate has wrong; each with filters that know the initial fields well, and less.
     """
     model = loop.model
     assert isinstance(model, SensedModel)
@@ -56,13 +54,10 @@ def estimated_laws(
     if whole is None:
         return [], 0
     size = root_mean_square(model.spread)
-    unpredicted = settings.filter_unpredicted * size
-    noises = dict.fromkeys(float(np.hypot(model.noise, own * unpredicted)) for own in UNPREDICTED)
-    known = [prior(fields, weights, share) for share in INDEPENDENT]
+    noise = noise_of_filter(model, settings)
     filters = [
-        SensedFilter(model, *own, noise, settings.filter_inflation)
-        for noise in noises
-        for own in known
+        SensedFilter(model, *prior(fields, weights, share), noise, settings.filter_inflation)
+        for share in INDEPENDENT
     ]
     found, theta, steps = [], whole.theta, whole.steps
     for share in (0.0, settings.filter_seen):
@@ -73,36 +68,41 @@ def estimated_laws(
                 continue
             theta, steps = better.theta, steps + better.steps
         K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
-        found += [law.theta_of(K, b, own, models) for own in filters]
+        found += [law.theta_of(K, b, known, models) for known in filters]
     return found, steps
 
 
+def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
+    """Standard deviation of a reading for a filter: noise, and what the model does not predict of it.
+
+    times: multiple of the latter.
+    """
+    unpredicted = settings.filter_unpredicted * root_mean_square(model.spread)
+    return float(np.hypot(model.noise, times * unpredicted))
+
+
 def least_trusting(
-    loop: ClosedLoop,
-    law: ExtendedKalman,
-    laws: Sequence[Array],
-    best: Array,
-    fields: Array,
-    most: float,
+    loop: ClosedLoop, law: ExtendedKalman, best: Array, fields: Array, settings: ModelBasedSettings
 ) -> Array:
-    """The law on an estimate whose filter trusts the equation least, among those that cost no more.
+    """The law with the filter that trusts the equation least, if it costs hardly more on the model.
 
     In simulations the filter's equation is that of the plant: laws that trust it look too good.
 
-    best: the cheapest one; another kind of law stays; most: how much more one may cost, as a share of
-    its cost.
+    best: the law on an estimate that is cheapest from these fields.
     """
-    if best.ndim > 1 or not law.estimates(best):
+    model = loop.model
+    assert isinstance(model, SensedModel)
+    parts, costs = dict(law.parts(best)), loop.costs(best, fields)
+    known = np.isfinite(costs)
+    if not known.any():
         return best
-    own = [theta for theta in laws if theta.ndim == 1 and law.estimates(theta)]
-    costs = np.array([loop.costs(theta, fields) for theta in own])
-    least = loop.costs(best, fields)
-    finite = np.isfinite(least)
-    total = costs[:, finite].mean(axis=1)
-    as_cheap = total <= (1.0 + most) * least[finite].mean()
-    noise = [known.noise if (known := law.filter(law.parts(each))) else 0.0 for each in own]
-    order = np.lexsort((total, np.negative(noise), ~as_cheap))
-    return own[int(order[0])] if as_cheap.any() else best
+    most = (1.0 + settings.filter_indifferent) * costs[known].mean()
+    for times in UNPREDICTED:
+        noise = noise_of_filter(model, settings, times)
+        other = law.vector(parts | {"noise": np.array([noise, settings.filter_inflation])})
+        if loop.costs(other, fields)[known].mean() <= most:
+            return other
+    return best
 
 
 def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:

@@ -124,7 +124,6 @@ class ModelBasedSensed(ModelBasedReadings):
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
-        further: list[Array] = []
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
             models = self._context.field_models
             further, more = estimated_laws(loop, law, every, weights, settings, models)
@@ -135,10 +134,9 @@ class ModelBasedSensed(ModelBasedReadings):
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
         theta = cheapest(loop, [now, *laws], held_out, equal)
-        if isinstance(law, ExtendedKalman) and theta is not now:
-            most = settings.filter_indifferent
-            theta = least_trusting(loop, law, further, theta, held_out, most)
         if theta is not now:
+            if isinstance(law, ExtendedKalman) and theta.ndim == 1:
+                theta = least_trusting(loop, law, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)

@@ -165,7 +165,7 @@ class ModelBasedSettings(ImprovementSettings):
     filter_unpredicted: float = setting(
         0.04,
         "share of the size of a field that its filter adds to the noise of a reading, as no model "
-        "predicts it; further laws add 3 and 6 times as much",
+        "predicts it; 3 or 6 times as much where the law costs hardly more",
         0.0,
         1.0,
     )

@@ -14,6 +14,7 @@ from loop_method.adapt.estimated_loop import (
     UNPREDICTED,
     estimated_laws,
     least_trusting,
+    noise_of_filter,
     prior,
     root_mean_square,
 )
@@ -207,30 +208,32 @@ def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> No
     assert max(own) - best < 0.1 * (none - best)
 
 
-def test_of_laws_that_cost_as_much_the_one_that_trusts_the_equation_least_is_used() -> None:
+def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> None:
     loop, law = loop_of(CUBIC)
-    every, weights = fields(8), np.full(8, 1.0 / 8.0)
-    settings = ModelBasedSettings(iterations=2)
-    laws, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
-    noise = [known.noise for theta in laws if (known := law.filter(law.parts(theta)))]
-    assert len(set(noise)) == len(UNPREDICTED)
-    costs = [loop.costs(theta, every).mean() for theta in laws]
-    best = int(np.argmin(costs))
+    every, weights, trusted = fields(8), np.full(8, 1.0 / 8.0), 0.3
+    settings = ModelBasedSettings(iterations=10, filter_unpredicted=trusted)
+    designed, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    best = min(designed, key=lambda theta: float(loop.costs(theta, every).mean()))
+    parts = dict(law.parts(best))
 
-    def used(most: float) -> int:
-        found = least_trusting(loop, law, laws, laws[best], every, most)
-        return next(i for i, theta in enumerate(laws) if theta is found)
+    def theta_with(times: float) -> Array:
+        noise = noise_of_filter(CUBIC, settings, times)
+        return law.vector(parts | {"noise": np.array([noise, settings.filter_inflation])})
 
-    within = used(1e6)
-    assert noise[within] == max(noise)
-    assert costs[within] == min(c for c, n in zip(costs, noise, strict=True) if n == max(noise))
-    for most in (0.0, 0.001, 0.01, 0.1):
-        own = used(most)
-        assert costs[own] <= (1.0 + most) * costs[best] and noise[own] >= noise[best]
-        as_cheap = np.array(costs) <= (1.0 + most) * costs[best]
-        assert noise[own] == np.max(np.array(noise)[as_cheap])
-    for other in law.theta_start, np.zeros((N_A, N_S + 1)):
-        assert least_trusting(loop, law, laws, other, every, 1e6) is other
+    assert same_bits(theta_with(1.0), best)
+    others = [theta_with(times) for times in UNPREDICTED]
+    known, *costs = (loop.costs(theta, every).mean() for theta in (best, *others))
+    shares = [cost / known - 1.0 for cost in costs]
+    assert shares[0] > shares[1] > 0.0, "the law is cheapest with the filter of the plant"
+    for allowed, expected in (
+        (1.01 * shares[0], others[0]),
+        (0.99 * shares[0], others[1]),
+        (0.99 * shares[1], best),
+    ):
+        settings = replace(settings, filter_indifferent=allowed)
+        assert same_bits(least_trusting(loop, law, best, every, settings), expected)
+    lost = law.vector(parts | {"K_e": np.full((N_A, 64), np.inf)})
+    assert least_trusting(loop, law, lost, every, settings) is lost
 
 
 def test_the_prior_has_the_moments_of_the_fields() -> None:
