@@ -32,7 +32,7 @@ INDEPENDENT = (0.3, 1.0)
 """Shares of the standard deviation of each wave that initial fields are assumed to have besides the
 covariance of those that were estimated; each makes a filter."""
 UNPREDICTED = (6.0, 3.0)
-"""Multiples of `filter_unpredicted` with which a law is tried in place of the cheapest one."""
+"""Multiples of `filter_unpredicted` with which the cheapest law is tried again, one after the other."""
 
 
 def estimated_laws(
@@ -84,7 +84,7 @@ def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: flo
 def least_trusting(
     loop: ClosedLoop, law: ExtendedKalman, best: Array, fields: Array, settings: ModelBasedSettings
 ) -> Array:
-    """The law with the filter that trusts the equation least, if it costs hardly more on the model.
+    """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
     In simulations the filter's equation is that of the plant: laws that trust it look too good.
 
@@ -96,7 +96,7 @@ def least_trusting(
     known = np.isfinite(costs)
     if not known.any():
         return best
-    most = (1.0 + settings.filter_indifferent) * costs[known].mean()
+    most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
         noise = noise_of_filter(model, settings, times)
         other = law.vector(parts | {"noise": np.array([noise, settings.filter_inflation])})

@@ -4,9 +4,11 @@
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`; its result is used only if it is cheaper on other draws.
+current law and those of `observer_design`; its result is used only if it is cheaper on other draws,
+or hardly dearer with a filter that trusts the equation less.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
-between the two: an equation that reproduces the readings may be wrong where no sensor is.
+between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
+law that measured better than the final one is returned in its place.
 Where no equation reproduces the rollouts, it continues with a model of the readings
 (`model_based_readings`) and tries again with more of them.
 """
@@ -34,6 +36,7 @@ from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
+    NAMES,
     NONE,
     Verdict,
     choose,
@@ -196,7 +199,7 @@ class ModelBasedSensed(ModelBasedReadings):
         if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
             self._compare_pairs(row, base, stays, final)
         if row["chosen"] == ADAPTED:
-            self._prefer_earlier(row, final)
+            self._prefer_earlier(row, base, stays, final)
         else:
             self._look_back(row, base, stays, final)
 
@@ -228,34 +231,46 @@ class ModelBasedSensed(ModelBasedReadings):
             return
         change = mean_of(own) - mean_of(known)
         if change.is_negative(self._settings.confidence):
-            names = ((FIRST, self._first), (NONE, self._none), (ADAPTED, before))
-            name = next(name for name, law in names if np.array_equal(law, before))
-            size = change.value, change.error
+            name, size = self._name_of(before), (change.value, change.error)
             self._progress.policy = before.copy()
             self._report(row, Verdict(name, *size, size_of(name, base, *size)))
 
-    def _prefer_earlier(self, row: Row, final: Array) -> None:
+    def _prefer_earlier(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Return the law that measured best before the final one, if it is better than that.
 
         Rollouts of one law tell little of the equation: the law may have been renewed for the worse.
         """
-        others = [own for own in self._records.all() if self._is_renewed(own.policy, final)]
-        earlier = best_measured(others, final)
-        own, known = (costs_of(self._of(law)) for law in (earlier, final))
-        if earlier is final or len(known) < FEWEST or not np.isfinite(known).all():
+        known = costs_of(self._of(final))
+        if not np.isfinite(known).all():
+            self._look_back(row, base, stays, final)
             return
+        others = [
+            own
+            for own in self._records.all()
+            if not any(np.array_equal(own.policy, law) for law in (stays, final))
+        ]
+        earlier = best_measured(others, final)
+        if earlier is final or len(known) < FEWEST:
+            return
+        own, before = costs_of(self._of(earlier)), costs_of(self._of(stays))
         change = mean_of(own) - mean_of(known)
-        if change.is_negative(self._settings.confidence):
-            self._progress.policy = earlier.copy()
-            size = f"{-change.value:.4g} (standard error {change.error:.2g})"
-            reason = f"{row['reason']}; an earlier one costs {size} less and is returned"
-            error = float(np.hypot(float(row["deviation"]), change.error))
-            gain = float(row["predicted_change"]) + change.value
-            self._report(row, Verdict(ADAPTED, gain, error, reason))
+        if not change.is_negative(self._settings.confidence):
+            return
+        size = f"{-change.value:.4g} (standard error {change.error:.2g})"
+        name = self._name_of(earlier)
+        law = "an earlier adapted law" if name == ADAPTED else NAMES[name]
+        reason = f"{row['reason']}; {law} costs {size} less than the last one and is returned"
+        if len(before) >= FEWEST and np.isfinite(before).all():
+            change = mean_of(own) - mean_of(before)
+        else:
+            change += Estimate(float(row["predicted_change"]), float(row["deviation"]))
+        self._progress.policy = earlier.copy()
+        self._report(row, Verdict(name, change.value, change.error, reason))
 
-    def _is_renewed(self, law: Array, final: Array) -> bool:
-        """True of a law between the first and the final one."""
-        return not any(np.array_equal(law, own) for own in (self._first, self._none, final))
+    def _name_of(self, law: Array) -> str:
+        """That of the first law, of no control, or of an adapted one."""
+        names = ((FIRST, self._first), (NONE, self._none), (ADAPTED, law))
+        return next(name for name, own in names if np.array_equal(own, law))
 
     @staticmethod
     def _report(row: Row, verdict: Verdict) -> None:

@@ -165,7 +165,7 @@ class ModelBasedSettings(ImprovementSettings):
     filter_unpredicted: float = setting(
         0.04,
         "share of the size of a field that its filter adds to the noise of a reading, as no model "
-        "predicts it; 3 or 6 times as much where the law costs hardly more",
+        "predicts it; 6 or else 3 times as much within filter_margin",
         0.0,
         1.0,
     )
@@ -178,9 +178,10 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         10.0,
     )
-    filter_indifferent: float = setting(
+    filter_margin: float = setting(
         0.03,
-        "share of the cost on the model that a law may cost more if its filter trusts the model less",
+        "largest relative increase of the cost on the model with which a filter that trusts the "
+        "equation less is used",
         0.0,
         1.0,
     )

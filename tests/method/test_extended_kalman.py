@@ -224,13 +224,13 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
     others = [theta_with(times) for times in UNPREDICTED]
     known, *costs = (loop.costs(theta, every).mean() for theta in (best, *others))
     shares = [cost / known - 1.0 for cost in costs]
-    assert shares[0] > shares[1] > 0.0, "the law is cheapest with the filter of the plant"
+    assert shares[0] > shares[1] > 0.0, "costs rise with the noise of the filter"
     for allowed, expected in (
         (1.01 * shares[0], others[0]),
         (0.99 * shares[0], others[1]),
         (0.99 * shares[1], best),
     ):
-        settings = replace(settings, filter_indifferent=allowed)
+        settings = replace(settings, filter_margin=allowed)
         assert same_bits(least_trusting(loop, law, best, every, settings), expected)
     lost = law.vector(parts | {"K_e": np.full((N_A, 64), np.inf)})
     assert least_trusting(loop, law, lost, every, settings) is lost

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from loop_method.adapt import Context, ModelBased, Record, Rollout, Trajectory, model_based_sensed
+from loop_method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
 from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.model_based_sensed import gained
+from loop_method.adapt.model_based_sensed import ModelBasedSensed, gained
 from loop_method.adapt.progress import JUDGING
 from loop_method.adapt.sensed_loop import sensed_from
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.laws import ExtendedKalman, Observer
 from loop_method.models.sensed import SensedModel
 from tests.support.sensed import SENSORS
 from tests.support.sensed_optimiser import N_A, measured, optimiser, small, told
@@ -129,9 +132,56 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
     own._judge(row)
     assert row["chosen"] == "adapted"
     assert same_bits(own.policy, before if more > 1.0 else final)
-    assert ("an earlier one costs" in str(row["reason"])) is (more > 1.0)
+    assert ("an earlier adapted law costs" in str(row["reason"])) is (more > 1.0)
     expected = 0.4 * min(more, 1.0) * np.mean(first) - np.mean(first)
     assert row["predicted_change"] == pytest.approx(expected)
+    # Of the earlier law's and the first one's rollouts, and of pairs of the last one's.
+    off = np.std(first, ddof=1) / np.sqrt(3.0)
+    error = np.hypot(off, 0.4 * 0.01 * off) if more > 1.0 else (1.0 - 0.2 * 0.01) * off
+    assert row["deviation"] == pytest.approx(error)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_better(
+    lost: bool,
+) -> None:
+    """Of a last law that beats no control, and of one that diverged once."""
+    better, *_ = told()
+    own = optimiser(rollouts=7, judging=3, first=better.policy)
+    own.tell([measured(asked) for asked in own.ask()])
+    own._progress.safe, final = False, own._first + 1e-6
+    count, row = len(own._of(own._first)), {"chosen": "adapted", "reason": "it is cheaper"}
+    own._progress.policy, level = final, own._records.all()[0].cost
+    for law, costs in ((own._none, [9.0, 9.1, 9.2]), (final, [5.0, np.inf if lost else 5.1, 5.2])):
+        for seed, cost in enumerate(costs, start=1):
+            result = replace(measured(Rollout(law, seed)), cost=cost * level)
+            own._records.add(law, result, set())
+    known = own._of(own._first)
+    assert count == len(known) == 3
+    own._prefer_earlier(
+        row | {"predicted_change": -1.0, "deviation": 0.1}, "none", own._none, final
+    )
+    assert same_bits(own.policy, own._first)
+
+
+def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_margin() -> None:
+    _, results, _ = told()
+    _, context = small()
+    assert isinstance(context.law, Observer)
+    law = ExtendedKalman(context.law.model, context.horizon)
+    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=1, filter_margin=1.0)
+    own = ModelBasedSensed(
+        law.theta_start,
+        seed=0,
+        rollouts=3,
+        settings=settings,
+        context=replace(context, law=law),
+    )
+    # Both first laws do nothing.
+    own.tell(results)
+    assert own._sensed is not None and law.estimates(own.policy)
+    noise = law.parts(own.policy)["noise"][0]
+    assert noise == noise_of_filter(own._sensed, settings, UNPREDICTED[0])
 
 
 def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
