@@ -50,6 +50,11 @@ def find_problem(name: str) -> Path:
     if name in shipped:
         return shipped[name]
     path = Path(name)
+    if ".py" in (path.suffix, path.suffix.partition(":")[0]):
+        raise ParameterError(
+            f"expected the name of a problem or the path of a YAML file, got {shown(name)}; a plant of "
+            "your own is given as --plant FILE.py:CLASS"
+        )
     if path.suffix in (".yaml", ".yml") or path.exists():
         if not path.is_file():
             raise ParameterError(f"no problem file at {name}; give the path of a YAML file")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.parameters import NODES, table, taken_by, with_names
-from loop_interfaces.problem import completed, load_parameters, shipped_problems
+from loop_interfaces.problem import completed, find_problem, load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
 from pde_sim_node.build import build_plant, fingerprint
@@ -297,6 +297,14 @@ def test_a_node_refuses_a_problem_that_nobody_knows(package, given, known):
     else:
         with pytest.raises(Refused, match=r"unknown problem 'stokes'.*burgers, .*kdv"):
             completed(given, package)
+
+
+@pytest.mark.parametrize("name", ["plant.py", "plant.py:Plant"])
+def test_a_plant_that_is_given_as_a_problem_is_told_how_to_be_given(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("plant.py").touch()
+    with pytest.raises(Refused, match=rf"got '{name}'; .* as --plant FILE\.py:CLASS"):
+        find_problem(name)
 
 
 def test_what_a_plant_tells_of_itself_is_not_taken_from_a_file_of_all_its_parameters() -> None:
