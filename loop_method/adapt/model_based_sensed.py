@@ -198,10 +198,7 @@ class ModelBasedSensed(ModelBasedReadings):
         base, stays = self._base
         if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
             self._compare_pairs(row, base, stays, final)
-        if row["chosen"] == ADAPTED:
-            self._prefer_earlier(row, base, stays, final)
-        else:
-            self._look_back(row, base, stays, final)
+        self._look_back(row, base, stays, final)
 
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Decide between the final law and the one to stay with on the same fields."""
@@ -223,49 +220,36 @@ class ModelBasedSensed(ModelBasedReadings):
         self._report(row, measured)
 
     def _look_back(self, row: Row, base: str, stays: Array, final: Array) -> None:
-        """Return the law that measured best before the final one, if it is better than what stays."""
-        others = [own for own in self._records.all() if not np.array_equal(own.policy, final)]
-        before = best_measured(others, stays)
-        own, known = (costs_of(self._of(law)) for law in (before, stays))
-        if len(known) < FEWEST or not np.isfinite(known).all():
-            return
-        change = mean_of(own) - mean_of(known)
-        if change.is_negative(self._settings.confidence):
-            name, size = self._name_of(before), (change.value, change.error)
-            self._progress.policy = before.copy()
-            self._report(row, Verdict(name, *size, size_of(name, base, *size)))
-
-    def _prefer_earlier(self, row: Row, base: str, stays: Array, final: Array) -> None:
-        """Return the law that measured best before the final one, if it is better than that.
+        """Return the law that measured best before the final one, if it is better than the chosen one.
 
         Rollouts of one law tell little of the equation: the law may have been renewed for the worse.
         """
-        known = costs_of(self._of(final))
-        if not np.isfinite(known).all():
-            self._look_back(row, base, stays, final)
-            return
+        last = row["chosen"] == ADAPTED and bool(np.isfinite(costs_of(self._of(final))).all())
+        chosen = final if last else stays
         others = [
             own
             for own in self._records.all()
             if not any(np.array_equal(own.policy, law) for law in (stays, final))
         ]
-        earlier = best_measured(others, final)
-        if earlier is final or len(known) < FEWEST:
+        earlier = best_measured(others, chosen)
+        own, known, before = (costs_of(self._of(law)) for law in (earlier, chosen, stays))
+        if len(known) < FEWEST or not np.isfinite(known).all():
             return
-        own, before = costs_of(self._of(earlier)), costs_of(self._of(stays))
         change = mean_of(own) - mean_of(known)
         if not change.is_negative(self._settings.confidence):
             return
-        size = f"{-change.value:.4g} (standard error {change.error:.2g})"
-        name = self._name_of(earlier)
-        law = "an earlier adapted law" if name == ADAPTED else NAMES[name]
-        reason = f"{row['reason']}; {law} costs {size} less than the last one and is returned"
-        if len(before) >= FEWEST and np.isfinite(before).all():
-            change = mean_of(own) - mean_of(before)
-        else:
-            change += Estimate(float(row["predicted_change"]), float(row["deviation"]))
+        name, reason = self._name_of(earlier), ""
+        if last:
+            law = "an earlier adapted law" if name == ADAPTED else NAMES[name]
+            saved = f"{-change.value:.4g} (standard error {change.error:.2g})"
+            reason = f"{row['reason']}; {law} costs {saved} less than the last one and is returned"
+            if len(before) >= FEWEST and np.isfinite(before).all():
+                change = mean_of(own) - mean_of(before)
+            else:
+                change += Estimate(float(row["predicted_change"]), float(row["deviation"]))
         self._progress.policy = earlier.copy()
-        self._report(row, Verdict(name, change.value, change.error, reason))
+        size = change.value, change.error
+        self._report(row, Verdict(name, *size, reason or size_of(name, base, *size)))
 
     def _name_of(self, law: Array) -> str:
         """That of the first law, of no control, or of an adapted one."""

@@ -92,10 +92,16 @@ def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
     assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
 
 
-def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
+def after_its_first_rollouts() -> Any:
+    """An optimiser that began with a law that is better than no control."""
     better, *_ = told()
     own = optimiser(rollouts=7, judging=3, first=better.policy)
     own.tell([measured(asked) for asked in own.ask()])
+    return own
+
+
+def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
+    own = after_its_first_rollouts()
     before, final = own._first + 1e-6, own._first + 2e-6
     own._progress.policy = final
     asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
@@ -116,9 +122,7 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
     more: float,
 ) -> None:
     """What a law is renewed from may tell less of the plant than what is known already."""
-    better, *_ = told()
-    own = optimiser(rollouts=7, judging=3, first=better.policy)
-    own.tell([measured(asked) for asked in own.ask()])
+    own = after_its_first_rollouts()
     before, final, row = own._first + 1e-6, own._first + 2e-6, dict[str, Any]()
     own._progress.policy = final
     first = [record.cost for record in own._of(own._first)]
@@ -146,22 +150,18 @@ def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_bett
     lost: bool,
 ) -> None:
     """Of a last law that beats no control, and of one that diverged once."""
-    better, *_ = told()
-    own = optimiser(rollouts=7, judging=3, first=better.policy)
-    own.tell([measured(asked) for asked in own.ask()])
+    own = after_its_first_rollouts()
     own._progress.safe, final = False, own._first + 1e-6
-    count, row = len(own._of(own._first)), {"chosen": "adapted", "reason": "it is cheaper"}
+    row = {"chosen": "adapted", "reason": "", "predicted_change": -1.0, "deviation": 0.1}
     own._progress.policy, level = final, own._records.all()[0].cost
     for law, costs in ((own._none, [9.0, 9.1, 9.2]), (final, [5.0, np.inf if lost else 5.1, 5.2])):
         for seed, cost in enumerate(costs, start=1):
             result = replace(measured(Rollout(law, seed)), cost=cost * level)
             own._records.add(law, result, set())
-    known = own._of(own._first)
-    assert count == len(known) == 3
-    own._prefer_earlier(
-        row | {"predicted_change": -1.0, "deviation": 0.1}, "none", own._none, final
-    )
-    assert same_bits(own.policy, own._first)
+    first = [record.cost / level for record in own._of(own._first)]
+    own._look_back(row, "none", own._none, final)
+    assert same_bits(own.policy, own._first) and row["chosen"] == "first"
+    assert row["predicted_change"] == pytest.approx(level * (np.mean(first) - 9.1))
 
 
 def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_margin() -> None:
