@@ -41,25 +41,22 @@ def test_one_rollout_suffices_and_the_optimiser_continues_with_the_same_bits() -
 
 def test_what_a_law_costs_on_the_fields_of_the_first_one_decides() -> None:
     """An equation that reproduces the readings may be wrong between them."""
-    before, *_ = told()
-    own, costs = optimiser(rollouts=7, judging=3, first=before.policy), {}
-    for number in range(100):
+    own, first, _ = told(better=True, rollouts=7, judging=3)
+    fields = [each.field_seed for each in optimiser(rollouts=7, judging=3, first=own._first).ask()]
+    costs = {field: result.cost for field, result in zip(fields, first, strict=True)}
+    assert len(costs) > 1
+    while not own.done:
         asked = own.ask()
         results = [measured(each) for each in asked]
-        if number == 0:
-            costs = {each.field_seed: r.cost for each, r in zip(asked, results, strict=True)}
-            assert len(costs) > 1
-        elif own._progress.stage == JUDGING:
+        if own._progress.stage == JUDGING:
             again = [each.field_seed for each in asked]
-            assert again == list(costs)[: len(again)] and len(again) == 3
+            assert again == fields[: len(again)] and len(again) == 3
             # A little more than chance explains.
             results = [
                 replace(result, cost=costs[each.field_seed] + 5.0 + 0.1 * i)
                 for i, (each, result) in enumerate(zip(asked, results, strict=True))
             ]
         row = own.tell(results)
-        if own.done:
-            break
     assert row["chosen"] == "first" and same_bits(own.policy, own._first)
 
 
@@ -92,16 +89,8 @@ def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
     assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
 
 
-def after_its_first_rollouts() -> Any:
-    """An optimiser that began with a law that is better than no control."""
-    better, *_ = told()
-    own = optimiser(rollouts=7, judging=3, first=better.policy)
-    own.tell([measured(asked) for asked in own.ask()])
-    return own
-
-
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
-    own = after_its_first_rollouts()
+    own, *_ = told(better=True, rollouts=7, judging=3)
     before, final = own._first + 1e-6, own._first + 2e-6
     own._progress.policy = final
     asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
@@ -122,7 +111,7 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
     more: float,
 ) -> None:
     """What a law is renewed from may tell less of the plant than what is known already."""
-    own = after_its_first_rollouts()
+    own, *_ = told(better=True, rollouts=7, judging=3)
     before, final, row = own._first + 1e-6, own._first + 2e-6, dict[str, Any]()
     own._progress.policy = final
     first = [record.cost for record in own._of(own._first)]
@@ -150,7 +139,7 @@ def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_bett
     lost: bool,
 ) -> None:
     """Of a last law that beats no control, and of one that diverged once."""
-    own = after_its_first_rollouts()
+    own, *_ = told(better=True, rollouts=7, judging=3)
     own._progress.safe, final = False, own._first + 1e-6
     row = {"chosen": "adapted", "reason": "", "predicted_change": -1.0, "deviation": 0.1}
     own._progress.policy, level = final, own._records.all()[0].cost
@@ -194,7 +183,7 @@ def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_aga
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model_based_sensed, "sensed_from", late)
         own, models = optimiser(rollouts=7), []
-        while not own.done:
+        for _ in range(4):
             row = own.tell([measured(asked) for asked in own.ask()])
             models.append(row.get("model"))
     assert models[2] == "innovations" and models[3] == "sensed"

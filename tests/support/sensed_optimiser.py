@@ -86,12 +86,17 @@ def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -
 
 
 @cache
-def _told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
-    own = optimiser(**given)
+def _told(better: bool, **given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
+    own = optimiser(**given, first=_told(better=False)[0].policy if better else None)
     results = [measured(asked) for asked in own.ask()]
     return own, results, dict(own.tell(results))
 
 
-def told(**given: int) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
-    """A copy of an optimiser after its first rollouts, these, and its row: most of what it does."""
-    return copy.deepcopy(_told(**given))
+def told(
+    better: bool = False, **given: int
+) -> tuple[Optimizer, list[RolloutResult], dict[str, Any]]:
+    """A copy of an optimiser after its first rollouts, these, and its row: most of what it does.
+
+    better: whether it began with a law that is better than no control.
+    """
+    return copy.deepcopy(_told(better, **given))
