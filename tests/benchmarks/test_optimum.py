@@ -29,7 +29,10 @@ from tests.support.plants import Advection, plant_of
 from tests.support.small import SMALL
 
 FIELDS = 2
-GIVEN = {"fields": 4, "tolerance": 1e-6, "jobs": 1}
+SIZE = {"horizon": 12, "n_a": 2, "integration_time": 0.01}
+"""The small problem with fewer numbers to descend in: what a limit is does not depend on them."""
+SETTINGS = [f"{name}={value}" for name, value in SIZE.items()]
+GIVEN = {"fields": 4, "tolerance": 1e-6, "jobs": 1, "settings": SETTINGS}
 
 
 def test_open_inputs_of_a_linear_plant_are_those_of_the_least_squares_problem():
@@ -95,7 +98,7 @@ def limits(tmp_path_factory) -> tuple[Path, dict]:
 
 
 def values_of(**changes):
-    return {**load_parameters(str(SMALL), {}), "evaluation_fields": FIELDS, **changes}
+    return {**load_parameters(str(SMALL), SIZE), "evaluation_fields": FIELDS, **changes}
 
 
 def test_the_limits_are_optima(limits):
@@ -173,6 +176,7 @@ def test_a_law_has_the_order_that_is_asked_for():
 def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_path):
     options = ["--seeds", "1", "--fields", "2", "--evaluation-fields", "1"]
     given = ["optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]
+    given += ["--settings", *SETTINGS]
     assert run(parser, [*given, "--save", str(tmp_path / "x")]) == 0
     shown = capsys.readouterr()
     assert "small" in shown.out and "optimum of class" in shown.out
