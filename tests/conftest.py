@@ -24,6 +24,7 @@ from pde_sim_node.plants.loading import OWN_PLANTS
 from tests.support import leftovers
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.compiled import COMPILED
+from tests.support.forked_workers import fork_workers
 from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
 from tests.support.small import RECORDED, REPRODUCED, SMALL
@@ -197,6 +198,12 @@ def loop(tmp_path: Path) -> Iterator[Processes]:
         yield running
     assert running.left_behind() == []
     assert shared_memory() <= before
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools of this test have worker processes that are forked, not executed."""
+    fork_workers(monkeypatch)
 
 
 @pytest.fixture(scope="session")

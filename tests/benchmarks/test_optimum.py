@@ -24,6 +24,7 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.cli import run
 from pdeloop.gradients import Gradients
+from tests.support.forked_workers import fork_workers
 from tests.support.made_once import made_once
 from tests.support.plants import Advection, plant_of
 from tests.support.small import SMALL
@@ -91,7 +92,9 @@ def limits(tmp_path_factory) -> tuple[Path, dict]:
 
     def make(folder: Path) -> tuple[Path, dict]:
         given = {**GIVEN, "evaluation_fields": FIELDS}
-        (result,) = optimum.run([str(SMALL)], **given, seeds=2, save=folder)
+        with pytest.MonkeyPatch.context() as patch:
+            fork_workers(patch)
+            (result,) = optimum.run([str(SMALL)], **given, seeds=2, save=folder)
         return folder, result
 
     return made_once(tmp_path_factory, "limits", make)
@@ -173,6 +176,7 @@ def test_a_law_has_the_order_that_is_asked_for():
         assert U.shape[1] == order and theta.shape[1] == order + 1
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_path):
     options = ["--seeds", "1", "--fields", "2", "--evaluation-fields", "1"]
     given = ["optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]

@@ -178,7 +178,7 @@ def _problem(varying: dict[tuple[int, int, int, bool], float], sigma: float) -> 
     model, rng = _model(varying), np.random.default_rng(4)
     x = np.arange(model.n_z) / model.n_z
     drawn = rng.uniform(-1, 1, (4, 5))
-    actions = 2.0 * rng.standard_normal((4, 40, 3))
+    actions = 2.0 * rng.standard_normal((4, 30, 3))
     fields = [
         2.0 * a * np.cos(2 * np.pi * (x - b)) + c * np.cos(4 * np.pi * (x - d)) + e
         for a, b, c, d, e in drawn

@@ -18,8 +18,8 @@ from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
 from tests.support.sensed import SENSORS
 
-FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=8, sensed_last_iterations=20)
-T = 16
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=5, sensed_last_iterations=8)
+T = 12
 Array = np.ndarray
 
 

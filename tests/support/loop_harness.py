@@ -179,10 +179,12 @@ def run_main(
         exec(code, {"__name__": "__main__"})
         return
     from tests.support.forked_nodes import fork_nodes
+    from tests.support.forked_workers import fork_workers_here
     from tests.support.preloaded import MAINS
 
     if name == "pdeloop":
         fork_nodes(log.parent)
+        fork_workers_here()
     sys.argv = [name, *arguments]
     sys.exit(MAINS[name]())
 
@@ -250,7 +252,7 @@ class Processes:
 
     def pdeloop(self, *arguments: str) -> Any:
         """Start the command line."""
-        if self.forks and arguments[0] not in ("reproduce", "study"):  # they have their own workers
+        if self.forks:
             return self._fork(self._new_log("pdeloop"), "pdeloop", *arguments)
         return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
 

@@ -148,6 +148,7 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
     assert words in sentence
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_an_interrupted_reproduction_continues_to_the_same_bits(reproduction, tmp_path, capsys):
     whole, _ = reproduction
     out = tmp_path / "out"

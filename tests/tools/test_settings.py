@@ -111,6 +111,7 @@ def test_evaluate_has_the_policies_under_another_parameter(
         refused(capsys, words, "evaluate", str(trained), "--set", setting)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_study_and_reproduce_set_a_parameter_of_all_trainings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -177,6 +177,7 @@ def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any
         Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_the_command_runs_continues_and_refuses_another_study(
     reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -235,6 +236,7 @@ def test_code_that_a_study_names_lies_beside_it_not_beside_its_problems(tmp_path
     assert Study.of(study.content()).variants == study.variants
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_the_command_takes_an_own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PDELOOP_EQUATIONS", "")  # to be as it was after the test
     monkeypatch.chdir(tmp_path)
