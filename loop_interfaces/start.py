@@ -26,6 +26,9 @@ LEAST_ADDRESS_SPACE = 2 * 2**30
 asks for it for ever, deaf to signals, and other libraries fail in words that do not name the cause."""
 PARENT = "PDELOOP_PARENT"
 """The environment variable with the id of the process that started a node, with which it ends."""
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+"""The environment variable with how many there are. Results have those of one (`one_thread`): the others
+would begin with each process, and spin for work that does not come."""
 _PR_SET_PDEATHSIG = 1
 _EXTRAS = {
     "rosbags": "record",
@@ -52,6 +55,7 @@ def begin(program: str) -> None:
     another: so none is raised.
     """
     leave_out_working_directory()
+    os.environ.setdefault(BLAS_THREADS, "1")
     _open_streams()
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:

@@ -10,6 +10,8 @@ import pytest
 from threadpoolctl import ThreadpoolController, threadpool_info, threadpool_limits
 
 from loop_interfaces import one_thread
+from loop_interfaces.start import BLAS_THREADS
+from tests.support.interpreter import python
 
 
 def threads() -> set[int]:
@@ -47,3 +49,20 @@ def test_libraries_are_looked_for_again_when_modules_were_imported(
     with one_thread.one_thread():
         assert threads() == {1}
     assert len(looked) == 2
+
+
+STARTED = """
+from loop_interfaces.start import begin
+begin("a process")
+import scipy.linalg
+from threadpoolctl import threadpool_info
+print(*{pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"})
+"""
+
+
+def test_a_process_begins_with_one_unless_the_user_wants_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv(BLAS_THREADS, raising=False)
+    assert python("-c", STARTED).stdout == "1\n"
+    assert python("-c", STARTED, **{BLAS_THREADS: "2"}).stdout == "2\n"

@@ -31,7 +31,7 @@ import pytest
 import pdeloop.domain
 import pdeloop.live
 from loop_interfaces.isolation import loopback_environment
-from loop_interfaces.start import die_with
+from loop_interfaces.start import BLAS_THREADS, die_with
 from pde_sim_node import run_record
 from pdeloop import supervisor
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
@@ -128,6 +128,7 @@ def forked(target: Callable[..., None], *given: Any) -> Any:
     process = FORKING.Process(target=target, args=given)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+        patch.setenv(BLAS_THREADS, "1")  # as what is forked from it would have it
         process.start()
     return process
 
