@@ -27,8 +27,8 @@ asks for it for ever, deaf to signals, and other libraries fail in words that do
 PARENT = "PDELOOP_PARENT"
 """The environment variable with the id of the process that started a node, with which it ends."""
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
-"""The environment variable with how many there are. Results have those of one (`one_thread`): the others
-would begin with each process, and spin for work that does not come."""
+"""The environment variable with their number. Results are those of one (`one_thread`): the others would
+begin with each process, and spin for work that does not come."""
 _PR_SET_PDEATHSIG = 1
 _EXTRAS = {
     "rosbags": "record",

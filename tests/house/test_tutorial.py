@@ -10,8 +10,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from tests.support.small import FEW_FITS
+
 NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "tutorial.ipynb"
-FEWER = {"ROLLOUTS": 9, "ITERATIONS": 3, "SIZE": {"n_z": 32, "horizon": 30}}
+FEWER = {"ROLLOUTS": 9, "ITERATIONS": 3, "SIZE": {"n_z": 32, "horizon": 30, **FEW_FITS}}
 
 
 def test_the_cells_of_the_tutorial_run() -> None:

@@ -71,6 +71,7 @@ def refused(task: Callable[[], Any]) -> str | None:
     return None
 
 
+@pytest.mark.usefixtures("read_once")
 def test_damaged_policies_are_refused_in_one_sentence(run):
     folder, path = RunFolder(run), run / "policy.npz"
     good = path.read_bytes()
@@ -92,7 +93,15 @@ def test_damaged_policies_are_refused_in_one_sentence(run):
         assert (refused(folder.policies) or "").startswith(f"{path} cannot be read (")
 
 
+@pytest.fixture
+def read_once(run, monkeypatch) -> None:
+    """The parameters, which are not damaged, are not read again for each damage."""
+    known = RunFolder(run).values()
+    monkeypatch.setattr(RunFolder, "values", lambda _: dict(known))
+
+
 @by_both
+@pytest.mark.usefixtures("read_once")
 def test_a_damaged_result_is_refused_in_one_sentence(run):
     folder, path = RunFolder(run), run / "result.json"
     good = json.loads(path.read_text())
