@@ -18,7 +18,8 @@ from tests.simulation.history import History
 from tests.simulation.plan import KINDS, Fault, Plan, aimed, draw
 from tests.simulation.planted import BUGS, OPEN, found, planted
 
-SEEDS = 60
+SEEDS = 50
+"""A sample, as of the bugs below; `.ci/run` has thousands of seeds, and all bugs."""
 
 
 def test_a_training_with_faults_ends_with_the_same_bits_or_names_the_cause():
@@ -29,7 +30,7 @@ def test_a_training_with_faults_ends_with_the_same_bits_or_names_the_cause():
 
 
 def test_messages_for_nobody_change_nothing_and_late_contradictions_are_never_overlooked():
-    plans = [aimed(seed) for seed in range(30)]
+    plans = [aimed(seed) for seed in range(20)]
     ends = Counter(audit(plan).split(":")[0] for plan in plans)
     assert set(ends) == {"same bits", "error"}
 
@@ -38,10 +39,7 @@ def test_messages_for_nobody_change_nothing_and_late_contradictions_are_never_ov
     "name",
     [
         "plant: late actions",
-        "plant: late actions, if signed",
-        "plant: late starts",
         "tuner: costs that are taken back",
-        "controller: states of another episode",
         "controller: a memory that it has not",
     ],
 )

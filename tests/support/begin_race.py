@@ -1,10 +1,11 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Two processes that begin a training in one folder, in every order of what they write.
 
-`python -m tests.support.begin_race FOLDER` forks two processes, A and B, for all n and m: A is
-let up to its n-th call that changes the folder or locks it, then B up to its m-th, then A to its end,
-then B. It prints a line of JSON: how many orders there were, and a sentence for each after which the
-folder does not tell of one training, that of the one process that was let begin.
+`python -m tests.support.begin_race [--every N]` forks two processes, A and B, for all n and m, or
+only for each N-th m: A is let up to its n-th call that changes the folder or locks it, then B up to its
+m-th, then A to its end, then B. It prints a line of JSON: how many orders there were, and a sentence
+for each after which the folder does not tell of one training, that of the one process that was let
+begin. Its exit code is 1 if there is such a sentence.
 
 It does so for each way to begin: `run` begins as a tuner does, `create` as the command line does, which
 starts a tuner afterwards.
@@ -12,12 +13,14 @@ starts a tuner afterwards.
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import gc
 import json
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -30,6 +33,8 @@ from tuner_node.run_folder import RunFolder, RunFolderError
 from tuner_node.run_store import RunWriter, open_run
 from tuner_node.training import Training
 
+MEMORY_DISK = Path("/dev/shm")
+"""There fsync does not wait."""
 POINTS = ("open", "replace", "unlink", "mkdir")
 """Calls before which a process waits; with them the taking of a lock."""
 
@@ -128,8 +133,8 @@ def judged(folder: Path, codes: tuple[int, int]) -> str:
     return ""
 
 
-def run(place: Path) -> dict[str, dict[str, Any]]:
-    """Every order of every way to begin."""
+def run(place: Path, every: int = 1) -> dict[str, dict[str, Any]]:
+    """Every order, or a sample, of every way to begin."""
     VALUES.update(parameters())
     TRAININGS.update((seed, build_training({**VALUES, "seed": seed})) for seed in (0, 1))
     # What each of them loads, those that are forked find there.
@@ -137,14 +142,14 @@ def run(place: Path) -> dict[str, dict[str, Any]]:
         first = {**VALUES, "out": str(place / "first"), "resume": False}
         open_run(first, build_training(first), locks, print)
     gc.disable(), gc.freeze()  # what a forked process touches is copied
-    return {how: every_order(place, how) for how in ("run", "create")}
+    return {how: orders_of(place, how, every) for how in ("run", "create")}
 
 
-def every_order(place: Path, how: str) -> dict[str, Any]:
-    """Every order of one way to begin."""
+def orders_of(place: Path, how: str, every: int) -> dict[str, Any]:
+    """The orders of one way to begin. Of each n the first m is another one, so that all m occur."""
     wrong, orders, n, last = [], 0, 0, False
     while not last:
-        m, ended = 0, False
+        m, ended = n % every, False
         while not ended:
             folder = place / "run"
             shutil.rmtree(folder, ignore_errors=True)
@@ -159,10 +164,22 @@ def every_order(place: Path, how: str) -> dict[str, Any]:
             orders += 1
             if sentence := judged(folder, codes):
                 wrong.append(f"A after {n} calls, B after {m}: {sentence}")
-            m += 1
+            m += every
         n += 1
     return {"orders": orders, "wrong": wrong}
 
 
+def command() -> int:
+    """1 if a folder told of something else than one training."""
+    words = argparse.ArgumentParser(prog="python -m tests.support.begin_race")
+    words.add_argument("--every", type=int, default=1, metavar="N", help="only each N-th order")
+    every = words.parse_args().every
+    where = MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=where) as place:
+        result = run(Path(place), every)
+    print(json.dumps(result))
+    return int(any(found["wrong"] for found in result.values()))
+
+
 if __name__ == "__main__":
-    print(json.dumps(run(Path(sys.argv[1]))))
+    sys.exit(command())

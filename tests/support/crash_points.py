@@ -1,9 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Trainings that are killed, or refused by the disk, at each call that concerns their folder.
 
-`python -m tests.support.crash_points [KIND ...] [--every N]` trains a small problem once undisturbed.
-Then, for each n until a training comes to its end, or only for each N-th, it lets the n-th call fail in
-each of these ways:
+`python -m tests.support.crash_points [KIND ...] [--most N]` trains a small problem once undisturbed.
+Then, for each n until a training comes to its end, or for N of them in each way, it lets the n-th call
+fail in each of these ways:
 
 kill     SIGKILL before the call; the training that continues is killed once more. Not after fsync,
          which changes nothing that a killed process leaves
@@ -209,7 +209,7 @@ class Judge:
         return (self._place / "calls").read_text().split()
 
 
-def run(place: Path, kinds: tuple[str, ...], every: int = 1) -> dict[str, Any]:
+def run(place: Path, kinds: tuple[str, ...], most: int = 10**6) -> dict[str, Any]:
     """The failures, one after the other."""
     first_training(place)
     gc.freeze()  # what a fork touches is copied
@@ -218,9 +218,14 @@ def run(place: Path, kinds: tuple[str, ...], every: int = 1) -> dict[str, Any]:
         if disk:
             stack.callback(disk.close)
         judge = Judge(place, disk)
-        failures = [(n, kind) for kind in kinds for n in judge.failures(kind)[::every]]
+        failures = [(n, kind) for kind in kinds for n in sample(judge.failures(kind), most)]
         wrong = [sentence for n, kind in failures if (sentence := judge.judged(n, kind))]
     return {"failures": Counter(kind for _, kind in failures), "wrong": wrong}
+
+
+def sample(numbers: list[int], most: int) -> list[int]:
+    """As many of them, from the first to the last."""
+    return numbers[:: -(-len(numbers) // most)]
 
 
 def first_training(place: Path) -> None:
@@ -240,11 +245,13 @@ def command() -> int:
     possible = [kind for kind in KINDS if kind != "power" or mountable("mkfs.ext4")]
     words = argparse.ArgumentParser(prog="python -m tests.support.crash_points")
     words.add_argument("kinds", nargs="*", default=possible, metavar="KIND", help=", ".join(KINDS))
-    words.add_argument("--every", type=int, default=1, metavar="N", help="only each N-th call")
+    words.add_argument(
+        "--most", type=int, default=10**6, metavar="N", help="only so many calls of each kind"
+    )
     given = words.parse_args()
     where = MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=where) as place:
-        result = run(Path(place), tuple(given.kinds), given.every)
+        result = run(Path(place), tuple(given.kinds), given.most)
     print(json.dumps(result))
     return int(bool(result["wrong"]))
 
