@@ -24,6 +24,7 @@ from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
 from tests.support.loop_harness import ROOT, Processes, until
 from tests.support.small_loop import LIMIT
+from tests.support.undrawn import report
 from tests.topics.test_foreign import PLANT, documented_command
 
 pytestmark = pytest.mark.topics
@@ -68,7 +69,7 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     assert result["controller"] == {"nodes": ["/saturated_controller"], "law": "not seen"}
     refused = loop.wait(loop.pdeloop("evaluate", str(out)), LIMIT, code=1)
     assert "had another control law than the built-in one (its controller: /saturated" in refused
-    shown = loop.wait(loop.pdeloop("report", str(out)), LIMIT)
+    shown = report(loop, out, LIMIT)
     assert "not shown: Behaviour" in shown and "(its controller: /saturated_controller)" in shown
     assert (out / "report" / "training-curves.png").exists()
 

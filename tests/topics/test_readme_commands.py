@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.support.loop_harness import Processes
+from tests.support.undrawn import report
 
 pytestmark = pytest.mark.topics
 LIMIT = 240.0
@@ -18,7 +19,7 @@ LIMIT = 240.0
 
 def pdeloop(loop: Processes, *words: object) -> str:
     # As a user starts them, where the libraries they load, and when, decide on bits.
-    loop.forks = words[0] in ("identify", "report")
+    loop.forks = words[0] == "identify"
     return loop.wait(loop.pdeloop(*map(str, words)), LIMIT)
 
 
@@ -47,6 +48,7 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
     result = json.loads((run / "result.json").read_text())
     assert costs["adapted"] == result["costs_by_field"]["adapted"]
 
-    pdeloop(loop, "report", run)
+    loop.forks = True
+    report(loop, run, LIMIT)
     (page,) = run.rglob("*.html")
     assert "burgers" in page.read_text()
