@@ -3,17 +3,17 @@
 
 >>> import numpy as np
 >>> class Chain(Dynamics):
-...     n_z, n_a, horizon = 64, 2, 30
-...     A = 0.9 * np.eye(64) + 0.05 * np.eye(64, k=1) + 0.05 * np.eye(64, k=-1)
-...     B = np.eye(64, 2)
+...     n_z, n_a, horizon = 16, 2, 30
+...     A = 0.9 * np.eye(16) + 0.05 * np.eye(16, k=1) + 0.05 * np.eye(16, k=-1)
+...     B = np.eye(16, 2)
 ...
 ...     def initial_state(self, rng):
-...         return rng.normal(size=64)
+...         return rng.normal(size=16)
 ...
 ...     def step(self, z, a):
 ...         return self.A @ z + self.B @ a
 >>> import pdeloop
->>> run = pdeloop.train(plant=Chain(), reduced_order=4, rollouts=20)
+>>> run = pdeloop.train(plant=Chain(), reduced_order=4, rollouts=12)
 >>> bool(run.costs["adapted"].mean() < run.costs["none"].mean())
 True
 """

@@ -32,7 +32,7 @@ from tests.support.small import same_bits
 
 Array = np.ndarray
 FIELD = 11
-FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=4)
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=2)
 """For readings that no equation explains, on which iterations are spent in vain."""
 
 
@@ -68,7 +68,7 @@ def _step(model: SpectralModel, z: Array, a: Array) -> Array:
 
 
 def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=24)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=18)
     plant = problem.plant()
     explored, excited = problem.explore(1000)
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
@@ -115,7 +115,7 @@ def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
 
 def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
     """u_t = 0.0025 u_xx + 5 u - 5 u^3 on a domain of length 2."""
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=50, measurement_noise=0.03)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=40, measurement_noise=0.03)
     model, _, error = _fitted(problem, 1000)
     assert error < 1e-4
     small, none = 1e-3, np.zeros(model.B.shape[1])
@@ -160,7 +160,7 @@ def _coefficients(model: SpectralModel) -> Array:
 
 def test_the_burgers_equation_is_found_from_fronts() -> None:
     """u_t = -u u_x + nu u_xx; nu is that of a coarse grid."""
-    problem = pdeloop.problem("burgers", sensors=16, horizon=12, measurement_noise=0.03)
+    problem = pdeloop.problem("burgers", sensors=16, horizon=10, measurement_noise=0.03)
     plant = problem.plant()
     explored, actions = problem.explore(1000)
     uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])

@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from loop_method.models.sensed import sensed_model
 from loop_method.models.sensed_fit import few_rollouts, fit_sensed
 from loop_method.models.sensed_unknowns import TERMS, unknowns
+from loop_method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 
 STEPS, N_A = 30, 3
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=5)
+"""Most are spent in vain, on the calmest rollouts."""
 
 
 def test_a_fit_begins_with_the_calmest_rollouts_and_then_with_the_largest_inputs() -> None:
@@ -35,6 +40,6 @@ def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_i
     readings = [*1e-3 * random.normal(size=(2, STEPS, SENSORS))]
     readings += [readings_of(model, a, z) for a, z in zip(actions[2:], fields, strict=True)]
     assert set(few_rollouts(np.stack(readings), actions, 1)[0]) == {0, 1}
-    _, _, alone = fit_sensed(readings[:2], list(actions[:2]), DECLARED)
-    _, _, error = fit_sensed(readings, list(actions), DECLARED)
+    _, _, alone = fit_sensed(readings[:2], list(actions[:2]), DECLARED, settings=FEW_ITERATIONS)
+    _, _, error = fit_sensed(readings, list(actions), DECLARED, settings=FEW_ITERATIONS)
     assert alone == np.inf and error < 1e-4

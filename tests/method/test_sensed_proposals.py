@@ -20,7 +20,7 @@ from pdeloop.episode import rollout
 from tests.support.sensed import SENSORS, equally_spaced
 from tests.support.small import same_bits
 
-FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=4)
+FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=2)
 """For readings that no equation explains, on which iterations are spent in vain."""
 
 
