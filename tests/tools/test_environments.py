@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import pdeloop
 from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import Environment, VectorEnvironment, environment_id
+from tests.support.loop_harness import forked
 from tests.support.small import same_bits
 
 BURGERS = "pdeloop/Burgers-v0"
@@ -376,8 +378,9 @@ def test_the_module_in_the_id_is_imported_where_nobody_has_done_it() -> None:
 
 def test_processes_of_their_own_have_the_same_bits() -> None:
     how = {"num_envs": 2, "action_limit": 0.5, **GRID}
+    forked(os.getpid).join()  # what they are forked from is there, and has everything loaded
     apart = gymnasium.make_vec(
-        BURGERS, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **how
+        BURGERS, vectorization_mode="async", vector_kwargs={"context": "forkserver"}, **how
     )
     try:
         batch = gymnasium.make_vec(BURGERS, **how)
