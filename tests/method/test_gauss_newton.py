@@ -17,7 +17,7 @@ from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.models.denoising import denoised
 from tests.support.lifted_plant import N_A, N_S, N_Z, Plant, make, mean_cost, measure, same_state
-from tests.support.small import parameters, same_bits, train_here
+from tests.support.small import FEW_FITS, parameters, same_bits, train_here
 
 
 def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
@@ -244,7 +244,7 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
 
 def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() -> None:
     size = {"n_z": 64, "n_a": 2, "reduced_order": 34, "horizon": 80}
-    training = train_here(parameters(optimizer="gauss_newton", rollouts=14, **size))
+    training = train_here(parameters(optimizer="gauss_newton", rollouts=14, **size, **FEW_FITS))
     assert training.policies().shape == (1, 2, 68)
     _, lqt, adapted = training.evaluation.mean(axis=2)[0]
     assert adapted < lqt

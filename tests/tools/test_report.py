@@ -21,7 +21,7 @@ from pdeloop.report.learning import EDGE, steps
 from tests.support.browser import browser
 from tests.support.loop_harness import processes
 from tests.support.made_once import made_once
-from tests.support.small import SMALL
+from tests.support.small import FEW_FITS, SMALL
 
 LIMIT = 300.0
 FIGURES = (
@@ -48,7 +48,8 @@ def reported(base: Path, reproduced: Path | None) -> Path:
     out = reproduced or base / "out"
     with processes(base) as running:
         if not reproduced:
-            options = ("--in-process", "--rollouts", "21", "--optimizer", "gauss_newton")
+            few = [word for n, value in FEW_FITS.items() for word in ("--set", f"{n}={value}")]
+            options = ("--in-process", "--rollouts", "21", "--optimizer", "gauss_newton", *few)
             words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
             running.wait(running.pdeloop(*words), LIMIT)
         running.wait(running.pdeloop("report", str(out)), LIMIT)

@@ -49,6 +49,9 @@ def test_nodes_started_in_any_order_find_each_other_and_train(loop: Processes, t
 
 def test_python_trains_over_topics_as_in_one_process(loop: Processes, tmp_path):
     program = (
+        "from pathlib import Path\n"
+        "from tests.support.forked_nodes import fork_nodes\n"
+        "fork_nodes(Path.cwd())\n"
         f"import pdeloop; pdeloop.train({str(SMALL)!r}, iterations=6, seeds=2, seed=3,"
         f"over_topics=True, out={str(tmp_path / 'run')!r})"
     )
