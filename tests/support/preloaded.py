@@ -19,7 +19,10 @@ from type_description_interfaces.srv import GetTypeDescription
 
 import controller_node.node
 import pde_sim_node.node
+import pdeloop.bags.verify  # noqa: F401
 import recorder_node.node
+import tests.support.forked_nodes
+import tests.support.forked_workers
 import tests.support.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
