@@ -42,8 +42,8 @@ def estimated_laws(
     weights: Array,
     settings: ModelBasedSettings,
     models: FieldModelSettings,
-) -> tuple[list[Array], int]:
-    """Theta of laws on the estimate, and the steps of L-BFGS that they took; none if none is finite.
+) -> tuple[list[Array], Array, int]:
+    """Theta of laws on the estimate, their modes and the steps of L-BFGS; none if none is finite.
 
     That of the whole field, and one that is optimised with noise on what it sees, so that it depends
     less on what an estimate has wrong; each with filters that know the initial fields well, and less.
@@ -52,7 +52,7 @@ def estimated_laws(
     assert isinstance(model, SensedModel)
     whole = whole_field_law(loop, fields, weights, settings, settings.filter_modes)
     if whole is None:
-        return [], 0
+        return [], np.empty((0, 0)), 0
     size = root_mean_square(model.spread)
     noise = noise_of_filter(model, settings)
     filters = [
@@ -69,7 +69,7 @@ def estimated_laws(
             theta, steps = better.theta, steps + better.steps
         K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
         found += [law.theta_of(K, b, known, models) for known in filters]
-    return found, steps
+    return found, whole.loop.U, steps
 
 
 def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
@@ -128,9 +128,16 @@ def root_mean_square(spread: Array) -> float:
 
 
 def simulate_estimated(
-    loop: ClosedLoop, law: ExtendedKalman, theta: Array, fields: Array
+    loop: ClosedLoop,
+    law: ExtendedKalman,
+    theta: Array,
+    fields: Array,
+    gains: list[Array] | None = None,
 ) -> Simulation:
-    """Roll the law's vector theta out from the fields (F, n); the simulation has no features."""
+    """Roll the law's vector theta out from the fields (F, n); the simulation has no features.
+
+    gains: where the filter's gain in each step, (F, n, n_y), is added.
+    """
     parts, model = law.parts(theta), loop.model
     assert isinstance(model, SensedModel)
     T, count = loop.horizon, len(fields)
@@ -151,6 +158,8 @@ def simulate_estimated(
             s = y @ law.model.U
             p = p if k else s
             x, S = known.measured(x, S, y)
+            if gains is not None:
+                gains.append(known.gain(S))
             a = x @ parts["K_e"].T + p @ parts["K"].T + s @ parts["D"].T + parts["b"]
             if loop.action_limit:
                 np.clip(a, -loop.action_limit, loop.action_limit, out=a)

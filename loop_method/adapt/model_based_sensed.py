@@ -4,8 +4,10 @@
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`; its result is used only if it is cheaper on other draws,
-or hardly dearer with a filter that trusts the equation less.
+current law and those of `observer_design`; a law on an estimate is also improved through its filter.
+Laws are compared on other draws, on the plants of this equation and of the ones believed before it: in
+simulations of the filter's own equation what trusts it looks too good. The cheapest is used, or one
+that is hardly dearer with a filter that trusts the equation less.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
 between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
 law that measured better than the final one is returned in its place.
@@ -15,16 +17,18 @@ Where no equation reproduces the rollouts, it continues with a model of the read
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.estimate import Estimate, mean_of
 from loop_method.adapt.estimated_loop import estimated_laws, least_trusting
+from loop_method.adapt.filtered_loop import improve_through_filter
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
@@ -47,6 +51,8 @@ from loop_method.adapt.verdict import (
 from loop_method.adapt.whole_field_law import whole_field_law
 from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.models.sensed import SensedModel
+from loop_method.models.sensed_ensemble import SensedEnsemble, ensemble
+from loop_method.models.sensed_unknowns import unknowns
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
 OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
@@ -55,6 +61,13 @@ OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
 
 class ModelBasedSensed(ModelBasedReadings):
     """`ModelBasedReadings`, on a model of the field as long as one reproduces the readings."""
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        super().restore(state)
+        expected = unknowns(self._context.exploration.actions.shape[1])
+        for shared in self._progress.equations:
+            if len(shared) != expected:
+                raise ValueError(f"its equations have {len(shared)} unknowns; expected {expected}")
 
     @property
     def _sensed(self) -> SensedModel | None:
@@ -119,6 +132,7 @@ class ModelBasedSensed(ModelBasedReadings):
             super()._improve(belief, row, final)
             return
         loop, fields = sensed_loop(self._context, belief.model), self._fields()
+        plants = replace(loop, model=self._plants(belief.model))
         progress, settings, law = self._progress, self._settings, self._context.law
         # A law with memory has many parameters, and simulations cost no rollout.
         sets = settings.observer_draws if final else 1
@@ -128,27 +142,58 @@ class ModelBasedSensed(ModelBasedReadings):
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
-            models = self._context.field_models
-            further, more = estimated_laws(loop, law, every, weights, settings, models)
+            many = weighted(
+                fields, self._drawn(fields, settings.filter_draws, 2), settings.measured_share
+            )
+            further, more = self._on_estimates(loop, plants, law, (every, weights), many)
             laws, steps = [*laws, *further], steps + more
         if not laws:
             row["reason"] = "no law is finite on the model; the law stays"
             return
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
-        theta = cheapest(loop, [now, *laws], held_out, equal)
+        theta = cheapest(plants, [now, *laws], held_out, equal)
         if theta is not now:
             if isinstance(law, ExtendedKalman) and theta.ndim == 1:
-                theta = least_trusting(loop, law, theta, held_out, settings)
+                theta = least_trusting(plants, law, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
-        first = loop.costs(loop.theta(self._first), held_out)
-        none = loop.costs(loop.no_control, held_out)
+        first = plants.costs(loop.theta(self._first), held_out)
+        none = plants.costs(loop.no_control, held_out)
         progress.safe = bool(first.mean() < none.mean())
-        change = gained(loop.costs(theta, held_out), first if progress.safe else none)
+        change = gained(plants.costs(theta, held_out), first if progress.safe else none)
         progress.fraction, progress.change = 1.0, change
         row["steps"] = steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
+
+    def _on_estimates(
+        self,
+        loop: SensedLoop,
+        plants: SensedLoop,
+        law: ExtendedKalman,
+        designed_from: tuple[Array, Array],
+        improved_from: tuple[Array, Array],
+    ) -> tuple[list[Array], int]:
+        """Laws on an estimate and their steps: those designed, and the cheapest one improved.
+
+        designed_from, improved_from: initial fields and their weights. Through its filter a law is
+        improved on the plants of several equations alone: on that of the filter it looks too good.
+        """
+        settings, models = self._settings, self._context.field_models
+        laws, modes, steps = estimated_laws(loop, law, *designed_from, settings, models)
+        assert isinstance(plants.model, SensedEnsemble)
+        if not laws or len(plants.model.members) < 2:
+            return laws, steps
+        best = cheapest(plants, laws, *designed_from)
+        best, more = improve_through_filter(plants, law, best, modes, *improved_from, settings)
+        return [*laws, best], steps + more
+
+    def _plants(self, model: SensedModel) -> SensedEnsemble:
+        """The model, and the equations that were believed before it, to which it is added."""
+        known, most = self._progress.equations, self._settings.filter_equations - 1
+        earlier = known[max(len(known) - most, 0) :]
+        self._progress.equations = [*earlier, model.shared.copy()]
+        return ensemble(model, earlier[::-1], self._context.field_models)
 
     def _drawn(self, fields: Array, sets: int, which: int) -> Array:
         """Draws from the distribution of the fields, as often as there are sets."""

@@ -178,6 +178,18 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         10.0,
     )
+    filter_iterations: int = setting(
+        30, "as iterations, for a law on an estimate that is improved through its filter", 1, 10_000
+    )
+    filter_draws: int = setting(
+        4, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
+    )
+    filter_equations: int = setting(
+        3,
+        "equations, the newest and those before it, on which laws on an estimate are compared",
+        1,
+        100,
+    )
     filter_margin: float = setting(
         0.03,
         "largest relative increase of the cost on the model with which a filter that trusts the "

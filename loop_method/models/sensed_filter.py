@@ -67,10 +67,14 @@ class SensedFilter:
         n = self.model.n_z
         return field_of(self.mean, n), field_of(self.factor, n)
 
+    @cached_property
+    def sigma(self) -> float:
+        """That of the noise, but large enough to divide by."""
+        return max(self.noise, _LEAST * float(np.abs(self.factor).max()), 1e-12)
+
     def measured(self, x: Array, S: Array, y: Array) -> tuple[Array, Array]:
         """After a reading: x (M, n), S (M, 33, n) and y (M, n_y)."""
-        seen = self.model.seen
-        sigma = max(self.noise, _LEAST * float(np.abs(self.factor).max()), 1e-12)
+        seen, sigma = self.model.seen, self.sigma
         H = S[:, :, seen] / sigma
         D = np.eye(H.shape[1]) + H @ H.swapaxes(1, 2)
         missed = (y - x[:, seen]) / sigma
@@ -82,6 +86,11 @@ class SensedFilter:
         x = x + np.einsum("mij,mj,min->mn", vectors, share, S)
         S = (vectors / np.sqrt(values)[:, None]) @ (turned @ S)
         return np.where(lost.reshape(-1, 1), np.nan, x), S
+
+    def gain(self, S: Array) -> Array:
+        """L = S S^T H^T / sigma^2, (M, n, n_y), of S after the reading."""
+        found: Array = S.swapaxes(1, 2) @ (S[:, :, self.model.seen] / self.sigma**2)
+        return found
 
     def predicted(self, x: Array, S: Array, a: Array) -> tuple[Array, Array]:
         """After a step under the actions a (M, n_a)."""

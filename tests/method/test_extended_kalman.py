@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import Context, ModelBased, Trajectory
+from loop_method.adapt import ModelBased
 from loop_method.adapt.estimated_loop import (
     UNPREDICTED,
     estimated_laws,
@@ -19,77 +18,36 @@ from loop_method.adapt.estimated_loop import (
     root_mean_square,
 )
 from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.whole_field_law import whole_field_law
-from loop_method.laws import ExtendedKalman, Law, Observer
+from loop_method.laws import ExtendedKalman, Observer
 from loop_method.laws.base import differentiable
 from loop_method.laws.calls import MAX_NUMBER, action, along
 from loop_method.models.sensed import (
     WAVES,
-    Actuators,
-    SensedModel,
     coefficients_of,
     field_of,
-    sensed_model,
 )
 from loop_method.models.sensed_filter import SensedFilter
-from loop_method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
 from loop_method.models.settings import DEFAULTS
+from tests.support.estimated import (
+    CUBIC,
+    LINEAR,
+    N_A,
+    SEEN,
+    SENSORS,
+    SIGMA,
+    SPREAD,
+    T,
+    context_of,
+    fields,
+    filter_of,
+    loop_of,
+    rows_of,
+)
 from tests.support.small import same_bits
 
 Array = np.ndarray
-SENSORS, N_A, T, N_S = 8, 3, 24, 6
-ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.full(N_A, 0.1))
-SPREAD = np.concatenate([[0.3], *2 * [np.r_[1.0, 0.7, 0.4, np.full(WAVES - 3, 1e-3)]]])
-FACTOR = np.diag(SPREAD)
-SEEN = slice(4, None, 8)
-"""The sensors among the 64 points of the grid."""
-SIGMA = 0.2
-
-
-def model_of(**terms: float) -> SensedModel:
-    """The equation with these terms, like z1_x2 for the second derivative of z."""
-    shared = np.zeros(unknowns(N_A))
-    for name, value in terms.items():
-        p, j = (int(part) for part in name[1:].split("_x"))
-        shared[TERMS.index((p, j))] = value
-    shared[COEFFICIENTS] = 5.0
-    model = sensed_model(shared, SENSORS, ACTUATORS, 4.0, noise=SIGMA)
-    return replace(model, spread=SPREAD)
-
-
-LINEAR = model_of(z1_x0=1.5, z1_x1=20.0, z1_x2=0.5)
-CUBIC = model_of(z1_x0=8.0, z1_x2=0.5, z3_x0=-1.0)
-
-
-def filter_of(
-    model: SensedModel, sigma: float = SIGMA, kappa: float = 1.0, factor: Array = FACTOR
-) -> SensedFilter:
-    return SensedFilter(model, np.zeros(SPREAD.size), factor, sigma, kappa)
-
-
-def rows_of(gain: float = 0.0) -> ModelRows:
-    rng = np.random.default_rng(2)
-    A, B, K = (0.3 * rng.standard_normal(shape) for shape in ((N_S, N_S), (N_S, N_A), (N_A, N_S)))
-    U = np.linalg.qr(rng.standard_normal((SENSORS, N_S)))[0]
-    return ModelRows(A=A, B=B, U=U, K_a=gain * K, K_b=gain * K, s_r=np.zeros(N_S))
-
-
-def context_of(law: Law) -> Context:
-    target, none = np.zeros(SENSORS), np.zeros((T, N_A))
-    seen = Trajectory(np.ones((T + 1, SENSORS)), none)
-    return Context(law.model.U, target, 1.0, 0.1, T, seen, sensors=SENSORS, law=law)
-
-
-def loop_of(model: SensedModel) -> tuple[SensedLoop, ExtendedKalman]:
-    law = ExtendedKalman(rows_of(), T)
-    return sensed_loop(context_of(law), model), law
-
-
-def fields(count: int, seed: int = 0) -> Array:
-    rng = np.random.default_rng(seed)
-    return field_of(SPREAD * rng.standard_normal((count, SPREAD.size)), 64)
 
 
 def test_of_a_linear_equation_it_is_the_kalman_filter() -> None:
@@ -196,7 +154,7 @@ def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> No
     loop, law = loop_of(CUBIC)
     every, weights = fields(24), np.full(24, 1.0 / 24.0)
     settings = ModelBasedSettings(iterations=30, filter_unpredicted=0.0)
-    laws, steps = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    laws, _, steps = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
     assert len(laws) == 4 and steps > 0
     others, equal = fields(20, seed=1), np.full(20, 1.0 / 20.0)
     none = loop.costs(loop.no_control, others) @ equal
@@ -212,7 +170,7 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
     loop, law = loop_of(CUBIC)
     every, weights, trusted = fields(8), np.full(8, 1.0 / 8.0), 0.3
     settings = ModelBasedSettings(iterations=10, filter_unpredicted=trusted)
-    designed, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    designed, _, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
     best = min(designed, key=lambda theta: float(loop.costs(theta, every).mean()))
     parts = dict(law.parts(best))
 

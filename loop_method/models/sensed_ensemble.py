@@ -1,0 +1,62 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Several equations of a field between few sensors, for simulations of what is uncertain in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.models.sensed import SensedModel, sensed_model
+from loop_method.models.settings import FieldModelSettings
+
+
+@dataclass(frozen=True, eq=False)
+class SensedEnsemble(SensedModel):
+    """The newest equation, and earlier ones: environments follow them in turn.
+
+    Its attributes are those of the newest equation, environment i has that of number i modulo their
+    number, and what it is linearised from is the newest one.
+
+    Attributes
+    ----------
+    members : sequence of SensedModel
+        The newest one first.
+    """
+
+    members: Sequence[SensedModel] = field(default=(), kw_only=True)
+
+    def _turns(self, states: Array) -> Iterator[tuple[SensedModel, slice]]:
+        for i, model in enumerate(self.members[: len(states)]):
+            yield model, slice(i, None, len(self.members))
+
+    def step(self, states: Array, actions: Array) -> Array:
+        after = np.empty(states.shape)
+        for model, rows in self._turns(states):
+            after[rows] = model.step(states[rows], actions[rows])
+        return after
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        on_states, on_actions = np.empty(states.shape), np.empty(actions.shape)
+        for model, rows in self._turns(states):
+            on_states[rows], on_actions[rows] = model.pull_back(
+                states[rows], actions[rows], covectors[rows]
+            )
+        return on_states, on_actions
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        return self.members[0].linearise(state, action)
+
+
+def ensemble(
+    model: SensedModel, earlier: Sequence[Array], settings: FieldModelSettings
+) -> SensedEnsemble:
+    """The model, and the equations with these other unknowns, each (44 + n_a,)."""
+    others = [
+        sensed_model(shared, model.sensors, model.actuators, model.largest, settings)
+        for shared in earlier
+    ]
+    parts = {name: getattr(model, name) for name in SensedModel.__dataclass_fields__}
+    return SensedEnsemble(**parts, members=(model, *others))
