@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A test run that is killed leaves no process behind."""
+"""A test run that is killed leaves no process behind; what it forks imports nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.forked_nodes import began
-from tests.support.loop_harness import Processes, until
+from tests.support.loop_harness import Processes, forked, run_main, until
 from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
@@ -50,3 +50,24 @@ def test_all_that_the_tests_started_dies_with_the_process_that_runs_them(
     os.kill(worker.pid, signal.SIGKILL)
     worker.wait()
     until(lambda: not any(map(began, started)), LIMIT, "end of all processes")
+
+
+def imported_by_a_command(log: Path, environment: dict[str, str], found: Path) -> None:
+    """In a forked process: note what it imports until the command begins."""
+    from tests.support import preloaded
+
+    before = set(sys.modules)
+
+    def note() -> int:
+        found.write_text(" ".join(sorted(set(sys.modules) - before)))
+        return 0
+
+    vars(preloaded)["MAINS"] = {"pdeloop": note}
+    run_main("pdeloop", [], log, environment)
+
+
+def test_what_is_forked_has_everything_loaded(loop: Processes, tmp_path: Path) -> None:
+    """Imports of its own would cost each of hundreds of processes a tenth of a second."""
+    found = tmp_path / "imported"
+    forked(imported_by_a_command, tmp_path / "log", loop.environment, found).join()
+    assert found.read_text() == ""
