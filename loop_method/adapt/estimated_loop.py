@@ -3,8 +3,8 @@
 
 The law of the whole field is designed on the model and acts on the filter's estimate of the field as if
 that were the field: certainty equivalence, which is optimal where model and law are linear and the cost
-is quadratic. What is not known of the field in a closed loop is seen in simulations of the model under
-the filter, whose model it is.
+is quadratic. What is not known of the field in a closed loop is seen in simulations under the filter,
+of its own model or of others.
 
 References
 ----------
@@ -86,7 +86,7 @@ def least_trusting(
 ) -> Array:
     """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
-    In simulations the filter's equation is that of the plant: laws that trust it look too good.
+    Plants in simulations follow the filter's equation, or ones like it: what trusts it looks too good.
 
     best: the law on an estimate that is cheapest from these fields.
     """

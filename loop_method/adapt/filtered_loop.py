@@ -25,6 +25,7 @@ Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,21 +42,18 @@ from loop_method.models.sensed_filter import SensedFilter
 
 @dataclass(frozen=True, eq=False)
 class FilteredLoop(ClosedLoop):
-    """Laws of the filter's estimate; theta is [K b].
+    """Laws of the filter's estimate; theta is [K b], and noise the standard deviation of v_k.
 
     Attributes
     ----------
     known : SensedFilter
         g, H and w_0.
-    gains : (T, F, n, n_y) array
-        L_k of each of the fields that are simulated.
-    readings_noise : float
-        Standard deviation of v_k.
+    gains : sequence of T arrays (F, n, n_y)
+        L_k of each of the fields that are simulated, which are always these.
     """
 
     known: SensedFilter = field(kw_only=True)
-    gains: Array = field(kw_only=True)
-    readings_noise: float = field(default=0.0, kw_only=True)
+    gains: Sequence[Array] = field(kw_only=True)
 
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         return self._estimated(theta, fields)[0]
@@ -68,8 +66,7 @@ class FilteredLoop(ClosedLoop):
         actions = np.zeros((T, count, g.n_a))
         features = np.full((T, count, len(K.T) + 1), self.constant_feature)
         costs, finite = np.zeros(count), np.ones(count, dtype=bool)
-        noise = np.random.default_rng(0).standard_normal((T, count, g.sensors))
-        noise *= self.readings_noise
+        noise = self.noise * np.random.default_rng(0).standard_normal((T, count, g.sensors))
         states[0] = fields
         x = np.repeat(self.known.start[0][None], count, axis=0)
         with np.errstate(all="ignore"):
@@ -133,6 +130,8 @@ def improve_through_filter(
 
     loop: the plants, and the cost. modes: (n, m), what of the estimate is fed back.
     """
+    # A descent leaves fields of no weight out, but each has its gains and its plant.
+    fields, weights = fields[weights > 0.0], weights[weights > 0.0]
     parts, model = dict(law.parts(theta)), loop.model
     known = law.filter(parts)
     assert isinstance(model, SensedModel) and known is not None
@@ -149,10 +148,12 @@ def improve_through_filter(
         loop.action_limit,
         model=model,
         known=known,
-        gains=np.stack(gains),
-        readings_noise=loop.noise,
+        gains=gains,
+        noise=loop.noise,
     )
     begin = np.column_stack([parts["K_e"] @ modes, parts["b"]])
+    if not np.isfinite(filtered.costs(begin, fields)).all():
+        return theta, 0
     few = replace(settings, iterations=settings.filter_iterations)
     found = improve(filtered, begin, fields, weights, curvature_of(filtered), few)
     if found is None:

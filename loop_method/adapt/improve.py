@@ -190,11 +190,15 @@ def _descend(
 
 def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
     """The law that is finite from most of the fields, and cheapest where all of those are."""
-    costs = np.array([loop.costs(theta, fields) for theta in laws])
+    return laws[index_of_cheapest(np.array([loop.costs(theta, fields) for theta in laws]), weights)]
+
+
+def index_of_cheapest(costs: Array, weights: Array) -> int:
+    """The row of costs (laws, F) that `cheapest` chooses, the first of several alike."""
     lost = ~np.isfinite(costs) @ weights
     common = np.isfinite(costs[lost <= lost.min()]).all(axis=0)
     total = np.where(common, costs, 0.0) @ weights
-    return laws[int(np.lexsort((total, lost))[0])]
+    return int(np.lexsort((total, lost))[0])
 
 
 def curvature_of(loop: ClosedLoop) -> Array:

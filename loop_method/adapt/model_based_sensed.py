@@ -29,7 +29,7 @@ from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.estimate import Estimate, mean_of
 from loop_method.adapt.estimated_loop import estimated_laws, least_trusting
 from loop_method.adapt.filtered_loop import improve_through_filter
-from loop_method.adapt.improve import cheapest, curvature_of, improve
+from loop_method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
 from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
@@ -159,7 +159,8 @@ class ModelBasedSensed(ModelBasedReadings):
             progress.policy = loop.policy(theta, self._first)
         first = plants.costs(loop.theta(self._first), held_out)
         none = plants.costs(loop.no_control, held_out)
-        progress.safe = bool(first.mean() < none.mean())
+        # From some fields an earlier equation may run away under any law.
+        progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
         change = gained(plants.costs(theta, held_out), first if progress.safe else none)
         progress.fraction, progress.change = 1.0, change
         row["steps"] = steps

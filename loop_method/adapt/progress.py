@@ -52,7 +52,7 @@ class Progress:
     noise : float
         Measurement noise that was found in place of the declared one; 0: none was.
     equations : list of arrays
-        Unknowns of the last equations of a field between few sensors that were believed.
+        Unknowns of the last equations of a field between few sensors believed, the newest last.
     """
 
     policy: Array

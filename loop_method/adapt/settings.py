@@ -186,7 +186,8 @@ class ModelBasedSettings(ImprovementSettings):
     )
     filter_equations: int = setting(
         3,
-        "equations, the newest and those before it, on which laws on an estimate are compared",
+        "equations, the newest and those before it, on which laws between few sensors are compared; "
+        "with 1 no law is improved through its filter",
         1,
         100,
     )

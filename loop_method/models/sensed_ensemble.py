@@ -17,8 +17,9 @@ from loop_method.models.settings import FieldModelSettings
 class SensedEnsemble(SensedModel):
     """The newest equation, and earlier ones: environments follow them in turn.
 
-    Its attributes are those of the newest equation, environment i has that of number i modulo their
-    number, and what it is linearised from is the newest one.
+    Its attributes are those of the newest equation, which is also the one that is linearised.
+    Environment i follows member i modulo their number: where there are fewer environments than
+    members, only the newest members count.
 
     Attributes
     ----------
@@ -26,7 +27,7 @@ class SensedEnsemble(SensedModel):
         The newest one first.
     """
 
-    members: Sequence[SensedModel] = field(default=(), kw_only=True)
+    members: Sequence[SensedModel] = field(kw_only=True)
 
     def _turns(self, states: Array) -> Iterator[tuple[SensedModel, slice]]:
         for i, model in enumerate(self.members[: len(states)]):

@@ -53,8 +53,8 @@ def filtered(limit: float = 0.0, count: int = 6) -> tuple[FilteredLoop, np.ndarr
         limit,
         model=loop.model,
         known=filter_of(CUBIC),
-        gains=np.stack(gains),
-        readings_noise=loop.noise,
+        gains=gains,
+        noise=loop.noise,
     )
     return replace(found, target=np.full(64, 0.1)), theta, begin
 
@@ -126,6 +126,18 @@ def test_a_law_improved_through_the_filter_costs_less_on_the_plants() -> None:
     own, known = (dict(law.parts(theta)) for theta in (found, begin))
     for name in own.keys() - {"K_e", "b"}:
         assert same_bits(own[name], known[name]), f"{name} is that of the filter"
+
+
+def test_fields_of_no_weight_are_left_out_with_their_gains() -> None:
+    loop, law = uncertain()
+    every, weights = fields(7), np.array([0.0, 0.25, 0.25, 0.0, 0.0, 0.25, 0.25])
+    settings = ModelBasedSettings(filter_iterations=2)
+    begin = law_vector(law, 0.01 * np.random.default_rng(5).standard_normal((N_A, 6)))
+    found, others = (
+        improve_through_filter(loop, law, begin, MODES, *given, settings)[0]
+        for given in ((every, weights), (every[weights > 0.0], weights[weights > 0.0]))
+    )
+    assert same_bits(found, others) and not same_bits(found, begin)
 
 
 def test_a_law_that_is_not_finite_on_every_plant_stays() -> None:
