@@ -4,10 +4,10 @@
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`; a law on an estimate is also improved through its filter.
-Laws are compared on other draws, on the plants of this equation and of the ones believed before it: in
-simulations of the filter's own equation what trusts it looks too good. The cheapest is used, or one
-that is hardly dearer with a filter that trusts the equation less.
+current law and those of `observer_design`. A law on an estimate, with a filter that trusts the equation
+less where it then costs hardly more, is also improved through that filter. Laws are compared on other
+draws, on plants of this equation and of the ones believed before it: in simulations of the filter's own
+equation what trusts it looks too good.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
 between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
 law that measured better than the final one is returned in its place.
@@ -141,12 +141,13 @@ class ModelBasedSensed(ModelBasedReadings):
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
+        improved: list[Array] = []
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
             many = weighted(
                 fields, self._drawn(fields, settings.filter_draws, 2), settings.measured_share
             )
-            further, more = self._on_estimates(loop, plants, law, (every, weights), many)
-            laws, steps = [*laws, *further], steps + more
+            further, improved, more = self._on_estimates(loop, plants, law, (every, weights), many)
+            laws, steps = [*laws, *further, *improved], steps + more
         if not laws:
             row["reason"] = "no law is finite on the model; the law stays"
             return
@@ -154,7 +155,8 @@ class ModelBasedSensed(ModelBasedReadings):
         equal = np.full(len(held_out), 1.0 / len(held_out))
         theta = cheapest(plants, [now, *laws], held_out, equal)
         if theta is not now:
-            if isinstance(law, ExtendedKalman) and theta.ndim == 1:
+            own = any(theta is known for known in improved)  # for its filter
+            if isinstance(law, ExtendedKalman) and theta.ndim == 1 and not own:
                 theta = least_trusting(plants, law, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
         first = plants.costs(loop.theta(self._first), held_out)
@@ -174,8 +176,8 @@ class ModelBasedSensed(ModelBasedReadings):
         law: ExtendedKalman,
         designed_from: tuple[Array, Array],
         improved_from: tuple[Array, Array],
-    ) -> tuple[list[Array], int]:
-        """Laws on an estimate and their steps: those designed, and the cheapest one improved.
+    ) -> tuple[list[Array], list[Array], int]:
+        """Laws on an estimate that are designed, the cheapest one improved, and their steps.
 
         designed_from, improved_from: initial fields and their weights. Through its filter a law is
         improved on the plants of several equations alone: on that of the filter it looks too good.
@@ -184,10 +186,11 @@ class ModelBasedSensed(ModelBasedReadings):
         laws, modes, steps = estimated_laws(loop, law, *designed_from, settings, models)
         assert isinstance(plants.model, SensedEnsemble)
         if not laws or len(plants.model.members) < 2:
-            return laws, steps
+            return laws, [], steps
         best = cheapest(plants, laws, *designed_from)
+        best = least_trusting(plants, law, best, designed_from[0], settings)
         best, more = improve_through_filter(plants, law, best, modes, *improved_from, settings)
-        return [*laws, best], steps + more
+        return laws, [best], steps + more
 
     def _plants(self, model: SensedModel) -> SensedEnsemble:
         """The model, and the equations that were believed before it, to which it is added."""
