@@ -4,10 +4,10 @@
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`. A law on an estimate, with a filter that trusts the equation
-less where it then costs hardly more, is also improved through that filter. Laws are compared on other
-draws, on plants of this equation and of the ones believed before it: in simulations of the filter's own
-equation what trusts it looks too good.
+current law and those of `observer_design`. The last law on an estimate, with a filter that trusts the
+equation less where it then costs hardly more, is also improved through that filter. Laws are compared
+on other draws, on plants of this equation and of the ones believed before it: in simulations of the
+filter's own equation what trusts it looks too good.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
 between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
 law that measured better than the final one is returned in its place.
@@ -143,11 +143,15 @@ class ModelBasedSensed(ModelBasedReadings):
         laws, steps = _observers(loop, linear, every, weights, settings, final)
         improved: list[Array] = []
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
-            many = weighted(
-                fields, self._drawn(fields, settings.filter_draws, 2), settings.measured_share
+            designed_from = every, weights
+            further, modes, more = estimated_laws(
+                loop, law, *designed_from, settings, self._context.field_models
             )
-            further, improved, more = self._on_estimates(loop, plants, law, (every, weights), many)
-            laws, steps = [*laws, *further, *improved], steps + more
+            laws, steps = [*laws, *further], steps + more
+            # What the equation has wrong shows more in rollouts of a law that is not adapted to it.
+            if final and further:
+                improved, more = self._improved(plants, law, further, modes, designed_from, fields)
+                laws, steps = [*laws, *improved], steps + more
         if not laws:
             row["reason"] = "no law is finite on the model; the law stays"
             return
@@ -169,28 +173,30 @@ class ModelBasedSensed(ModelBasedReadings):
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
-    def _on_estimates(
+    def _improved(
         self,
-        loop: SensedLoop,
         plants: SensedLoop,
         law: ExtendedKalman,
+        laws: Sequence[Array],
+        modes: Array,
         designed_from: tuple[Array, Array],
-        improved_from: tuple[Array, Array],
-    ) -> tuple[list[Array], list[Array], int]:
-        """Laws on an estimate that are designed, the cheapest one improved, and their steps.
+        fields: Array,
+    ) -> tuple[list[Array], int]:
+        """The cheapest of the laws on an estimate, improved through its filter, and the steps.
 
-        designed_from, improved_from: initial fields and their weights. Through its filter a law is
-        improved on the plants of several equations alone: on that of the filter it looks too good.
+        designed_from: initial fields and their weights. None on the plant of one equation, that of the
+        filter, on which it would look too good.
         """
-        settings, models = self._settings, self._context.field_models
-        laws, modes, steps = estimated_laws(loop, law, *designed_from, settings, models)
+        settings = self._settings
         assert isinstance(plants.model, SensedEnsemble)
-        if not laws or len(plants.model.members) < 2:
-            return laws, [], steps
+        if len(plants.model.members) < 2:
+            return [], 0
+        drawn = self._drawn(fields, settings.filter_draws, 2)
+        many = weighted(fields, drawn, settings.measured_share)
         best = cheapest(plants, laws, *designed_from)
         best = least_trusting(plants, law, best, designed_from[0], settings)
-        best, more = improve_through_filter(plants, law, best, modes, *improved_from, settings)
-        return laws, [best], steps + more
+        best, steps = improve_through_filter(plants, law, best, modes, *many, settings)
+        return [best], steps
 
     def _plants(self, model: SensedModel) -> SensedEnsemble:
         """The model, and the equations that were believed before it, to which it is added."""
