@@ -4,10 +4,11 @@
 Where one equation reproduces the readings of the rollouts (`loop_method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`. The last law on an estimate, with a filter that trusts the
-equation less where it then costs hardly more, is also improved through that filter. Laws are compared
-on other draws, on plants of this equation and of the ones believed before it: in simulations of the
-filter's own equation what trusts it looks too good.
+current law and those of `observer_design`. Laws are compared on other draws. In simulations of the
+filter's own equation what trusts it looks too good: the cheapest law on an estimate gets a filter that
+trusts the equation less where it then costs hardly more. With `filter_equations` above 1 laws are
+compared on plants of the equations believed before as well, and the last one is improved through its
+filter.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
 between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
 law that measured better than the final one is returned in its place.

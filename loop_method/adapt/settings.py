@@ -185,9 +185,9 @@ class ModelBasedSettings(ImprovementSettings):
         4, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
     )
     filter_equations: int = setting(
-        3,
+        1,
         "equations, the newest and those before it, on which laws between few sensors are compared; "
-        "with 1 no law is improved through its filter",
+        "with more than 1 the last law on an estimate is also improved through its filter",
         1,
         100,
     )

@@ -229,6 +229,7 @@ def test_an_earlier_equation_on_which_every_law_runs_away_decides_nothing() -> N
     wild = belief.model.shared.copy()
     wild[TERMS.index((3, 0))] = 1e3
     own._progress.equations = [wild]
+    own._settings = replace(own._settings, filter_equations=2)
     loop, plants = sensed_loop(own._context, belief.model), copy.deepcopy(own)._plants(belief.model)
     for law in own._none, own._first:
         lost = np.isinf(replace(loop, model=plants).costs(loop.theta(law), own._fields()))
