@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed import SensedModel, sensed_model
 from loop_method.models.settings import FieldModelSettings
@@ -29,23 +27,10 @@ class SensedEnsemble(SensedModel):
 
     members: Sequence[SensedModel] = field(kw_only=True)
 
-    def _turns(self, states: Array) -> Iterator[tuple[SensedModel, slice]]:
+    def _alike(self, states: Array) -> Iterator[tuple[SensedModel, slice]]:
+        """The rows that follow each member."""
         for i, model in enumerate(self.members[: len(states)]):
             yield model, slice(i, None, len(self.members))
-
-    def step(self, states: Array, actions: Array) -> Array:
-        after = np.empty(states.shape)
-        for model, rows in self._turns(states):
-            after[rows] = model.step(states[rows], actions[rows])
-        return after
-
-    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        on_states, on_actions = np.empty(states.shape), np.empty(actions.shape)
-        for model, rows in self._turns(states):
-            on_states[rows], on_actions[rows] = model.pull_back(
-                states[rows], actions[rows], covectors[rows]
-            )
-        return on_states, on_actions
 
     def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
         return self.members[0].linearise(state, action)

@@ -107,8 +107,10 @@ class SpectralModel:
         )
         return PolynomialStep(equation)
 
-    def _alike(self, states: Array) -> Iterator[tuple[PolynomialStep, NDArray[np.bool_]]]:
-        """The rows of states that are stepped alike."""
+    def _alike(
+        self, states: Array
+    ) -> Iterator[tuple[PolynomialStep | SpectralModel, NDArray[np.bool_] | slice]]:
+        """The rows of states that are stepped alike, and by what."""
         level = np.searchsorted(self.fewer[:, 0], np.abs(states).max(axis=1, initial=0.0))
         level = np.minimum(level, len(self.fewer))  # NaN is beyond infinity
         for i in np.unique(level):
@@ -116,14 +118,14 @@ class SpectralModel:
 
     def step(self, states: Array, actions: Array) -> Array:
         after = np.empty(states.shape)
-        for compiled, rows in self._alike(states):
-            after[rows] = compiled.step(states[rows], actions[rows])
+        for alike, rows in self._alike(states):
+            after[rows] = alike.step(states[rows], actions[rows])
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         on_states, on_actions = np.empty(states.shape), np.empty(actions.shape)
-        for compiled, rows in self._alike(states):
-            on_states[rows], on_actions[rows] = compiled.pull_back(
+        for alike, rows in self._alike(states):
+            on_states[rows], on_actions[rows] = alike.pull_back(
                 states[rows], actions[rows], covectors[rows]
             )
         return on_states, on_actions
