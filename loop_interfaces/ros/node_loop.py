@@ -24,7 +24,6 @@ from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos
 from loop_interfaces.ros.observer import STUCK, SUSPENDED, WAIT, EventLoop
 from loop_interfaces.ros.sample_subscription import SampleSubscription
-from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 
@@ -174,14 +173,14 @@ class NodeLoop(EventLoop):
         nothing happens; tick(now) when `deadline()` (monotonic s, or None) has passed.
         """
         self._turned = self._active = next_round = self.now()
-        with SuspendWatchdog(self._end_long_wait) as watchdog, self._fast_path_open() as fast:
+        with self.watched(self._end_long_wait), self._fast_path_open() as fast:
             self._takes = self._subscriptions(fast)
             while self._stop_reason is None:
                 self._turned = now = self.now()
                 if now >= next_round:
                     if not self.node.context.ok():
                         break
-                    if watchdog.longest() > SUSPENDED:
+                    if self.watchdog.longest() > SUSPENDED:
                         self.suspended = True
                         return "suspended"
                     next_round = now + self._round(now, fast, housekeeping)

@@ -19,7 +19,9 @@ from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameter_file import read_parameter_file
 from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.observer import EventLoop
 from loop_interfaces.ros.parameters import require_parameters, take_over
+from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.ros_environment import prepared, with_log_folder
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.start import on_signals
@@ -49,32 +51,42 @@ def ros_node(
             loop.stop(name)
 
     on_signals(stop)
-    try:
-        prepare_process(name)
-        check_profile()
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rcl raises bare RuntimeErrors and its own types
-        raise ConfigurationError(_first_line(error)) from error
-    node = None
-    try:
+    with SuspendWatchdog() as watchdog:  # peers may forget it from here on
         try:
-            node = Node(name, start_parameter_services=True)
-        except Exception as error:
+            prepare_process(name)
+            check_profile()
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rcl raises bare RuntimeErrors and its own types
             raise ConfigurationError(_first_line(error)) from error
-        if is_confined() and (outside := outside_sockets()):
-            raise ConfigurationError(
-                f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
-                f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
-            )
-        LONG_CALLS.tell = node.get_logger().warning  # type: ignore[method-assign]
-        loop = make_loop(node)
-        for name_of_signal in signals:  # before there was a loop
-            loop.stop(name_of_signal)
-        yield node, loop
-    finally:
-        if node is not None:
-            node.destroy_node()
-        try_shutdown()
+        node = None
+        try:
+            node = _make_node(name)
+            loop = make_loop(node)
+            if isinstance(loop, EventLoop):
+                loop.watchdog = watchdog
+            for name_of_signal in signals:  # before there was a loop
+                loop.stop(name_of_signal)
+            yield node, loop
+        finally:
+            if node is not None:
+                node.destroy_node()
+            try_shutdown()
+
+
+def _make_node(name: str) -> Node:
+    """A node; its process uses the loopback interface only, if it is to."""
+    try:
+        node = Node(name, start_parameter_services=True)
+    except Exception as error:
+        raise ConfigurationError(_first_line(error)) from error
+    LONG_CALLS.tell = node.get_logger().warning  # type: ignore[method-assign]
+    if is_confined() and (outside := outside_sockets()):
+        node.destroy_node()
+        raise ConfigurationError(
+            f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
+            f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
+        )
+    return node
 
 
 def prepare_process(name: str) -> None:

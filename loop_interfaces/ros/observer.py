@@ -8,7 +8,8 @@ its peers have forgotten it.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from rclpy.clock import Clock
@@ -51,6 +52,8 @@ class EventLoop:
         self.introspection = Introspection(node)
         self.suspended = False
         """True if `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
+        self.watchdog = SuspendWatchdog()
+        """Of a node that ros_node made: it runs since before the node joined the network."""
         self._stop_reason: str | None = None
         self._turned = self.now()
         """Time of the last round of the loop."""
@@ -65,6 +68,13 @@ class EventLoop:
     def stop(self, reason: str) -> None:
         """Leave `run` after the current event."""
         self._stop_reason = reason
+
+    @contextmanager
+    def watched(self, on_tick: Callable[[], None]) -> Iterator[None]:
+        """The watchdog runs in the block, at the latest from its beginning, and calls on_tick."""
+        running = nullcontext() if self.watchdog.running else self.watchdog
+        with running, self.watchdog.calling(on_tick):
+            yield
 
     def serve_next(self, seconds: float) -> bool:
         """Call the executor's next callback, after a wait of so long at most; whether there was one.
@@ -112,11 +122,11 @@ class Observer(EventLoop):
     def run(self) -> str:
         """Serve timers, subscriptions and services until `stop` or a signal; returns the reason."""
         self._turned = self.now()
-        with SuspendWatchdog(self._wake_if_stuck) as watchdog:
+        with self.watched(self._wake_if_stuck):
             while not self.stopped:
                 self.serve_next(WAIT)
                 self._turned = self.now()
-                if watchdog.longest() > SUSPENDED:
+                if self.watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
         return self._stop_reason or "shutdown"

@@ -6,7 +6,8 @@ from __future__ import annotations
 import select
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 PERIOD = 0.1
 """Seconds between two ticks."""
@@ -41,28 +42,44 @@ class SuspendWatchdog:
         self._lock = threading.Lock()
         self._longest = 0.0
         self._last, self._cpu = clock(), time.process_time()
-        self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> SuspendWatchdog:
         self._last, self._cpu = self._clock(), time.process_time()
+        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stopped = True  # the thread ends with its next beat; it holds nothing
+        self._thread = None  # it ends with its next beat; it holds nothing
+
+    @property
+    def running(self) -> bool:
+        """True within its block."""
+        return self._thread is not None
 
     def longest(self) -> float:
         """The longest suspension in s so far, one that has just ended included."""
         self._tick()
         return self._longest
 
+    @contextmanager
+    def calling(self, on_tick: Callable[[], None]) -> Iterator[None]:
+        """Call another function on ticks in the block."""
+        former, self._on_tick = self._on_tick, on_tick
+        try:
+            yield
+        finally:
+            self._on_tick = former
+
     def _run(self) -> None:
-        while not self._stopped:
+        me = threading.current_thread()
+        while self._thread is me:
             sleep_for(PERIOD)
             self._tick()
-            if self._on_tick and not self._stopped:
-                self._on_tick()
+            on_tick = self._on_tick
+            if on_tick and self._thread is me:
+                on_tick()
 
     def _tick(self) -> None:
         with self._lock:

@@ -29,6 +29,27 @@ from tests.support.small_loop import (
 from tuner_node.batch import Batch, BatchResult
 
 pytestmark = pytest.mark.topics
+STOPS_WHILE_IT_STARTS = """
+import os, signal, sys
+from loop_interfaces.ros.node_main import node_main
+from loop_interfaces.ros import node_loop, observer
+
+class Body:
+    def __init__(self, node, loop):
+        self.loop = loop
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    def join(self, node, loop):
+        print("as a new participant", flush=True)
+        loop.stop("done")
+        self.loop = loop
+
+    def run(self):
+        {run}
+        return 0
+
+sys.exit(node_main("late", ["--ros-args"], Body, {loop}))
+"""
 
 
 def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_path):
@@ -58,6 +79,23 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
     running[victim].send_signal(signal.SIGCONT)
     loop.wait(running["tuner"], LIMIT)
     assert_same_training(out, in_process(iterations=100))
+
+
+@pytest.mark.parametrize(
+    ("loop_class", "run"),
+    [
+        ("node_loop.NodeLoop", "self.loop.run(lambda now: None)"),
+        ("observer.Observer", "self.loop.run()"),
+    ],
+)
+def test_a_node_that_is_stopped_while_it_starts_joins_again(loop, loop_class, run):
+    # Otherwise peers that have forgotten it, and that it still knows, may never find it again.
+    node = loop.start("-c", STOPS_WHILE_IT_STARTS.format(loop=loop_class, run=run), name="late")
+    state = Path(f"/proc/{node.pid}/stat")
+    until(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", LIMIT, "stop")
+    time.sleep(2.5)
+    node.send_signal(signal.SIGCONT)
+    assert "as a new participant" in loop.wait(node, LIMIT)
 
 
 def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
