@@ -17,7 +17,7 @@ from loop_interfaces.problem import load_parameters
 from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pdeloop.episode import Law, rollout
-from pdeloop.problem_check import linearisation
+from pdeloop.unstable_modes import linearisation
 
 FIELDS = 10
 

@@ -16,7 +16,7 @@ from pde_sim_node.definition import described
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Instruments, Plant
 from pde_sim_node.plants import DynamicsPlant
-from pdeloop.problem_check import linearisation
+from pdeloop.unstable_modes import linearisation
 from tests.support.linear_dynamics import A, B, Linear
 
 

@@ -23,7 +23,8 @@ from pde_sim_node.plants.reactions import Plate
 from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
 from pdeloop.control_effect import judged
-from pdeloop.problem_check import check, reach
+from pdeloop.problem_check import check
+from pdeloop.unstable_modes import REACHED, reach, reach_by_powers
 from tests.support.plants import plant_of
 from tests.support.small import parameters
 
@@ -344,11 +345,11 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_check(
 def test_of_a_large_state_the_leading_modes_are_those_of_the_whole_matrix(plant: Any) -> None:
     """One actuator in the middle of a plate does not reach what is odd about it."""
     made = as_plant(plant)
-    whole, leading = reach(made), problem_check._reach_by_powers(made)
+    whole, leading = reach(made), reach_by_powers(made)
     np.testing.assert_allclose(leading.growth, whole.growth, atol=1e-5)
     assert leading.waves.tolist() == whole.waves.tolist()
-    lost = whole.margins < problem_check.REACHED
-    assert (leading.margins < problem_check.REACHED).tolist() == lost.tolist()
+    lost = whole.margins < REACHED
+    assert (leading.margins < REACHED).tolist() == lost.tolist()
     assert lost.sum() == (3 if isinstance(plant, Plate) else 0)
 
 
