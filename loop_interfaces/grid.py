@@ -317,6 +317,15 @@ class Grid:
             np.int64
         )
 
+    def measured(self, count: int) -> NDArray[np.int64]:
+        """Indices, within a state, of what `count` point sensors measure: all components at a point.
+
+        ValueError as from `equally_spaced`.
+        """
+        first = self.points * np.arange(len(self.components), dtype=np.int64)
+        found: NDArray[np.int64] = (first[:, None] + self.equally_spaced(count)).ravel()
+        return found
+
     def _counts(self, count: int) -> tuple[int, ...]:
         """Numbers of sensors along the axes."""
         if count > self.points:

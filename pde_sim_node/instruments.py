@@ -105,16 +105,14 @@ class InstrumentedPlant:
                 "measure the whole state, or change the cost"
             )
         self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target
-        points = self.grid.equally_spaced(instruments.sensors or self.grid.points)
-        # A sensor measures every component at its point.
-        first = self.grid.points * np.arange(len(self.grid.components))
-        self.positions = (first[:, None] + points).ravel()
+        sensors = instruments.sensors or self.grid.points
+        self.positions = self.grid.measured(sensors)
         self._delays = instruments.sensor_delays if instruments.sensors else 1
         if self._delays > self.horizon:
             raise ValueError(
                 f"sensor_delays must be at most the horizon, {self.horizon} steps, got {self._delays}"
             )
-        self._scale = math.sqrt(self.grid.points / (points.size * self._delays))
+        self._scale = math.sqrt(self.grid.points / (sensors * self._delays))
         self._forcing = instruments.process_noise * math.sqrt(
             self.sample_time * self.grid.points / self.grid.volume
         )

@@ -47,8 +47,10 @@ def beyond_bounds(plant: Plant, actions: Array) -> tuple[bool, str]:
     return share <= MOST_BEYOND, told if share > SOME_BEYOND else ""
 
 
-def judged(none: float, law: float) -> tuple[bool, str]:
-    """Whether a first law helps, from mean costs without control and with it, and what to do if not.
+def judged(none: float, law: float, *, compared: bool = False) -> tuple[bool, str]:
+    """Whether a first law will do, from mean costs without control and with it, and what to do if not.
+
+    compared: the optimiser compares it with no control itself, and need not begin with it.
 
     >>> judged(10.0, 2.0)
     (True, '')
@@ -65,4 +67,9 @@ def judged(none: float, law: float) -> tuple[bool, str]:
         )
     if law < none:
         return True, ""
+    if compared:
+        return (
+            True,
+            "the law does not help; the adaptation compares it with no control, and makes others",
+        )
     return False, "the adaptation begins with a law that does not help; try another order"

@@ -17,15 +17,20 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from controller_node.identification import DesignSettings, design
+from controller_node.law_batch import LawBatch
 from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.parameters import INSTRUMENTS
+from loop_method.laws.calls import laws_of
+from loop_method.laws.registry import law_kind
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
-from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
-from pdeloop.unstable_modes import REACHED, named_waves, reach
+from pdeloop.episode import EpisodeRecord, Law, rollout
+from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
 from tuner_node.build import build_training, remarks_on
+from tuner_node.optimizer_parameters import kind_of
 
 __all__ = ["Finding", "check", "field_plant"]
 
@@ -62,6 +67,8 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding("actuators", False, f"{which} the state: see what step does with its a")
     yield _halving(plant, values, explored)
     yield _actuators(plant)
+    if 0 < values["sensors"] < plant.grid.points:
+        yield _sensors(plant, values["sensors"])
     lost = _without_control(plant)
     if len(lost):
         yield Finding(
@@ -188,7 +195,7 @@ def _actuators(plant: Plant) -> Finding:
     name = "modes"
     if not plant.settable:
         return Finding(name, True, "not checked: the state of the plant cannot be set")
-    found = reach(plant)
+    found = controllability(plant)
     if not len(found.growth):
         return Finding(name, True, "none is unstable at the target")
     text = f"{len(found.growth)} unstable at the target, growing at up to {found.growth[0]:.3g} 1/s"
@@ -205,11 +212,43 @@ def _actuators(plant: Plant) -> Finding:
     )
 
 
+def _sensors(plant: Plant, sensors: int) -> Finding:
+    name = "sensors"
+    if not plant.settable:
+        return Finding(name, True, "not checked: the state of the plant cannot be set")
+    found = observability(plant, plant.grid.measured(sensors))
+    if not len(found.growth):
+        return Finding(name, True, "no mode is unstable at the target: none has to be observed")
+    lost = found.waves[found.margins < REACHED]
+    if len(lost):
+        waves = named_waves(plant.grid, lost)
+        return Finding(
+            name, False, f"{sensors} of them do not observe {waves}: take more, or another number"
+        )
+    return Finding(
+        name,
+        True,
+        f"{sensors} of them observe all unstable modes, the least by {found.margins.min():.2g} of what "
+        "the whole state would",
+    )
+
+
+def _first_law(plant: Plant, rows: ModelRows, settings: DesignSettings) -> Law:
+    """The law that a training with this design begins with, for the drawn fields."""
+    kind = law_kind(settings.law, settings.constants)
+    [law] = laws_of(kind, [rows], settings.horizon, settings.cost)
+    batch = LawBatch([law], plant.target, settings.action_limit)
+    batch.set(np.repeat(law.theta_start.reshape(1, *law.shape), DRAWN, axis=0))
+    return batch.actions
+
+
 def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings on exploration variance, order and law, from the plant as it is measured."""
     plant = build_plant(values)
     explored = _explore(plant, values)
-    trajectories = [(explored.states[:, 1], explored.actions[:, 1])]  # drawn, as in a training
+    count = min(build_training({**values, "seeds": 1}).settings.explorations, DRAWN)
+    # Of drawn fields, as in a training.
+    first, *further = [(explored.states[:, i], explored.actions[:, i]) for i in range(1, count + 1)]
     yield Finding(
         "exploration",
         True,
@@ -218,31 +257,39 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"{plant.divergence_bound:g})",
     )
     settings = DesignSettings.of(values)
-    try:
-        suggested = study_orders(trajectories).suggested
-    except ValueError as error:
-        yield Finding("order", False, str(error))
-        return
-    n_s = settings.reduced_order or suggested
-    yield Finding(
-        "order",
-        True,
-        f"reduced_order {n_s}; one episode suggests {suggested}, and dmdc a rank of "
-        f"{suggested + plant.n_a} or more",
-    )
-    costs = {"no control": _drawn_fields_cost(plant)}
-    for order in dict.fromkeys((n_s, suggested)):
+    if settings.identification == "subspace":
+        orders = [settings.reduced_order, 0]
+        told = f"reduced_order {settings.reduced_order}; 0: as readings that are left out suggest"
+    else:
         try:
-            law = design(trajectories, plant.target, replace(settings, reduced_order=order))
+            suggested = study_orders([first]).suggested
+        except ValueError as error:
+            yield Finding("order", False, str(error))
+            return
+        orders = [settings.reduced_order or suggested, suggested]
+        told = (
+            f"reduced_order {orders[0]}; one episode suggests {suggested}, and dmdc a rank of "
+            f"{suggested + plant.n_a} or more"
+        )
+    yield Finding("order", True, told)
+    costs = {"no control": _drawn_fields_cost(plant)}
+    for order in dict.fromkeys(orders):
+        try:
+            own = replace(settings, reduced_order=order)
+            rows = design([first], plant.target, own, further=further)
         except ValueError as error:
             yield Finding("first law", False, f"of order {order}: {error}")
             return
-        own = projected_law(plant, law.U, law.policy)
-        costs[f"order {order}"] = _drawn_fields_cost(plant, own)
+        costs[f"order {rows.A.shape[0]}"] = _drawn_fields_cost(
+            plant, _first_law(plant, rows, settings)
+        )
     told = ", ".join(
         f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()
     )
-    good, hint = judged(costs["no control"], costs[f"order {n_s}"])
+    kind = kind_of(values)
+    compared = kind.judges_first_law or (plant.state_size < plant.n_z and kind.compares_first_law)
+    law = next(cost for name, cost in costs.items() if name != "no control")
+    good, hint = judged(costs["no control"], law, compared=compared)
     told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")
     yield Finding("first law", good, told, note=good and bool(hint))

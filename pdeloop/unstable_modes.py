@@ -1,9 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The unstable modes of a plant at its target: how fast they grow, and how well actuators reach them."""
+"""The unstable modes of a plant at its target: growth, and whether actuators and sensors suffice."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from pde_sim_node.plant import Plant
 GROWS = 1e-8
 """A mode is unstable whose eigenvalue is further outside of the unit circle than this."""
 REACHED = 1e-6
-"""Smallest singular value of [lambda I - T, W^T B], relative to |B|, of a mode that actuators reach."""
+"""Smallest `UnstableModes.margins` of a mode that actuators reach, and that sensors observe."""
 MAX_LINEARISED = 1024
 """Numbers of a state beyond which the linearisation is not a square matrix of them, but Krylov's."""
 MODES = 12
@@ -30,13 +31,12 @@ SMALL = 1e-6
 
 
 @dataclass(frozen=True)
-class Reach:
-    """The unstable modes of the linearised plant, and how well actuators reach them.
+class UnstableModes:
+    """The unstable modes of the linearised plant, and how well actuators reach or sensors observe them.
 
     growth (n,): ln|lambda| / sample_time; waves (n, axes): the strongest wave in the mode, along each
-    axis j of exp(2 pi i j x/L) if it is periodic, otherwise j of cos(pi j x/L); margins (n,):
-    smallest singular value of [lambda I - A, B] on the subspace of these modes, relative to the norm
-    of B (Popov-Belevitch-Hautus; 0: out of reach).
+    axis j of exp(2 pi i j x/L) if it is periodic, otherwise j of cos(pi j x/L); margins (n,): see
+    `controllability` and `observability` (Popov-Belevitch-Hautus; 0: out of reach, or not observed).
     """
 
     growth: Array
@@ -50,86 +50,121 @@ def linearisation(plant: Plant) -> tuple[Array, Array]:
     By central differences.
     """
     moves = SMALL * np.eye(plant.n_z + plant.n_a)
-    states, actions = np.split(moves, [plant.n_z], axis=1)
-    plus, _ = plant.evaluate(plant.field_target + states, actions)
-    minus, _ = plant.evaluate(plant.field_target - states, -actions)
-    A, B = np.split((plus - minus).T / (2 * SMALL), [plant.n_z], axis=1)
+    moved = _moved(plant, *np.split(moves, [plant.n_z], axis=1))
+    A, B = np.split(moved.T / SMALL, [plant.n_z], axis=1)
     return A, B
 
 
-def reach(plant: Plant) -> Reach:
-    """Controllability of the `linearisation` by the actuators.
+def controllability(plant: Plant) -> UnstableModes:
+    """How well actuators reach the unstable modes of the `linearisation`.
 
     Left invariant subspace of the unstable eigenvalues: W^T A = T W^T with W orthonormal, from an
-    ordered real Schur form of A^T; mode by mode the test is then one of small matrices.
+    ordered real Schur form of A^T; mode by mode the margin is the smallest singular value of
+    [lambda I - T, W^T B], relative to the norm of B.
     """
     if plant.n_z > MAX_LINEARISED:
-        return reach_by_powers(plant)
+        return controllability_by_powers(plant)
     A, B = linearisation(plant)
-    T, W, count = linalg.schur(A.T, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
+    T, W, count = _unstable_subspace(A.T)
     if not count:
-        return Reach(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
-    W, T = W[:, :count], T[:count, :count].T
-    eigenvalues, vectors = linalg.eig(T, left=True, right=False)
-    pencils = [np.hstack([value * np.eye(count) - T, W.T @ B]) for value in eigenvalues]
-    margins = [linalg.svdvals(pencil)[-1] for pencil in pencils]
-    waves = _strongest_waves(plant.grid, (W @ vectors).T)
+        return _modes(plant, np.empty(0), np.empty((plant.n_z, 0)), np.empty(0))
+    eigenvalues, vectors = linalg.eig(T.T, left=True, right=False)
+    pencils = [np.hstack([value * np.eye(count) - T.T, W.T @ B]) for value in eigenvalues]
+    margins = np.array([linalg.svdvals(pencil)[-1] for pencil in pencils])
+    return _modes(plant, eigenvalues, W @ vectors, margins / max(float(linalg.norm(B, 2)), 1e-300))
+
+
+def observability(plant: Plant, positions: NDArray[np.int64]) -> UnstableModes:
+    """How well the numbers of a state at `positions` observe the unstable modes.
+
+    Right invariant subspace: A Q = Q T with Q orthonormal. The margin of a mode is the smallest
+    singular value of [lambda I - T; s C Q], where C picks the positions and s^2 is n_z over their
+    number: 1 for a wave that they observe as well as the whole state would.
+    """
+    if plant.n_z > MAX_LINEARISED:
+        values, V = _leading(plant)
+        Q, R = linalg.qr(V, mode="economic")
+        T = linalg.solve(R.T, (R * values).T).T if len(values) else np.empty((0, 0))
+    else:
+        T, Q, _ = _unstable_subspace(linearisation(plant)[0])
+    count = len(T)
+    if not count:
+        return _modes(plant, np.empty(0), np.empty((plant.n_z, 0)), np.empty(0))
+    seen = np.sqrt(plant.n_z / len(positions)) * Q[positions]
+    eigenvalues, vectors = linalg.eig(T)
+    pencils = [np.vstack([value * np.eye(count) - T, seen]) for value in eigenvalues]
+    margins = np.array([linalg.svdvals(pencil)[-1] for pencil in pencils])
+    return _modes(plant, eigenvalues, Q @ vectors, margins)
+
+
+def controllability_by_powers(plant: Plant) -> UnstableModes:
+    """`controllability` of the leading modes alone, for large states.
+
+    A^p B is a matter of the unstable ones alone once p is large: A^p B = V diag(lambda^p) W^* B, of
+    which least squares give W^* B.
+    """
+    eigenvalues, V = _leading(plant)
+    if not len(eigenvalues):
+        return _modes(plant, eigenvalues, V, np.empty(0))
+    states = _moved(plant, np.zeros((plant.n_a, plant.n_z)), SMALL * np.eye(plant.n_a)) / SMALL
+    size = float(linalg.norm(states))
+    reached, power = np.zeros((len(eigenvalues), plant.n_a), dtype=complex), 0
+    while power < POWERS:
+        power += 1
+        states = np.stack([_product(plant, row) for row in states])
+        coefficients = np.linalg.lstsq(V, states.T.astype(complex))[0]
+        rest = float(linalg.norm(states.T - V @ coefficients))
+        reached = coefficients / eigenvalues[:, None] ** power
+        if rest <= REACHED * float(linalg.norm(states)) or linalg.norm(states) > 1 / SMALL:
+            break
+    return _modes(plant, eigenvalues, V, linalg.norm(reached, axis=1) / max(size, 1e-300))
+
+
+def _modes(plant: Plant, eigenvalues: Array, vectors: Array, margins: Array) -> UnstableModes:
+    """Modes (n_z, n) by descending growth."""
     growth = np.log(np.abs(eigenvalues)) / plant.sample_time
     order = np.argsort(-growth)
-    relative = np.array(margins) / max(float(linalg.norm(B, 2)), 1e-300)
-    return Reach(growth[order], waves[order], relative[order])
+    waves = _strongest_waves(plant.grid, vectors.T) if len(order) else np.empty((0, 1), np.int64)
+    return UnstableModes(growth[order], waves[order], margins[order])
 
 
-def reach_by_powers(plant: Plant) -> Reach:
-    """The same of the leading modes alone, from products A v by differences, for large states.
+def _unstable_subspace(A: Array) -> tuple[Array, Array, int]:
+    """T and orthonormal Q of A Q = Q T for the unstable eigenvalues, and their number."""
+    T, Q, count = linalg.schur(A, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
+    return T[:count, :count], Q[:, :count], count
 
-    Right eigenvectors V come from Arnoldi's method. A^p B is a matter of the unstable ones alone once p
-    is large: A^p B = V diag(lambda^p) W^* B, of which least squares give W^* B.
-    """
+
+def _leading(plant: Plant) -> tuple[Array, Array]:
+    """The unstable leading eigenvalues and their right eigenvectors V (n_z, n), by Arnoldi's method."""
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 
-    nothing, z_r = np.zeros((1, plant.n_a)), plant.field_target
-
-    def moved(states: Array, actions: Array) -> Array:
-        plus, _ = plant.evaluate(z_r + states, actions)
-        minus, _ = plant.evaluate(z_r - states, -actions)
-        change: Array = 0.5 * (plus - minus)
-        return change
-
-    def product(v: Array) -> Array:
-        size = max(float(np.abs(v).max()), 1e-300)
-        image: Array = size * moved(SMALL * v.reshape(1, -1) / size, nothing)[0] / SMALL
-        return image
-
-    A = LinearOperator((plant.n_z, plant.n_z), matvec=product, dtype=np.float64)
+    A = LinearOperator((plant.n_z, plant.n_z), matvec=partial(_product, plant), dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(plant.n_z)
     try:
         found = eigs(A, k=MODES, v0=start, tol=KRYLOV_ACCURACY, ncv=4 * MODES)
     except ArpackNoConvergence as error:
         found = error.eigenvalues, error.eigenvectors
     grows = np.abs(found[0]) > 1 + 10 * KRYLOV_ACCURACY
-    eigenvalues, V = found[0][grows], found[1][:, grows]
-    if not len(eigenvalues):
-        return Reach(np.empty(0), np.empty((0, len(plant.grid.axes)), dtype=np.int64), np.empty(0))
-    states = moved(np.zeros((plant.n_a, plant.n_z)), SMALL * np.eye(plant.n_a)) / SMALL
-    size = float(linalg.norm(states))
-    reached, power = np.zeros((len(eigenvalues), plant.n_a), dtype=complex), 0
-    while power < POWERS:
-        power += 1
-        states = np.stack([product(row) for row in states])
-        coefficients = np.linalg.lstsq(V, states.T.astype(complex))[0]
-        rest = float(linalg.norm(states.T - V @ coefficients))
-        reached = coefficients / eigenvalues[:, None] ** power
-        if rest <= REACHED * float(linalg.norm(states)) or linalg.norm(states) > 1 / SMALL:
-            break
-    margins = linalg.norm(reached, axis=1) / max(size, 1e-300)
-    growth = np.log(np.abs(eigenvalues)) / plant.sample_time
-    order = np.argsort(-growth)
-    waves = _strongest_waves(plant.grid, V.T)
-    return Reach(growth[order], waves[order], margins[order])
+    return found[0][grows], found[1][:, grows]
 
 
-def _strongest_waves(grid: Grid, modes: NDArray[np.complex128]) -> NDArray[np.int64]:
+def _moved(plant: Plant, states: Array, actions: Array) -> Array:
+    """What displacements from the target and actions lead to a step later, by central differences."""
+    plus, _ = plant.evaluate(plant.field_target + states, actions)
+    minus, _ = plant.evaluate(plant.field_target - states, -actions)
+    change: Array = 0.5 * (plus - minus)
+    return change
+
+
+def _product(plant: Plant, v: Array) -> Array:
+    """A v."""
+    size = max(float(np.abs(v).max()), 1e-300)
+    moved = _moved(plant, SMALL * v.reshape(1, -1) / size, np.zeros((1, plant.n_a)))
+    image: Array = size * moved[0] / SMALL
+    return image
+
+
+def _strongest_waves(grid: Grid, modes: NDArray[Any]) -> NDArray[np.int64]:
     """Of each mode (n, n_z), the wave of largest magnitude over all components, (n, axes)."""
     spectra: NDArray[Any] = modes.reshape(len(modes), len(grid.components), *grid.shape)
     axes = grid.axes or (grid.line,)

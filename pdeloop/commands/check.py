@@ -9,14 +9,18 @@ from dataclasses import asdict
 from math import nan
 from typing import TYPE_CHECKING
 
+from loop_interfaces.parameters import flags
 from pdeloop.commands.common import (
     Commands,
     a_path,
+    add_flags,
     add_json,
     add_own_code,
     allow_own_code,
     command,
+    given_flags,
 )
+from pdeloop.commands.settings import add_set, joined, read_settings
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
@@ -39,11 +43,11 @@ def add(commands: Commands) -> None:
         _check,
         help="check a problem before training, or a node of your own against the protocol",
         description="Check a problem before training on it: halve the integration step, see "
-        "whether the actuators reach the modes that are unstable at the target and whether the plant "
-        "diverges without control, explore once, report the order that the data support and the cost "
-        "of the first law, and draw fields and supports. The exit code is 1 if a check fails. With "
-        "plant, controller or tuner instead of a FILE, check that a node of your own, alone in this "
-        "ROS_DOMAIN_ID, conforms to docs/stand-in.md.",
+        "whether the actuators reach the modes that are unstable at the target, whether few sensors "
+        "observe them and whether the plant diverges without control, explore once, report the order "
+        "that the data support and the cost of the first law, and draw fields and supports. The exit "
+        "code is 1 if a check fails. With plant, controller or tuner instead of a FILE, check that a "
+        "node of your own, alone in this ROS_DOMAIN_ID, conforms to docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
     check.add_argument(
@@ -71,7 +75,10 @@ def add(commands: Commands) -> None:
     add_option(
         "--network", action="store_true", default=None, help="the node may run on another machine"
     )
-    add_own_code(check)
+    problem = check.add_argument_group("problem")
+    add_own_code(problem)
+    add_flags(problem, "problem")
+    add_set(problem)
     check.add_argument(
         "--picture",
         type=a_path,
@@ -85,7 +92,9 @@ def _check(options: argparse.Namespace) -> int:
     if not options.problem and options.plant is None:
         options.refuse("give a problem's FILE, --plant NAME, or plant, controller or tuner")
     of_a_node = options.problem in ROLES
-    given = {name: getattr(options, name) for name in (*OF_A_NODE, *OF_A_FILE)}
+    of_the_problem = [spec.name for spec in flags("problem")]
+    names = *OF_A_NODE, *OF_A_FILE, *of_the_problem
+    given = {name: getattr(options, name) for name in names} | {"set": options.set or None}
     given = {name: value for name, value in given.items() if value is not None}
     for name in given:
         takers = OF_A_NODE.get(name)
@@ -102,7 +111,8 @@ def _check(options: argparse.Namespace) -> int:
         from pdeloop.problem_picture import draw
         from pdeloop.training_run import load_compiled, resolve
 
-        values = resolve(options.problem, allow_own_code(options))
+        settings = joined(given_flags(options), read_settings(options.set))
+        values = resolve(options.problem, settings | allow_own_code(options))
         if options.picture is not None:
             draw(values, options.picture)  # before the check, which takes longer
         load_compiled(values)

@@ -168,8 +168,8 @@ def _laws(prefix: str, **_: object) -> list[str]:
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:
-    """The parameters whose flags were given, by name."""
-    named = [(spec, getattr(options, spec.name)) for spec in flags()]
+    """The parameters whose flags a command has and was given, by name."""
+    named = [(spec, getattr(options, spec.name, None)) for spec in flags()]
     return {
         spec.name: spec.parse(value) if spec.numbers else value
         for spec, value in named

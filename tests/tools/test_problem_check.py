@@ -13,20 +13,33 @@ import pytest
 import scipy.fft
 
 import pdeloop
+from controller_node.identification import DesignSettings, design
+from loop_interfaces.model_rows import pack
 from loop_interfaces.problem import load_parameters
+from loop_interfaces.topics import CostColumn
+from loop_method.laws.calls import laws_of
+from loop_method.laws.extended_kalman import ExtendedKalman
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.loading import as_plant
 from pde_sim_node.plants.reactions import Plate
-from pdeloop import problem_check
+from pdeloop import problem_check, unstable_modes
 from pdeloop.cli import FAILED, main
 from pdeloop.control_effect import judged
+from pdeloop.in_process import LocalPair
 from pdeloop.problem_check import check
-from pdeloop.unstable_modes import REACHED, reach, reach_by_powers
+from pdeloop.training_run import resolve
+from pdeloop.unstable_modes import (
+    REACHED,
+    controllability,
+    controllability_by_powers,
+    observability,
+)
 from tests.support.plants import plant_of
-from tests.support.small import parameters
+from tests.support.small import SMALL, parameters
+from tuner_node.batch import Batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +65,7 @@ def plant(n_a: int, width: float) -> SpectralPlant:
 
 
 def test_the_unstable_modes_are_those_of_the_operator_and_enough_actuators_reach_them() -> None:
-    found = reach(plant(5, 0.1))
+    found = controllability(plant(5, 0.1))
     assert found.waves[:, 0].tolist() == [0, 1, 1, 2, 2]
     np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.8, 0.2, 0.2], atol=1e-7)
     assert found.margins.min() > 0.1
@@ -63,8 +76,23 @@ def test_waves_on_which_equally_spaced_actuators_have_one_phase_are_not_reached(
     n_a: int, lost: list[int]
 ) -> None:
     """A pair cos, sin of one growth rate needs two columns of B, and they see wave n_a / 2 as one."""
-    found = reach(plant(n_a, 0.1))
+    found = controllability(plant(n_a, 0.1))
     assert sorted(set(found.waves[found.margins < 1e-6, 0].tolist())) == lost
+
+
+@pytest.mark.parametrize(("sensors", "lost"), [(1, [1, 2]), (2, [1, 2]), (4, [2]), (5, [])])
+def test_waves_of_which_equally_spaced_sensors_see_one_phase_are_not_observed(
+    sensors: int, lost: list[int]
+) -> None:
+    """As for actuators. Of two waves that look alike between them, the growth tells which it is."""
+    found = observability(plant(1, 0.1), plant(1, 0.1).grid.measured(sensors))
+    np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.8, 0.2, 0.2], atol=1e-7)
+    assert sorted(set(found.waves[found.margins < REACHED, 0].tolist())) == lost
+
+
+def test_the_whole_state_observes_every_wave_alike() -> None:
+    found = observability(plant(1, 0.1), np.arange(32))
+    np.testing.assert_allclose(found.margins, 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +104,7 @@ def test_four_actuators_reach_the_unstable_modes_of_the_equilibria(
 ) -> None:
     """Rates of Cvitanovic, Davidchack, Siminos (2010); a shift of the field keeps its size."""
     values = load_parameters("kuramoto-sivashinsky-22", {"physical.equilibrium": equilibrium})
-    found = reach(build_plant(values))
+    found = controllability(build_plant(values))
     grows = found.growth > 1e-3
     np.testing.assert_allclose(np.sort(found.growth[grows])[::-1], growth, atol=2e-4)
     assert found.margins[grows].min() > 0.2
@@ -109,7 +137,7 @@ class GrowingPlate(pdeloop.Dynamics):
 
 
 def test_modes_between_walls_are_told_by_their_half_waves() -> None:
-    found = reach(as_plant(GrowingPlate()))
+    found = controllability(as_plant(GrowingPlate()))
     assert {tuple(row) for row in found.waves.tolist()} == {(0, 0), (0, 1), (0, 2), (1, 0)}
     np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.2, 0.1], atol=1e-6)
     assert (found.margins < 1e-6).tolist() == [False, True, False, True]
@@ -288,6 +316,38 @@ def test_the_first_law_is_judged_by_what_it_saves(
     assert found == good and words in hint and bool(words) == bool(hint)
 
 
+def test_a_first_law_that_need_not_be_begun_with_is_not_bad() -> None:
+    assert judged(9.0, 99.0, compared=True)[0] and judged(9.0, 1.0, compared=True) == (True, "")
+    values = resolve("kdv", {"sensors": 8})
+    good, text = next((f.good, f.text) for f in check(values) if f.name == "first law")
+    assert good and "does not help; the adaptation compares it" in text
+
+
+def test_with_few_sensors_the_first_law_is_that_of_a_training_with_its_filter() -> None:
+    values = resolve(str(SMALL), {"sensors": 8, "optimizer": "model_based", "rollouts": 20})
+    made, settings = build_plant(values), DesignSettings.of(values)
+    explored = problem_check._explore(made, values)
+    rows = design([(explored.states[:, 1], explored.actions[:, 1])], made.target, settings)
+    assert rows.L is not None
+    pair = LocalPair(values)
+    pair.use_models(pack(rows)[None])
+    [law] = laws_of(ExtendedKalman, [rows], made.horizon)
+    fields = np.array([(i, -1, 0, 0, i) for i in range(problem_check.DRAWN)], dtype=np.float64)
+    policies = np.repeat(law.theta_start.reshape(1, *law.shape), len(fields), axis=0)
+    there = pair.run(Batch(fields, policies)).costs[:, CostColumn.MEAN].mean()
+    first = problem_check._first_law(made, rows, settings)
+    assert problem_check._drawn_fields_cost(made, first) == there
+
+
+def test_sensors_and_other_parameters_may_be_given(capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--sensors", "2", "--set", "horizon=12"]
+    assert main(["check", "allen-cahn", *given]) == FAILED
+    told = capsys.readouterr().out
+    assert re.search(r"BAD  sensors: 2 of them do not observe all of wave number \d", told)
+    assert main(["check", str(SMALL), "--sensors", "9999"]) == FAILED
+    assert "9999" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
@@ -295,6 +355,8 @@ def test_the_first_law_is_judged_by_what_it_saves(
         (["burgers", "--patience", "10"], "--patience: only for the check of a node"),
         (["burgers", "--network"], "--network: only for the check of a node"),
         (["plant", "--n-z", "8"], "--n-z: only for the check of a node (controller)"),
+        (["plant", "--sensors", "8"], "--sensors: only for the check of a problem's FILE"),
+        (["plant", "--set", "horizon=9"], "--set: only for the check of a problem's FILE"),
         (["tuner", "--equation", "burgers"], "--equation: only for the check of a problem's FILE"),
         (["plant", "--picture", "x.png"], "--picture: only for the check of a problem's FILE"),
     ],
@@ -342,15 +404,23 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_check(
 
 
 @pytest.mark.parametrize("plant", [Plate(10, 8, across=1, up=1), Convection(10)])
-def test_of_a_large_state_the_leading_modes_are_those_of_the_whole_matrix(plant: Any) -> None:
+def test_of_a_large_state_the_leading_modes_are_those_of_the_whole_matrix(
+    plant: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One actuator in the middle of a plate does not reach what is odd about it."""
     made = as_plant(plant)
-    whole, leading = reach(made), reach_by_powers(made)
+    whole, leading = controllability(made), controllability_by_powers(made)
     np.testing.assert_allclose(leading.growth, whole.growth, atol=1e-5)
     assert leading.waves.tolist() == whole.waves.tolist()
     lost = whole.margins < REACHED
     assert (leading.margins < REACHED).tolist() == lost.tolist()
     assert lost.sum() == (3 if isinstance(plant, Plate) else 0)
+    positions = made.grid.measured(6)
+    whole = observability(made, positions)
+    monkeypatch.setattr(unstable_modes, "MAX_LINEARISED", 0)
+    leading = observability(made, positions)
+    np.testing.assert_allclose(leading.growth, whole.growth, atol=1e-5)
+    np.testing.assert_allclose(leading.margins, whole.margins, atol=1e-4)
 
 
 class Forgetful(pdeloop.Dynamics):
