@@ -318,9 +318,24 @@ class Grid:
         )
 
     def measured(self, count: int) -> NDArray[np.int64]:
-        """Indices, within a state, of what `count` point sensors measure: all components at a point.
+        """Indices, within a state, of the readings of equally spaced point sensors.
 
-        ValueError as from `equally_spaced`.
+        Each measures all components at its point.
+
+        Parameters
+        ----------
+        count
+            How many sensors.
+
+        Returns
+        -------
+        (components * count,) int64
+            All sensors of a component one after the other.
+
+        Raises
+        ------
+        ValueError
+            As from `equally_spaced`.
         """
         first = self.points * np.arange(len(self.components), dtype=np.int64)
         found: NDArray[np.int64] = (first[:, None] + self.equally_spaced(count)).ravel()
