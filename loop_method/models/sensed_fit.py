@@ -184,6 +184,7 @@ def _refined(
         found.append(part_by_part(problem, shared, fields, settings))
     if problem.noise and fresh:
         problem.prior.forget()
+        problem.prior.spread = None  # which followed from that equation
         most = settings.sensed_hopeless
         anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
         found += [anew] if np.isfinite(anew[0]) else []
@@ -197,7 +198,8 @@ def _refined(
 def dispersion_of(shared: Array) -> Array:
     """No equation but the terms and the dispersion of another, on which a descent depends.
 
-    What few rollouts suggested may be a wrong optimum, from which no descent leads away.
+    What few rollouts suggested may be a wrong optimum, from which no descent leads away: with eight
+    sensors one whose short waves move past them, as an advection that is not there.
     """
     found, own = start_with(shared), TERMS.index((1, 3))
     found[own] = shared[own]

@@ -272,18 +272,21 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     """It is fitted to all rollouts from their beginning, from what two suggest and from nothing.
 
-    So is an equation of earlier rollouts, from which no descent may lead to a likelier one. Of errors
-    that are all below the noise the least is no better: the likeliest unknowns are taken.
+    So is an equation of earlier rollouts, from which no descent may lead to a likelier one. The spread
+    of waves that followed from it holds neither that fit nor the choice. Of errors that are all below
+    the noise the least is no better: the likeliest unknowns are taken.
     """
     rng, actuators = np.random.default_rng(6), DECLARED
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
     starts: list[Array] = []
     mosts: list[tuple[float, ...]] = []
+    spreads: list[Array | None] = []
     likelier, dispersion = np.zeros(unknowns(3)), TERMS.index((1, 3))
 
     def recorded(problem: SensedProblem, start: Array, *given: Any) -> tuple[float, Array, Array]:
         starts.append(start)
         mosts.append(given[2:])
+        spreads.append(problem.prior.spread)
         return worse, likelier, np.zeros_like(problem.interpolated())
 
     ridges, guess = [], sensed_fit._first_guess
@@ -292,10 +295,14 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         ridges.append(problem.prior.place_ridge)
         return guess(problem, *given)
 
+    def off(problem: SensedProblem, x: Array, fields: Array) -> float:
+        spreads.append(problem.prior.spread)
+        return abs(x[0] - wanted)
+
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "part_by_part", recorded)
         patch.setattr(sensed_fit, "_first_guess", guessed)
-        patch.setattr(SensedProblem, "implausibility", lambda _, x, fields: abs(x[0] - wanted))
+        patch.setattr(SensedProblem, "implausibility", off)
         # Of noise alone, which any equation explains.
         few = {"settings": replace(FEW_ITERATIONS, sensed_starts=1, sensed_varying=1.0)}
         worse, wanted = 1.0, 0.0
@@ -304,8 +311,10 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         worse, wanted = 0.0, 1e9
         shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
         assert shared.any() and len(starts) == 4
-        again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
-        assert again.any() and len(starts) == 5
+        spreads.clear()
+        known = {**few, "spread": np.full(33, 0.1)}
+        again = fit_sensed(readings, actions, actuators, 1.0, shared, **known)[0]
+        assert again.any() and len(starts) == 5 and spreads == [None] * 3
         for guessed_start, start in ((starts[2], starts[3]), (shared, starts[4])):
             assert start[dispersion] == guessed_start[dispersion] and np.sum(start != 0.0) <= 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
