@@ -183,13 +183,20 @@ def _refined(
         problem.prior.forget()
         found.append(part_by_part(problem, shared, fields, settings))
     if problem.noise and fresh:
+        held = problem.prior.spread is not None
         problem.prior.forget()
         problem.prior.spread = None  # which followed from that equation
         most = settings.sensed_hopeless
         anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
-        found += [anew] if np.isfinite(anew[0]) else []
+        # Each with its likeliest fields: those of the first were held to that spread.
+        likeliest = [
+            problem.fit(*own[1:], known=True, lengths=whole[:1]) if held else own for own in found
+        ]
+        if np.isfinite(anew[0]):
+            found, likeliest = [*found, anew], [*likeliest, anew]
         # Errors that are all below the noise tell no equation from another.
-        error, shared, fields = min(found, key=lambda own: problem.implausibility(*own[1:]))
+        costs = [problem.implausibility(*own[1:]) for own in likeliest]
+        error, shared, fields = found[int(np.argmin(costs))]
     else:
         error, shared, fields = min(found, key=lambda own: own[0])
     return error - problem.noise, shared, fields

@@ -16,6 +16,7 @@ from loop_method.models import sensed_fit
 from loop_method.models.sensed import (
     Actuators,
     SensedEquation,
+    coefficients_of,
     grid_points,
     interpolated,
     sensed_model,
@@ -295,8 +296,12 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         ridges.append(problem.prior.place_ridge)
         return guess(problem, *given)
 
+    compared: list[tuple[SensedProblem, Array]] = []
+    truly = SensedProblem.implausibility
+
     def off(problem: SensedProblem, x: Array, fields: Array) -> float:
         spreads.append(problem.prior.spread)
+        compared.append((problem, fields))
         return abs(x[0] - wanted)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
@@ -313,8 +318,11 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         assert shared.any() and len(starts) == 4
         spreads.clear()
         known = {**few, "spread": np.full(33, 0.1)}
-        again = fit_sensed(readings, actions, actuators, 1.0, shared, **known)[0]
+        again, kept, _ = fit_sensed(readings, actions, actuators, 1.0, shared, **known)
         assert again.any() and len(starts) == 5 and spreads == [None] * 3
+        # In the comparison it has its likeliest fields, but it keeps those that the spread held.
+        problem, likeliest = compared[-2]
+        assert truly(problem, again, likeliest) < truly(problem, again, coefficients_of(kept))
         for guessed_start, start in ((starts[2], starts[3]), (shared, starts[4])):
             assert start[dispersion] == guessed_start[dispersion] and np.sum(start != 0.0) <= 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
