@@ -183,30 +183,45 @@ def _refined(
         problem.prior.forget()
         found.append(part_by_part(problem, shared, fields, settings))
     if problem.noise and fresh:
-        held = problem.prior.spread is not None
         problem.prior.forget()
-        problem.prior.spread = None  # which followed from that equation
         most = settings.sensed_hopeless
         anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
-        # Each with its likeliest fields: those of the first were held to that spread.
-        likeliest = [
-            problem.fit(*own[1:], known=True, lengths=whole[:1]) if held else own for own in found
-        ]
-        if np.isfinite(anew[0]):
-            found, likeliest = [*found, anew], [*likeliest, anew]
+        found += [anew] if np.isfinite(anew[0]) else []
         # Errors that are all below the noise tell no equation from another.
-        costs = [problem.implausibility(*own[1:]) for own in likeliest]
-        error, shared, fields = found[int(np.argmin(costs))]
+        best = min(found, key=lambda own: problem.implausibility(*own[1:]))
+        if problem.prior.spread is not None:
+            best = far_likelier(problem, best, dispersion_of(shared), fields, settings)
+        error, shared, fields = best
     else:
         error, shared, fields = min(found, key=lambda own: own[0])
     return error - problem.noise, shared, fields
 
 
+def far_likelier(
+    problem: SensedProblem, best: Found, start: Array, fields: Array, settings: FieldModelSettings
+) -> Found:
+    """A fit from these unknowns without a spread of waves, if it is likelier by far, or else the best.
+
+    The spread followed from the equation before, and may hold a wrong one: with eight sensors one whose
+    short waves move past them, as an advection that is not there.
+    """
+    spread, problem.prior.spread = problem.prior.spread, None
+    problem.prior.forget()
+    anew = part_by_part(problem, start, fields, settings, settings.sensed_hopeless)
+    if np.isfinite(anew[0]):
+        # Each with its likeliest fields: those of the best were held to that spread.
+        _, *held = problem.fit(*best[1:], known=True, lengths=[problem.y.shape[1]])
+        gain = problem.implausibility(*held) - problem.implausibility(*anew[1:])
+        if 0.5 * gain * problem.y.size / problem.noise > settings.sensed_likelier:
+            best = anew
+    problem.prior.spread = spread
+    return best
+
+
 def dispersion_of(shared: Array) -> Array:
     """No equation but the terms and the dispersion of another, on which a descent depends.
 
-    What few rollouts suggested may be a wrong optimum, from which no descent leads away: with eight
-    sensors one whose short waves move past them, as an advection that is not there.
+    What few rollouts suggested may be a wrong optimum, from which no descent leads away.
     """
     found, own = start_with(shared), TERMS.index((1, 3))
     found[own] = shared[own]

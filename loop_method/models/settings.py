@@ -221,6 +221,13 @@ class FieldModelSettings(Settings):
         0,
         100,
     )
+    sensed_likelier: float = setting(
+        30.0,
+        "log-likelihood that a fit from nothing, without the spread of waves that followed from an "
+        "earlier equation, must have more than the fit with it",
+        0,
+        1e6,
+    )
     sensed_beginning: float = setting(
         0.05, "share of each rollout over which a fit begins", 1e-3, 1
     )

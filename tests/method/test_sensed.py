@@ -273,9 +273,8 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
 def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
     """It is fitted to all rollouts from their beginning, from what two suggest and from nothing.
 
-    So is an equation of earlier rollouts, from which no descent may lead to a likelier one. The spread
-    of waves that followed from it holds neither that fit nor the choice. Of errors that are all below
-    the noise the least is no better: the likeliest unknowns are taken.
+    So is an equation of earlier rollouts, from which no descent may lead to a likelier one. Of errors
+    that are all below the noise the least is no better: the likeliest unknowns are taken.
     """
     rng, actuators = np.random.default_rng(6), DECLARED
     readings, actions = rng.standard_normal((3, 12, SENSORS)), rng.standard_normal((3, 12, 3))
@@ -297,12 +296,13 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         return guess(problem, *given)
 
     compared: list[tuple[SensedProblem, Array]] = []
+    told: list[float] = []
     truly = SensedProblem.implausibility
 
     def off(problem: SensedProblem, x: Array, fields: Array) -> float:
         spreads.append(problem.prior.spread)
         compared.append((problem, fields))
-        return abs(x[0] - wanted)
+        return told.pop(0) if told else abs(x[0] - wanted)
 
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(sensed_fit, "part_by_part", recorded)
@@ -316,13 +316,8 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         worse, wanted = 0.0, 1e9
         shared, fields, _ = fit_sensed(readings, actions, actuators, 1.0, None, **few)
         assert shared.any() and len(starts) == 4
-        spreads.clear()
-        known = {**few, "spread": np.full(33, 0.1)}
-        again, kept, _ = fit_sensed(readings, actions, actuators, 1.0, shared, **known)
-        assert again.any() and len(starts) == 5 and spreads == [None] * 3
-        # In the comparison it has its likeliest fields, but it keeps those that the spread held.
-        problem, likeliest = compared[-2]
-        assert truly(problem, again, likeliest) < truly(problem, again, coefficients_of(kept))
+        again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
+        assert again.any() and len(starts) == 5
         for guessed_start, start in ((starts[2], starts[3]), (shared, starts[4])):
             assert start[dispersion] == guessed_start[dispersion] and np.sum(start != 0.0) <= 1
         fit_sensed(readings, actions, actuators, 1.0, shared, near=fields, **few)
@@ -332,6 +327,20 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
         assert again.any() and len(starts) == 6
         assert mosts == [(), (DEFAULTS.sensed_hopeless,)] * 2 + [(DEFAULTS.sensed_hopeless,)] * 2
+        # A spread that followed from an earlier equation holds neither a third fit nor the choice.
+        worse, known = 0.0, {**few, "spread": np.full(33, 0.1)}
+        for nats, chosen in ((25.0, again), (35.0, likelier)):
+            gain = 2.0 * nats * compared[-1][0].noise / readings.size
+            told[:], spreads[:] = [0.0, 1.0, gain, 0.0], []
+            found, kept, _ = fit_sensed(readings, actions, actuators, 1.0, shared, **known)
+            assert found.any() == chosen.any() and not told
+            assert [own is None for own in spreads] == [False] * 3 + [True] * 3
+            # For the comparison it has its likeliest fields, and it keeps those that the spread held.
+            problem, likeliest = compared[-2]
+            problem.prior.spread = None
+            if found.any():
+                held = coefficients_of(kept)
+                assert truly(problem, found, likeliest) < truly(problem, found, held)
     # What two of them have to say of each actuator is noise.
     assert ridges == [DEFAULTS.sensed_held_ridge] * 2
     # Nobody says where those of a plant of one's own are.
