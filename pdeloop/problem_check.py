@@ -259,7 +259,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     settings = DesignSettings.of(values)
     if settings.identification == "subspace":
         orders = [settings.reduced_order, 0]
-        told = f"reduced_order {settings.reduced_order}; 0: as readings that are left out suggest"
+        told = f"reduced_order {settings.reduced_order}; 0: the best one for held-out readings"
     else:
         try:
             suggested = study_orders([first]).suggested
