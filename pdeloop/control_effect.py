@@ -61,13 +61,13 @@ def judged(none: float, law: float, *, compared: bool = False) -> tuple[bool, st
             "another target"
         )
     if abs(none - law) < LITTLE * none:
-        return law < none, (
+        return law < none or compared, (
             "the law does next to nothing: its actions hardly move the states, are dear (lower "
             "action_weight), or cannot reach the target"
         )
     if law < none:
         return True, ""
-    if compared:
+    if compared and np.isfinite(none):
         return (
             True,
             "the law does not help; the adaptation compares it with no control, and makes others",

@@ -228,8 +228,8 @@ def _sensors(plant: Plant, sensors: int) -> Finding:
     return Finding(
         name,
         True,
-        f"{sensors} of them observe all unstable modes, the least by {found.margins.min():.2g} of what "
-        "the whole state would",
+        f"{sensors} of them observe all unstable modes, with a margin of at least "
+        f"{found.margins.min():.2g} (1: that of the whole state)",
     )
 
 
@@ -280,15 +280,15 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         except ValueError as error:
             yield Finding("first law", False, f"of order {order}: {error}")
             return
-        costs[f"order {rows.A.shape[0]}"] = _drawn_fields_cost(
-            plant, _first_law(plant, rows, settings)
-        )
+        cost = _drawn_fields_cost(plant, _first_law(plant, rows, settings))
+        costs.setdefault(f"order {rows.A.shape[0]}", cost)
     told = ", ".join(
         f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()
     )
     kind = kind_of(values)
-    compared = kind.judges_first_law or (plant.state_size < plant.n_z and kind.compares_first_law)
+    few = 0 < values["sensors"] < values["n_z"]
+    compared = kind.judges_first_law or (few and kind.compares_first_law)
     law = next(cost for name, cost in costs.items() if name != "no control")
     good, hint = judged(costs["no control"], law, compared=compared)
     told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")

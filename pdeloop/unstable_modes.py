@@ -78,8 +78,8 @@ def observability(plant: Plant, positions: NDArray[np.int64]) -> UnstableModes:
     """How well the numbers of a state at `positions` observe the unstable modes.
 
     Right invariant subspace: A Q = Q T with Q orthonormal. The margin of a mode is the smallest
-    singular value of [lambda I - T; s C Q], where C picks the positions and s^2 is n_z over their
-    number: 1 for a wave that they observe as well as the whole state would.
+    singular value of [(lambda I - T) / g; s C Q], where C picks the positions, s^2 is n_z over their
+    number and g the largest growth in a step: 1 for the whole state.
     """
     if plant.n_z > MAX_LINEARISED:
         values, V = _leading(plant)
@@ -92,7 +92,8 @@ def observability(plant: Plant, positions: NDArray[np.int64]) -> UnstableModes:
         return _modes(plant, np.empty(0), np.empty((plant.n_z, 0)), np.empty(0))
     seen = np.sqrt(plant.n_z / len(positions)) * Q[positions]
     eigenvalues, vectors = linalg.eig(T)
-    pencils = [np.vstack([value * np.eye(count) - T, seen]) for value in eigenvalues]
+    growth = np.log(np.abs(eigenvalues).max())  # so that the sampling time does not matter
+    pencils = [np.vstack([(value * np.eye(count) - T) / growth, seen]) for value in eigenvalues]
     margins = np.array([linalg.svdvals(pencil)[-1] for pencil in pencils])
     return _modes(plant, eigenvalues, Q @ vectors, margins)
 

@@ -126,7 +126,7 @@ class Observer(EventLoop):
             while not self.stopped:
                 self.serve_next(WAIT)
                 self._turned = self.now()
-                if self.watchdog.longest() > SUSPENDED:
+                if not self.stopped and self.watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
         return self._stop_reason or "shutdown"

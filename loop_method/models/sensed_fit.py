@@ -212,7 +212,8 @@ def far_likelier(
         # Each with its likeliest fields: those of the best were held to that spread.
         _, *held = problem.fit(*best[1:], known=True, lengths=[problem.y.shape[1]])
         gain = problem.implausibility(*held) - problem.implausibility(*anew[1:])
-        if 0.5 * gain * problem.y.size / problem.noise > settings.sensed_likelier:
+        share = problem.weight(problem.y.shape[1])  # that of one reading, with its variance
+        if 0.5 * gain / share > settings.sensed_likelier:
             best = anew
     problem.prior.spread = spread
     return best

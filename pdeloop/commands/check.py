@@ -32,7 +32,7 @@ OF_A_NODE = {
     "n_z": ("controller",),
 }
 """The options that only the check of a node has, and of which."""
-OF_A_FILE = ("equation", "plant", "picture")
+OF_A_FILE = ("equation", "plant", "optimizer", "law", "picture")
 
 
 def add(commands: Commands) -> None:
@@ -76,7 +76,7 @@ def add(commands: Commands) -> None:
         "--network", action="store_true", default=None, help="the node may run on another machine"
     )
     problem = check.add_argument_group("problem")
-    add_own_code(problem)
+    add_own_code(problem, ("equation", "plant", "optimizer", "law"))
     add_flags(problem, "problem")
     add_set(problem)
     check.add_argument(

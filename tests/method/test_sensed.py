@@ -328,9 +328,10 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         assert again.any() and len(starts) == 6
         assert mosts == [(), (DEFAULTS.sensed_hopeless,)] * 2 + [(DEFAULTS.sensed_hopeless,)] * 2
         # A spread that followed from an earlier equation holds neither a third fit nor the choice.
-        worse, known = 0.0, {**few, "spread": np.full(33, 0.1)}
+        every_other = replace(few["settings"], sensed_compared=6)
+        worse, known = 0.0, {"settings": every_other, "spread": np.full(33, 0.1)}
         for nats, chosen in ((25.0, again), (35.0, likelier)):
-            gain = 2.0 * nats * compared[-1][0].noise / readings.size
+            gain = 2.0 * nats * compared[-1][0].noise / (readings.size / 2)
             told[:], spreads[:] = [0.0, 1.0, gain, 0.0], []
             found, kept, _ = fit_sensed(readings, actions, actuators, 1.0, shared, **known)
             assert found.any() == chosen.any() and not told

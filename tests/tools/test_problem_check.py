@@ -90,6 +90,17 @@ def test_waves_of_which_equally_spaced_sensors_see_one_phase_are_not_observed(
     assert sorted(set(found.waves[found.margins < REACHED, 0].tolist())) == lost
 
 
+def test_the_margin_of_sensors_does_not_depend_on_the_sampling_time() -> None:
+    margins = [
+        observability(as_sampled, as_sampled.grid.measured(1)).margins[0]
+        for as_sampled in (
+            plant_of(Growing(), n_z=32, n_a=1, width=0.1, sample_time=time, horizon=5)
+            for time in (0.1, 0.01)
+        )
+    ]
+    assert margins[1] == pytest.approx(margins[0], rel=0.1) and margins[0] > 0.05
+
+
 def test_the_whole_state_observes_every_wave_alike() -> None:
     found = observability(plant(1, 0.1), np.arange(32))
     np.testing.assert_allclose(found.margins, 1.0, atol=1e-6)
@@ -318,6 +329,8 @@ def test_the_first_law_is_judged_by_what_it_saves(
 
 def test_a_first_law_that_need_not_be_begun_with_is_not_bad() -> None:
     assert judged(9.0, 99.0, compared=True)[0] and judged(9.0, 1.0, compared=True) == (True, "")
+    assert judged(9.0, 9.1, compared=True)[0] and not judged(9.0, 9.1)[0]
+    assert not judged(np.inf, np.inf, compared=True)[0]
     values = resolve("kdv", {"sensors": 8})
     good, text = next((f.good, f.text) for f in check(values) if f.name == "first law")
     assert good and "does not help; the adaptation compares it" in text
