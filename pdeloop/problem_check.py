@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop check FILE`: whether a training can work with a problem's numbers.
 
-Findings: the integration step, by halving it; the actuators, by the plant linearised at the target;
-whether the plant diverges without control; the exploration, the order and the first law, by one
+Findings: the integration step, by halving it; actuators and sensors, by the plant linearised at the
+target; whether the plant diverges without control; the exploration, the order and the first law, by one
 exploratory episode.
 """
 
@@ -29,8 +29,7 @@ from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
-from tuner_node.build import build_training, remarks_on
-from tuner_node.optimizer_parameters import kind_of
+from tuner_node.build import build_training, compares_first_law, few_sensors, remarks_on
 
 __all__ = ["Finding", "check", "field_plant"]
 
@@ -67,8 +66,8 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding("actuators", False, f"{which} the state: see what step does with its a")
     yield _halving(plant, values, explored)
     yield _actuators(plant)
-    if 0 < values["sensors"] < plant.grid.points:
-        yield _sensors(plant, values["sensors"])
+    if sensors := few_sensors(values):
+        yield _sensors(plant, sensors)
     lost = _without_control(plant)
     if len(lost):
         yield Finding(
@@ -223,12 +222,15 @@ def _sensors(plant: Plant, sensors: int) -> Finding:
     if len(lost):
         waves = named_waves(plant.grid, lost)
         return Finding(
-            name, False, f"{sensors} of them do not observe {waves}: take more, or another number"
+            name,
+            False,
+            f"of {len(found.growth)} unstable modes these are not observed: {waves}; take more "
+            "sensors, or another number",
         )
     return Finding(
         name,
         True,
-        f"{sensors} of them observe all unstable modes, with a margin of at least "
+        f"the {len(found.growth)} unstable modes are observed, with a margin of at least "
         f"{found.margins.min():.2g} (1: that of the whole state)",
     )
 
@@ -286,10 +288,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()
     )
-    kind = kind_of(values)
-    few = 0 < values["sensors"] < values["n_z"]
-    compared = kind.judges_first_law or (few and kind.compares_first_law)
     law = next(cost for name, cost in costs.items() if name != "no control")
-    good, hint = judged(costs["no control"], law, compared=compared)
+    good, hint = judged(costs["no control"], law, compared=compares_first_law(values))
     told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")
     yield Finding("first law", good, told, note=good and bool(hint))

@@ -44,6 +44,9 @@ class UnstableModes:
     margins: Array
 
 
+NONE_UNSTABLE = UnstableModes(np.empty(0), np.empty((0, 1), dtype=np.int64), np.empty(0))
+
+
 def linearisation(plant: Plant) -> tuple[Array, Array]:
     """A (n_z, n_z) and B (n_z, n_a) of z+ = f(z, a) at the target without action.
 
@@ -65,11 +68,12 @@ def controllability(plant: Plant) -> UnstableModes:
     if plant.n_z > MAX_LINEARISED:
         return controllability_by_powers(plant)
     A, B = linearisation(plant)
-    T, W, count = _unstable_subspace(A.T)
-    if not count:
-        return _modes(plant, np.empty(0), np.empty((plant.n_z, 0)), np.empty(0))
-    eigenvalues, vectors = linalg.eig(T.T, left=True, right=False)
-    pencils = [np.hstack([value * np.eye(count) - T.T, W.T @ B]) for value in eigenvalues]
+    transposed, W = _unstable_subspace(A.T)
+    T = transposed.T
+    if not len(T):
+        return NONE_UNSTABLE
+    eigenvalues, vectors = linalg.eig(T, left=True, right=False)
+    pencils = [np.hstack([value * np.eye(len(T)) - T, W.T @ B]) for value in eigenvalues]
     margins = np.array([linalg.svdvals(pencil)[-1] for pencil in pencils])
     return _modes(plant, eigenvalues, W @ vectors, margins / max(float(linalg.norm(B, 2)), 1e-300))
 
@@ -86,14 +90,13 @@ def observability(plant: Plant, positions: NDArray[np.int64]) -> UnstableModes:
         Q, R = linalg.qr(V, mode="economic")
         T = linalg.solve(R.T, (R * values).T).T if len(values) else np.empty((0, 0))
     else:
-        T, Q, _ = _unstable_subspace(linearisation(plant)[0])
-    count = len(T)
-    if not count:
-        return _modes(plant, np.empty(0), np.empty((plant.n_z, 0)), np.empty(0))
+        T, Q = _unstable_subspace(linearisation(plant)[0])
+    if not len(T):
+        return NONE_UNSTABLE
     seen = np.sqrt(plant.n_z / len(positions)) * Q[positions]
     eigenvalues, vectors = linalg.eig(T)
     growth = np.log(np.abs(eigenvalues).max())  # so that the sampling time does not matter
-    pencils = [np.vstack([(value * np.eye(count) - T) / growth, seen]) for value in eigenvalues]
+    pencils = [np.vstack([(value * np.eye(len(T)) - T) / growth, seen]) for value in eigenvalues]
     margins = np.array([linalg.svdvals(pencil)[-1] for pencil in pencils])
     return _modes(plant, eigenvalues, Q @ vectors, margins)
 
@@ -106,7 +109,7 @@ def controllability_by_powers(plant: Plant) -> UnstableModes:
     """
     eigenvalues, V = _leading(plant)
     if not len(eigenvalues):
-        return _modes(plant, eigenvalues, V, np.empty(0))
+        return NONE_UNSTABLE
     states = _moved(plant, np.zeros((plant.n_a, plant.n_z)), SMALL * np.eye(plant.n_a)) / SMALL
     size = float(linalg.norm(states))
     reached, power = np.zeros((len(eigenvalues), plant.n_a), dtype=complex), 0
@@ -125,14 +128,14 @@ def _modes(plant: Plant, eigenvalues: Array, vectors: Array, margins: Array) -> 
     """Modes (n_z, n) by descending growth."""
     growth = np.log(np.abs(eigenvalues)) / plant.sample_time
     order = np.argsort(-growth)
-    waves = _strongest_waves(plant.grid, vectors.T) if len(order) else np.empty((0, 1), np.int64)
+    waves = _strongest_waves(plant.grid, vectors.T)
     return UnstableModes(growth[order], waves[order], margins[order])
 
 
-def _unstable_subspace(A: Array) -> tuple[Array, Array, int]:
-    """T and orthonormal Q of A Q = Q T for the unstable eigenvalues, and their number."""
+def _unstable_subspace(A: Array) -> tuple[Array, Array]:
+    """T and orthonormal Q of A Q = Q T for the unstable eigenvalues."""
     T, Q, count = linalg.schur(A, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
-    return T[:count, :count], Q[:, :count], count
+    return T[:count, :count], Q[:, :count]
 
 
 def _leading(plant: Plant) -> tuple[Array, Array]:

@@ -181,6 +181,25 @@ def remarks_on(values: Mapping[str, Any]) -> list[str]:
     return []
 
 
+def few_sensors(values: Mapping[str, Any]) -> int:
+    """The number of sensors; 0 where the whole state is measured, as by one at every point."""
+    return int(values["sensors"]) if values["sensors"] < values["n_z"] else 0
+
+
+def kind_used(values: Mapping[str, Any]) -> type[Optimizer]:
+    """The class of the optimiser, or of the one that it hands over to with few sensors."""
+    kind = kind_of(values)
+    if few_sensors(values) and kind.with_sensors and values["law"] not in kind.also_improves:
+        return kind_of({"optimizer": kind.with_sensors})
+    return kind
+
+
+def compares_first_law(values: Mapping[str, Any]) -> bool:
+    """True if the optimiser compares the first law with no control itself."""
+    kind = kind_used(values)
+    return kind.judges_first_law or bool(few_sensors(values) and kind.compares_first_law)
+
+
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     order = model_order(values)
@@ -190,12 +209,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
             "the models of a batch have one order; give --reduced-order N (a training of one seed "
             "says which), or train each seed on its own with pdeloop study"
         )
-    kind = kind_of(values)
-    chosen = settings_of(kind, values)
-    # One at every point measures the whole state.
-    sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
-    if sensors and kind.with_sensors and values["law"] not in kind.also_improves:
-        kind = kind_of({"optimizer": kind.with_sensors})
+    named, kind, sensors = kind_of(values), kind_used(values), few_sensors(values)
+    chosen = settings_of(named, values)
+    if kind is not named:
         chosen = kind.Settings()
 
     law = law_of(values, kind)
@@ -218,7 +234,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         return made(context)
 
     explorations = 1 if sensors and law is Affine else kind.explorations
-    if kind.judges_first_law or (sensors and kind.compares_first_law):
+    if compares_first_law(values):
         values = {**values, "identification_attempts": 1}
     step = kind.first_step(chosen)
     check_budget(values, kind, step, explorations)

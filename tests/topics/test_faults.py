@@ -81,6 +81,7 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
     assert_same_training(out, in_process(iterations=100))
 
 
+@pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize(
     ("loop_class", "run"),
     [
@@ -88,31 +89,16 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
         ("observer.Observer", "self.loop.run()"),
     ],
 )
-def test_a_node_that_is_stopped_while_it_starts_joins_again(loop, loop_class, run):
-    # Otherwise peers that have forgotten it, and that it still knows, may never find it again.
+def test_a_node_that_is_stopped_while_it_starts_joins_again_or_ends(loop, loop_class, run, ends):
+    # Peers that have forgotten it, and that it still knows, may never find it again otherwise.
     node = loop.start("-c", STOPS_WHILE_IT_STARTS.format(loop=loop_class, run=run), name="late")
     state = Path(f"/proc/{node.pid}/stat")
     until(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", LIMIT, "stop")
     time.sleep(2.5)
+    if ends:
+        node.send_signal(signal.SIGTERM)
     node.send_signal(signal.SIGCONT)
-    assert "as a new participant" in loop.wait(node, LIMIT)
-
-
-@pytest.mark.parametrize(
-    ("loop_class", "run"),
-    [
-        ("node_loop.NodeLoop", "self.loop.run(lambda now: None)"),
-        ("observer.Observer", "self.loop.run()"),
-    ],
-)
-def test_a_node_that_is_told_to_end_while_it_is_stopped_ends(loop, loop_class, run):
-    node = loop.start("-c", STOPS_WHILE_IT_STARTS.format(loop=loop_class, run=run), name="late")
-    state = Path(f"/proc/{node.pid}/stat")
-    until(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", LIMIT, "stop")
-    time.sleep(2.5)
-    node.send_signal(signal.SIGTERM)
-    node.send_signal(signal.SIGCONT)
-    assert "as a new participant" not in loop.wait(node, LIMIT)
+    assert ("as a new participant" in loop.wait(node, LIMIT)) != ends
 
 
 def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
