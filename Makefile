@@ -16,16 +16,25 @@ setup: .venv/ready
 # needs, then those of the tests. Each archive must have one of the digests in requirements/. Bytecode is
 # compiled at the first import.
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt \
-	| sed -un 's/^Collecting \([^ ]*\).*/  \1/p; s/^Installing collected.*/  installing/p'
+# Faster than pip; from the index that pip is told of.
+UV := UV_DEFAULT_INDEX=$${UV_DEFAULT_INDEX:-$${PIP_INDEX_URL:-$$($(PIP) config get global.index-url 2>/dev/null)}} \
+	$(BIN)/python -m uv
+# pip knows more ways to an index (find-links, several indices): it tries where uv has failed.
+install = { $(UV) pip install --python $(BIN)/python --require-hashes -r requirements/$(1).txt 2>&1 \
+		| sed -u '/^ [-+~] /d; /Downloaded/d; /Buil[dt]/d' || { echo "installing with pip instead" && \
+		$(PIP) install --quiet --no-compile --require-hashes -r requirements/$(1).txt; }; } >&2
 
-.venv/runs: pyproject.toml requirements/run.txt
+.venv/uv: requirements/uv.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "pdeloop needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
 	@test -d .venv || echo "setting up .venv, once: Python packages and ROS 2"
 	@test -d .venv || $(PYTHON) -m venv .venv
+	@$(PIP) install --quiet --no-compile --require-hashes -r requirements/uv.txt
+	@touch $@
+
+.venv/runs: .venv/uv pyproject.toml requirements/run.txt
 	@$(call install,run)
-	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
+	@$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
 	@touch $@
 
 .venv/ready: .venv/runs requirements/test.txt
@@ -33,28 +42,22 @@ install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt 
 	@$(call install,test)
 	@touch $@
 
-# uv writes the digests, pip-audit asks for advisories; pdeloop itself needs neither.
-.venv/supply:
-	@test -d .venv || $(PYTHON) -m venv .venv
-	@$(PYTHON) -m venv .venv/supply.new
-	@.venv/supply.new/bin/python -m pip install -qq --disable-pip-version-check uv==0.13.9 pip-audit==2.10.1
-	@mv .venv/supply.new $@
-
 # The digests of all archives of the pinned versions; a version is changed in constraints.txt. With its extras,
 # since pip holds name[extra], which a package asks for, to the pin of name[extra] alone.
-lock: .venv/supply
-	@for part in run:ros,report test:ros,dev; do \
-		echo setuptools | .venv/supply/bin/python -m uv pip compile --quiet --universal --generate-hashes --no-strip-extras \
-			--no-annotate --no-header --constraint constraints.txt $$(echo $${part#*:} | tr , '\n' | sed 's/^/--extra /') \
-			--output-file requirements/$${part%:*}.txt pyproject.toml - || exit 1; \
+lock: .venv/uv
+	@for part in uv: run:ros,report test:ros,dev; do \
+		extras=$${part#*:}; { if [ $$extras ]; then echo setuptools; else echo uv; fi; } \
+			| $(UV) pip compile --quiet --universal --generate-hashes --no-strip-extras \
+			--no-annotate --no-header --constraint constraints.txt $$(echo $$extras | tr , '\n' | sed 's/./--extra &/') \
+			--output-file requirements/$${part%:*}.txt $${extras:+pyproject.toml} - || exit 1; \
 		sed -i "s/ ; python_full_version >= '3.11.5' and python_full_version < '3.15' and sys_platform == 'linux'//" \
 			requirements/$${part%:*}.txt; \
 	done
 
 # Which of the pinned versions are no longer the newest, and which have known vulnerabilities.
-audit: setup .venv/supply
+audit: setup
 	@$(PIP) list --outdated
-	@.venv/supply/bin/python -m pip_audit --requirement requirements/test.txt --require-hashes --disable-pip \
+	@$(UV) tool run pip-audit==2.10.1 --requirement requirements/test.txt --require-hashes --disable-pip \
 		--progress-spinner off
 
 run: .venv/runs
