@@ -244,7 +244,9 @@ def designed(
         found_model = subspace_model(
             every, order=settings.reduced_order, channels=channels, settings=settings.method
         )
-        return Designed(lqg.law_of_innovations(found_model, target, **weights))
+        return Designed(
+            lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control)
+        )
     truncated = settings.identification == "dmdc"
     model = identify(
         trajectories,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from controller_node.identification import DesignSettings, design
+from controller_node.identification import DesignSettings, designed
 from controller_node.law_batch import LawBatch
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
@@ -274,13 +274,20 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             f"{suggested + plant.n_a} or more"
         )
     yield Finding("order", True, told)
-    costs = {"no control": _drawn_fields_cost(plant)}
+    costs, compared = {"no control": _drawn_fields_cost(plant)}, compares_first_law(values)
     for order in dict.fromkeys(orders):
         try:
             own = replace(settings, reduced_order=order)
-            rows = design([first], plant.target, own, further=further)
+            rows = designed([first], plant.target, own, further=further, or_no_control=True).rows
         except ValueError as error:
             yield Finding("first law", False, f"of order {order}: {error}")
+            return
+        if not rows.K_a.any():
+            told = (
+                f"the model of order {len(rows.A)} has no stabilising gains: a training explores "
+                "again, or begins from no control"
+            )
+            yield Finding("first law", compared, told, note=compared)
             return
         cost = _drawn_fields_cost(plant, _first_law(plant, rows, settings))
         costs.setdefault(f"order {rows.A.shape[0]}", cost)
@@ -289,6 +296,6 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         for name, cost in costs.items()
     )
     law = next(cost for name, cost in costs.items() if name != "no control")
-    good, hint = judged(costs["no control"], law, compared=compares_first_law(values))
+    good, hint = judged(costs["no control"], law, compared=compared)
     told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")
     yield Finding("first law", good, told, note=good and bool(hint))

@@ -231,6 +231,7 @@ def law_of_innovations(
     state_weight: float,
     action_weight: float,
     cost: Cost | None = None,
+    or_no_control: bool = False,
 ) -> ModelRows:
     """The LQG law of a model in innovation form, for the cost of the measurements.
 
@@ -248,6 +249,8 @@ def law_of_innovations(
         q and r.
     cost : Cost, optional
         In place of them.
+    or_no_control : bool
+        Gains of 0, with the filter, where there are no stabilising ones.
 
     Raises
     ------
@@ -263,12 +266,17 @@ def law_of_innovations(
     with one_thread():
         require_detectable(A, C)
         seen = ReducedModel(A, B, model.U @ C)
-        gains = track_outputs(seen, cost)
-        b = gains.K_b @ (seen.U.T @ cost.field_target)
+        try:
+            gains = track_outputs(seen, cost)
+            K_a, b = gains.K_a, gains.K_b @ (seen.U.T @ cost.field_target)
+        except DesignError:
+            if not or_no_control:
+                raise
+            K_a, b = np.zeros_like(B.T), np.zeros(n_a)
         back = linalg.pinv(C)
         M = linalg.lstsq(A, model.G)[0]
         U = model.U @ back.T
         s_r = U.T @ target
         size = float(s_r @ s_r)
-        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(gains.K_a)
-    return ModelRows(A=A, B=B, U=U, K_a=gains.K_a, K_b=K_b, s_r=s_r, L=M @ C)
+        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C)
