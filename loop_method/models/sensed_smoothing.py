@@ -30,7 +30,7 @@ class Smoothing:
 
     Attributes
     ----------
-    shared : (24 + n_a,) array
+    shared : (44 + n_a,) array
         The equation's unknowns.
     actuators : Actuators
         What is declared of them.

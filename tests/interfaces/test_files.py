@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces import array_files
-from loop_interfaces.files import FileError, open_own, read_json, write_atomically
+from loop_interfaces.files import FileError, make_folder, open_own, read_json, write_atomically
 from loop_interfaces.spec import ParameterError, read_document
 from pdeloop.cli import FAILED, main
 from pdeloop.commands import new
@@ -76,6 +76,28 @@ def test_what_cannot_be_written_is_named_and_no_half_of_it_stays(tmp_path, monke
     with pytest.raises(FileError, match=f"cannot write to {tmp_path}/my-pde: No space left"):
         new.write("my-pde", tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_content_and_then_its_name_are_on_the_disk_when_a_write_returns(tmp_path, monkeypatch):
+    synced, replace, calls = os.fsync, os.replace, []
+
+    def fsync(descriptor: int) -> None:
+        calls.append(("fsync", os.readlink(f"/proc/self/fd/{descriptor}")))
+        synced(descriptor)
+
+    def renamed(*names: str | os.PathLike[str]) -> None:
+        calls.append(("replace", *map(os.fspath, names)))
+        replace(*names)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", renamed)
+    write_atomically(tmp_path / "file", b"content")
+    part, path = str(tmp_path / "file.part"), str(tmp_path / "file")
+    assert calls == [("fsync", part), ("replace", part, path), ("fsync", str(tmp_path))]
+    calls.clear()
+    make_folder(tmp_path / "a" / "b")
+    # A name is an entry of the folder above it.
+    assert {found for _, found in calls} == {str(tmp_path), str(tmp_path / "a")}
 
 
 def test_a_terminal_does_not_obey_what_a_file_says(tmp_path, capsys):
