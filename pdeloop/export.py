@@ -17,6 +17,8 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.spec import ParameterError
 from loop_method.laws import Law
+from loop_method.laws.extended_kalman import ExtendedKalman
+from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
 
 LAWS = ("adapted", "lqt")
@@ -24,14 +26,15 @@ CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diver
 """Columns of a curve."""
 FORMULA = tuple("=+-@\t\r")
 """First characters of a formula in a spreadsheet."""
-_C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
+_TEMPLATES = Path(__file__).parent / "commands" / "template"
 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """Export of a law without gains: theta, its name, and the model it belongs to.
 
-    law: None where it is code that is not allowed, so that theta has no parts.
+    law: None where it is code that is not allowed, so that theta has no parts; name: what it is the law
+    of, in words.
     """
 
     kind: str
@@ -40,6 +43,7 @@ class Parameters:
     law: Law | None
     limit: float
     sample_time: float
+    name: str
 
     def npz(self) -> bytes:
         """`law`, its name, `theta`, its parts as `theta.NAME`, and the reduced model."""
@@ -56,11 +60,23 @@ class Parameters:
         )
 
     def c(self) -> bytes:
-        """Refused with a ParameterError: only gains are written in C."""
-        raise ParameterError(
-            f"the law '{self.kind}' has no gains, so it cannot be written in C; write its "
-            "parameters as .npz"
-        )
+        """One function in C99 for the law `observer`, and for one that acts on nothing else.
+
+        Any other law is refused with a ParameterError.
+        """
+        law, theta, other = self.law, self.theta, ""
+        if isinstance(law, ExtendedKalman) and law.estimates(theta):
+            other = ", or train with `--law observer`, which can"
+        if other or type(law) not in (Observer, ExtendedKalman):
+            raise ParameterError(
+                f"the law '{self.kind}' cannot be written in C; write its parameters as .npz{other}"
+            )
+        assert law is not None
+        parts = law.parts(theta)
+        matrices = {name: _rows(parts[name]) for name in ("K", "D", "F", "G")}
+        vectors = {name: _numbers(parts[name]) for name in ("b", "c")}
+        B = _rows(self.model.B)
+        return _filled("observer", self, self.model, B=B, **matrices, **vectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,20 +103,8 @@ class GainLaw:
     def c(self) -> bytes:
         """One function in C99 without a library, whose numbers are the law's own to the bit."""
         model = self.model
-        (n_z, n_s), n_a = model.U.shape, len(model.K_a)
-        constant = model.K_b @ model.s_r
-        filled = {
-            "name": " ".join(self.name.replace("*/", "* /").split()),
-            "sample_time": repr(self.sample_time),
-            "n_z": n_z,
-            "n_s": n_s,
-            "n_a": n_a,
-            "U": _rows(model.U.T),
-            "K_a": _rows(model.K_a),
-            "constant": ", ".join(map(_hex, constant)),
-            "limit": _hex(self.limit),
-        }
-        return Template(_C.read_text()).substitute(filled).encode()
+        constant = _numbers(model.K_b @ model.s_r)
+        return _filled("law", self, model, K_a=_rows(model.K_a), constant=constant)
 
 
 def law_of(
@@ -121,13 +125,15 @@ def law_of(
     policy = (run.policies if which == "adapted" else run.warm)[m]
     model, limit = run.models[m], float(run.values["action_limit"])
     law = _loaded(run, m)
+    step, name = (
+        float(run.values["sample_time"]),
+        f"the {which} law of {run.values['problem']}, seed {seed}",
+    )
     if law is None or not law.compiled:
-        kind, step = str(run.values["law"]), float(run.values["sample_time"])
-        return Parameters(kind, policy.ravel(), model, law, limit, step)
+        return Parameters(str(run.values["law"]), policy.ravel(), model, law, limit, step, name)
     gains, n_s = law.gains(policy.ravel()), model.U.shape[1]
     own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())
-    name = f"the {which} law of {run.values['problem']}, seed {seed}"
-    return GainLaw(own, limit, float(run.values["sample_time"]), name)
+    return GainLaw(own, limit, step, name)
 
 
 def _loaded(run: FinishedRun, m: int) -> Law | None:
@@ -161,9 +167,25 @@ def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA else value
 
 
+def _filled(template: str, law: GainLaw | Parameters, model: ModelRows, **numbers: str) -> bytes:
+    """A template with the law's numbers; U, sizes, limit and name among them."""
+    (n_z, n_s), n_a = model.U.shape, len(model.K_a)
+    text = Template((_TEMPLATES / f"{template}.c.txt").read_text())
+    return text.substitute(
+        name=" ".join(law.name.replace("*/", "* /").split()),
+        sample_time=repr(law.sample_time),
+        n_z=n_z,
+        n_s=n_s,
+        n_a=n_a,
+        U=_rows(model.U.T),
+        limit=float(law.limit).hex(),
+        **numbers,
+    ).encode()
+
+
 def _rows(matrix: Array) -> str:
-    return ",\n    ".join("{" + ", ".join(map(_hex, row)) + "}" for row in matrix)
+    return ",\n    ".join(f"{{{_numbers(row)}}}" for row in matrix)
 
 
-def _hex(value: float) -> str:
-    return float(value).hex()
+def _numbers(vector: Array) -> str:
+    return ", ".join(float(value).hex() for value in vector)

@@ -8,6 +8,7 @@ import hashlib
 import io
 import os
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_content_and_then_its_name_are_on_the_disk_when_a_write_returns(tmp_path
     synced, replace, calls = os.fsync, os.replace, []
 
     def fsync(descriptor: int) -> None:
-        calls.append(("fsync", os.readlink(f"/proc/self/fd/{descriptor}")))
+        calls.append(("fsync", str(Path(f"/proc/self/fd/{descriptor}").readlink())))
         synced(descriptor)
 
     def renamed(*names: str | os.PathLike[str]) -> None:

@@ -16,16 +16,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from controller_node.law_batch import LawBatch
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.spec import ParameterError
+from loop_method.laws.extended_kalman import ExtendedKalman
 from pdeloop.cli import FAILED, main
 from pdeloop.comparison import compare
-from pdeloop.export import GainLaw, curve_csv
+from pdeloop.export import GainLaw, Parameters, curve_csv
 from pdeloop.finished_run import load_run
 from pdeloop.study.table import reduction_texts
 from tests.support.small import SMALL
 
 LIMIT = 0.2
+DOUBLES = ctypes.POINTER(ctypes.c_double)
+needs_compiler = pytest.mark.skipif(
+    shutil.which("cc") is None, reason="needs a C compiler, the command cc (make packages)"
+)
 
 
 @pytest.fixture(scope="module")
@@ -110,21 +117,26 @@ def test_what_is_no_run_is_refused(
     assert "expected two runs or more" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(
-    shutil.which("cc") is None, reason="needs a C compiler, the command cc (make packages)"
-)
-@pytest.mark.parametrize(("name", "law", "seed"), [("plain", "adapted", 6), ("limited", "lqt", 0)])
-def test_the_law_in_c_is_the_law_of_the_loop(
-    runs: dict[str, Path], tmp_path: Path, name: str, law: str, seed: int
-) -> None:
-    run, source, library = load_run(runs[name]), tmp_path / "law.c", tmp_path / "law.so"
-    words = ["--out", str(source), "--controller", law, "--seed", str(seed)]
-    assert main(["export", str(runs[name]), *words]) == 0
+def compiled(source: Path) -> Any:
+    """The function of an exported law, compiled without a warning."""
+    library = source.with_suffix(".so")
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
     built = subprocess.run(
         ["cc", *strict, "-o", str(library), str(source)], capture_output=True, text=True, timeout=60
     )
     assert built.returncode == 0, built.stderr
+    return ctypes.CDLL(str(library)).pdeloop_law
+
+
+@needs_compiler
+@pytest.mark.parametrize(("name", "law", "seed"), [("plain", "adapted", 6), ("limited", "lqt", 0)])
+def test_the_law_in_c_is_the_law_of_the_loop(
+    runs: dict[str, Path], tmp_path: Path, name: str, law: str, seed: int
+) -> None:
+    run, source = load_run(runs[name]), tmp_path / "law.c"
+    words = ["--out", str(source), "--controller", law, "--seed", str(seed)]
+    assert main(["export", str(runs[name]), *words]) == 0
+    function = compiled(source)
     m = run.seeds.index(seed)
     model, gains = run.models[m], (run.policies if law == "adapted" else run.warm)[m]
     states = np.random.default_rng(0).normal(size=(20, len(model.U)))
@@ -132,10 +144,8 @@ def test_the_law_in_c_is_the_law_of_the_loop(
     n_s = model.U.shape[1]
     expected = states @ model.U @ gains[:, :n_s].T + gains[:, n_s:] @ model.s_r
     found = np.empty((20, len(gains)))
-    function = ctypes.CDLL(str(library)).pdeloop_law
-    double = ctypes.POINTER(ctypes.c_double)
     for z, a in zip(states, found, strict=True):
-        function(z.ctypes.data_as(double), a.ctypes.data_as(double))
+        function(z.ctypes.data_as(DOUBLES), a.ctypes.data_as(DOUBLES))
     if limit:
         assert (np.abs(expected) > limit).any()
         expected = np.clip(expected, -limit, limit)
@@ -143,6 +153,39 @@ def test_the_law_in_c_is_the_law_of_the_loop(
     loop = ProjectedLaw([model.U], np.linalg.pinv(model.U.T) @ model.s_r, limit)
     loop.set(np.repeat(gains[np.newaxis], 20, axis=0), np.zeros(20, dtype=np.int64))
     np.testing.assert_allclose(found, loop.actions(states), rtol=1e-12, atol=1e-13)
+
+
+@needs_compiler
+def test_a_law_with_a_linear_filter_in_c_is_that_of_the_loop(tmp_path: Path) -> None:
+    out, source, horizon = tmp_path / "run", tmp_path / "law.c", 20
+    words = ["--sensors", "8", "--law", "observer", "--optimizer", "two-point", "--iterations", "2"]
+    words += ["--action-limit", str(LIMIT), "--set", f"horizon={horizon}", "--out", str(out)]
+    assert main(["train", str(SMALL), "--in-process", *words]) == 0
+    run = load_run(out)
+    assert main(["export", str(out), "--out", str(source)]) == 0
+    assert_c_is(source, run.laws[0], run.policies[0])
+
+    # So is one with a nonlinear filter as long as it acts on its linear one alone.
+    law = ExtendedKalman(run.models[0], horizon)
+    theta = law.theta_start.ravel()
+    exported = Parameters(law.name, theta, law.model, law, LIMIT, 0.1, "the lqt law")
+    source = tmp_path / "first.c"  # a library that is loaded already is not loaded again
+    source.write_bytes(exported.c())
+    assert_c_is(source, law, theta)
+    with pytest.raises(ParameterError, match="train with `--law observer`, which can"):
+        replace(exported, theta=np.ones_like(theta)).c()
+
+
+def assert_c_is(source: Path, law: Any, theta: Any) -> None:
+    """Assert that an exported law gives the actions of the loop's, in two episodes."""
+    function, loop, found = compiled(source), LawBatch([law], np.zeros(8), LIMIT), np.empty(law.n_a)
+    readings = np.random.default_rng(0).normal(size=(law.horizon, 8))
+    for _ in range(2):
+        memory = ctypes.create_string_buffer(8 * (1 + len(law.model.A)))
+        loop.set(theta.reshape(1, *law.shape))
+        for k, y in enumerate(readings):
+            function(memory, y.ctypes.data_as(DOUBLES), found.ctypes.data_as(DOUBLES))
+            np.testing.assert_allclose(found, loop.actions(k, y[None])[0], rtol=1e-9, atol=1e-12)
 
 
 def test_the_law_in_an_npz_begins_a_training(runs: dict[str, Path], tmp_path: Path) -> None:
