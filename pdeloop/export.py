@@ -21,7 +21,6 @@ from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
 
-LAWS = ("adapted", "lqt")
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
 """Columns of a curve."""
 FORMULA = tuple("=+-@\t\r")
@@ -114,21 +113,10 @@ def law_of(
 
     ParameterError for a seed that the run does not have.
     """
-    if which not in LAWS:
-        raise ParameterError(f"the law is '{which}'; expected one of {', '.join(LAWS)}")
-    seed = run.seeds[0] if seed is None else seed
-    if seed not in run.seeds:
-        raise ParameterError(
-            f"the run has no seed {seed}; expected one from {run.seeds[0]} to {run.seeds[-1]}"
-        )
-    m = run.seeds.index(seed)
-    policy = (run.policies if which == "adapted" else run.warm)[m]
-    model, limit = run.models[m], float(run.values["action_limit"])
-    law = _loaded(run, m)
-    step, name = (
-        float(run.values["sample_time"]),
-        f"the {which} law of {run.values['problem']}, seed {seed}",
-    )
+    m, policy = run.index(seed), run.theta(which, seed)
+    model, law, limit = run.models[m], _loaded(run, m), float(run.values["action_limit"])
+    step = float(run.values["sample_time"])
+    name = f"the {which} law of {run.values['problem']}, seed {run.seeds[m]}"
     if law is None or not law.compiled:
         return Parameters(str(run.values["law"]), policy.ravel(), model, law, limit, step, name)
     gains, n_s = law.gains(policy.ravel()), model.U.shape[1]

@@ -11,17 +11,23 @@ from typing import Any
 
 import numpy as np
 
+from controller_node.law_batch import LawBatch
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
 from loop_method.laws.registry import law_kind
+from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
+from pdeloop.episode import Law as ActingLaw
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, model_of
 
+LAWS = ("adapted", "lqt")
+"""The laws of a run, the first being the default."""
 RESAMPLES = 9999
 CONFIDENCE = 0.95
 
@@ -82,6 +88,100 @@ class FinishedRun:
             self.values["horizon"],
             self.values.get("cost", ()),
         )
+
+    def index(self, seed: int | None = None) -> int:
+        """Where a training seed stands in the arrays.
+
+        Parameters
+        ----------
+        seed
+            The training seed; the first one if not given.
+
+        Returns
+        -------
+        int
+
+        Raises
+        ------
+        ValueError
+            The run does not have that seed.
+        """
+        if seed is None:
+            return 0
+        if seed not in self.seeds:
+            raise ParameterError(
+                f"the run has no seed {seed}; expected one from {self.seeds[0]} to {self.seeds[-1]}"
+            )
+        return self.seeds.index(seed)
+
+    def theta(self, which: str = "adapted", seed: int | None = None) -> Array:
+        """The parameters of a law of this run.
+
+        Parameters
+        ----------
+        which
+            "adapted", or "lqt", the first law.
+        seed
+            The training seed; the first one if not given.
+
+        Returns
+        -------
+        (n_a, 2 n_s) or (size,) array
+            As in `policies`.
+
+        Raises
+        ------
+        ValueError
+            There is no such law or seed.
+        """
+        if which not in LAWS:
+            raise ParameterError(f"the law is {which!r}; expected one of {', '.join(LAWS)}")
+        found: Array = (self.policies if which == "adapted" else self.warm)[self.index(seed)]
+        return found
+
+    def law(self, which: str = "adapted", seed: int | None = None) -> ActingLaw:
+        """A law of this run, to act with: in `pdeloop.rollout`, or on a machine.
+
+        Parameters
+        ----------
+        which
+            "adapted", or "lqt", the first law.
+        seed
+            The training seed; the first one if not given.
+
+        Returns
+        -------
+        function of (k, states)
+            The actions (M, n_a), saturated at the action limit, for the step k and what is measured of
+            M plants, (M, n_z). A law with a memory needs the steps in order; step 0 begins an episode.
+
+        Raises
+        ------
+        ValueError
+            There is no such law or seed, or the law is code that is not allowed.
+
+        Examples
+        --------
+        >>> import pdeloop
+        >>> run = pdeloop.train("burgers", optimizer="two_point", rollouts=5)
+        >>> episode = pdeloop.rollout(pdeloop.problem("burgers").plant(), run.law(), [0, 1])
+        >>> episode.actions.shape
+        (300, 2, 6)
+        """
+        theta, m = self.theta(which, seed), self.index(seed)
+        law, model = self.laws[m], self.models[m]
+        try:
+            target = build_plant(self.values, compiled=False).target
+        except ValueError:  # a plant of another program: what U shows of its target
+            target = np.linalg.pinv(model.U.T) @ model.s_r
+        batch = LawBatch([law], target, float(self.values["action_limit"]))
+
+        def act(k: int, states: Array) -> Array:
+            if k == 0:
+                batch.set(np.repeat(theta[None], len(states), axis=0))
+            return batch.actions(k, states)
+
+        return act
 
     @property
     def before(self) -> list[int]:

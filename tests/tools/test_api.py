@@ -56,6 +56,23 @@ def test_a_training_has_the_bits_of_the_command_line(run, tmp_path: Path) -> Non
         pdeloop.train(str(SMALL), out=tmp_path / "kept")
 
 
+@pytest.mark.parametrize("given", [{}, {"sensors": 8, "law": "observer", "measurement_noise": 0.1}])
+def test_a_law_of_a_run_acts_as_in_its_evaluation(given: dict[str, object]) -> None:
+    problem = pdeloop.problem(SMALL, **given)
+    run = pdeloop.train(problem, **TWO_POINT)
+    plant = problem.plant()
+    seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(3)]
+    noise = np.array([derive(0, Purpose.EVALUATION_NOISE, i) for i in range(3)])
+    for which, costs in ((["adapted"], "adapted"), (["lqt", 5], "lqt")):
+        law = run.law(*which)
+        for _ in range(2):  # its memory begins anew
+            episode = pdeloop.rollout(plant, law, seeds, noise)
+            assert same_bits(episode.costs.mean, run.costs[costs][0])
+    for which, seed, told in (("none", None, "one of adapted, lqt"), ("lqt", 6, "no seed 6")):
+        with pytest.raises(ValueError, match=told):
+            run.law(which, seed)
+
+
 def test_its_parts_make_what_the_training_made(run, small) -> None:
     """Exploration, identification, design and rollouts one by one."""
     values = run.values
