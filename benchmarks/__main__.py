@@ -26,21 +26,21 @@ from pdeloop.output import print_json
 
 PROGRAMS = {
     "first_run": "where the first `make run` in a fresh clone spends its time",
-    "rtt": "rounds per second of the loop, next to a bare ping-pong",
+    "rtt": "rounds per second of the loop, compared with a bare ping-pong",
     "batch": "environment steps per second against the size of the batch",
-    "train": "a whole training: over topics against in process",
+    "train": "a whole training, over topics and in one process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "baselines": "optimisers and other methods at equal rollouts, with intervals over seeds",
     "field_models": "the selected model of the whole field and its error",
     "choices": "how often the law that a training returns is the wrong one",
     "general": "held-out plants and initial fields: first law, adapted law and limit",
     "scale": "messages, bags, fits, memory and files as the state grows",
-    "published": "tasks with published figures, side by side",
+    "published": "tasks with published figures, which are shown beside ours",
     "optimum": "limits of the policy class and of any controller, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
-    "estimator": "cost of an estimator with the true plant, few sensors and noise",
+    "estimator": "cost with an estimator that knows the true plant, from few sensors and with noise",
     "few_sensors": "trainings with few sensors and noise, seed by seed",
-    "hidden_noise": "trainings whose noise is not declared, or wrongly, seed by seed",
+    "hidden_noise": "trainings whose noise is declared wrongly or not at all, seed by seed",
     "linearised": "cost of the LQR law of the exact linearisation at the target",
     "environments": "steps per second of the Gymnasium environments",
     "participants": "memory and processor time of many idle nodes",
@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     """The parser of all programs."""
     root = argparse.ArgumentParser(
         prog="python -m benchmarks",
-        description="Measure. Competitors take turns in one run; figures are medians.",
+        description="Run a benchmark. What is compared takes turns in one run; figures are medians.",
         epilog="example: python -m benchmarks rtt --turns 3",
     )
     programs = root.add_subparsers(required=True, metavar="PROGRAM", parser_class=_Program)

@@ -77,29 +77,29 @@ def run(
     any_environment: bool = False,
     figure: Path | None = None,
 ) -> dict[str, Any]:
-    """A row for each problem, budget and method.
+    """Compare methods on problems, at equal numbers of rollouts.
 
     Parameters
     ----------
     studies
-        Names in benchmarks/studies, or YAML files like those.
+        Names in benchmarks/studies, or YAML files like the ones there.
     rollouts
-        Budgets, of all rollouts before the evaluation.
+        Budgets: numbers of all rollouts before the evaluation.
     seeds
-        How many; those of the study if not given, and all of `TUNING_SEEDS` with `tune`.
+        Number of seeds; if not given, those of the study, or with --tune all seeds for tuning.
     methods
-        Only these; all of the file if not given.
+        Compare only these methods; all of the file if not given.
     settings
         Words NAME=JSON: parameters of the problem for all methods, like sensors=16.
     tune
         Words NAME=JSON: compare values of constants or parameters on the validation split, like
         sigma=[0.1,0.3].
     folder
-        Of the runs; runs/baselines if not given.
+        Folder of the runs; runs/baselines if not given.
     processes
-        Trainings at the same time; one a core if not given.
+        Number of trainings at the same time; one per core if not given.
     any_environment
-        Go on with results of other versions or another processor, as `pdeloop study` does.
+        Also accept results of other versions or another processor, as `pdeloop study` does.
     figure
         Draw the costs against the rollouts to this file.
 

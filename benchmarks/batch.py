@@ -26,16 +26,16 @@ SHORT_FROM = 64
 
 
 def run(*, problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...] = BATCHES) -> Any:
-    """One row for each batch, and the fitted model.
+    """Measure each batch size, and fit a model of the time of a round.
 
     Parameters
     ----------
     problem
-        What is controlled.
+        The problem whose loop is measured.
     turns
-        Measurements of each batch.
+        Number of measurements of each batch size.
     batches
-        Numbers of environments.
+        Batch sizes: numbers of environments.
     """
     samples: dict[tuple[int, str], list[float]] = {}
     for horizon in (LONG, SHORT):

@@ -124,26 +124,26 @@ def run(
     jobs: int | None = None,
     folder: Path = Path("runs/choices"),
 ) -> dict[str, Any]:
-    """Train, and draw the choices of these trainings again.
+    """Train, and draw again and again the choice that each training makes between its laws.
 
     Parameters
     ----------
     cases
-        Names of benchmarks/families/cases.py, or `reacting plate`.
+        Names of cases in benchmarks/families/cases.py, or `reacting plate`.
     seeds
-        Trainings of each case.
+        Number of trainings of each case.
     rollouts
-        Of a training.
+        Rollouts of each training.
     fields
-        Initial fields that say what a law costs.
+        Number of initial fields from which the cost of a law is known.
     draws
-        Choices drawn for each training.
+        Number of choices drawn for each training.
     tuning
         Use the seeds and fields with which constants may be chosen.
     jobs
-        Processes; one a core if not given.
+        Number of processes; one per core if not given.
     folder
-        Where the tables of costs are kept.
+        Folder in which the tables of costs are kept.
     """
     if unknown := [name for name in cases if name not in KNOWN]:
         raise ValueError(f"no case {unknown[0]!r}; known: {', '.join(KNOWN)}")

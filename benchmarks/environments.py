@@ -38,14 +38,18 @@ def run(
     turns: int = 3,
     controlgym: str | None = None,
 ) -> dict[str, Any]:
-    """The rates for each number of environments; the modes take turns.
+    """Measure steps per second for each number of environments; the modes take turns.
 
     Parameters
     ----------
-    problem, num_envs, turns
-        What is measured, in batches of these sizes, and how often.
+    problem
+        The problem whose environments are measured.
+    num_envs
+        Numbers of environments in a batch.
+    turns
+        Number of measurements of each.
     controlgym
-        An interpreter that can import controlgym 1.0.0, which is left out where not given.
+        Python interpreter that can import controlgym 1.0.0; if not given, it is left out.
     """
     rows = []
     for count in num_envs:

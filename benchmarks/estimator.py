@@ -161,24 +161,24 @@ def run(
     evaluation: int = 0,
     draws: int = 0,
 ) -> list[dict[str, Any]]:
-    """What the estimator with the true plant reaches.
+    """Measure the cost with an estimator that knows the true plant.
 
     Parameters
     ----------
     problems
-        Names, also of the cases of `benchmarks.families`, or files.
+        Names of problems or of cases of `benchmarks.families`, or YAML files.
     sensors
-        How many there are.
+        Numbers of sensors.
     noise
-        Standard deviations of a reading.
+        Standard deviations of the noise of a reading.
     seed
-        Of the training whose modes the law of the whole field has.
+        Seed of the training whose modes the law of the whole field uses.
     fields
-        Initial fields that this law is optimised on.
+        Number of initial fields on which this law is optimised.
     evaluation
         Seed of the ten held-out fields.
     draws
-        Initial fields of the posterior mean; 0: the extended Kalman filter.
+        Number of initial fields in the posterior mean; 0: the extended Kalman filter.
     """
     estimator = PosteriorMeanLaw if draws else ExtendedKalmanLaw
     rows = []

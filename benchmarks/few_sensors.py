@@ -45,23 +45,23 @@ def run(
     Parameters
     ----------
     problems
-        Names, also of the cases of `benchmarks.families`, or files.
+        Names of problems or of cases of `benchmarks.families`, or YAML files.
     sensors
-        How many there are.
+        Numbers of sensors.
     noise
-        Standard deviations of a reading.
+        Standard deviations of the noise of a reading.
     laws
         Names of laws.
     first
-        The first seed.
+        First seed.
     seeds
-        Trainings of each case.
+        Number of trainings of each case.
     rollouts
-        Of each, explorations and checks among them.
+        Rollouts of each training, including explorations and checks.
     jobs
-        Processes; one a core if not given.
+        Number of processes; one per core if not given.
     folder
-        Where finished trainings are kept.
+        Folder in which finished trainings are kept.
     """
     own = range(first, first + seeds)
     tasks = list(itertools.product(problems, sensors, noise, laws, own))

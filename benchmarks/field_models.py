@@ -129,12 +129,12 @@ def plant_components(plant: Any) -> int:
 
 
 def run(cases: Sequence[str] = ()) -> dict[str, Any]:
-    """Fit and judge.
+    """Fit models of the whole field, and report the selected one and its error.
 
     Parameters
     ----------
     cases
-        Names, or beginnings of names; none: all.
+        Names of cases, or beginnings of names; none: all cases.
     """
     chosen = [name for name in CASES if not cases or name.startswith(tuple(cases))]
     if not chosen:

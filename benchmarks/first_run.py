@@ -18,12 +18,12 @@ PARTS = {"start (": "compile", "identify": "start-up", "adapt": "first law"}
 
 
 def run(*, python: str = "python3") -> dict[str, Any]:
-    """Seconds of each part of `make run` in a clone of this checkout, and the machine.
+    """Measure the seconds of each part of `make run` in a clone of this checkout.
 
     Parameters
     ----------
     python
-        Interpreter that the virtual environment is made with.
+        Python interpreter with which the virtual environment is made.
     """
     clean = {k: v for k, v in os.environ.items() if k not in ("VIRTUAL_ENV", "NUMBA_CACHE_DIR")}
     clean["PYTHONUNBUFFERED"] = "1"

@@ -52,28 +52,28 @@ def run(
     folder: Path = Path("runs/general"),
     save: Path | None = None,
 ) -> dict[str, Any]:
-    """Train on every case and compare.
+    """Train on every held-out case, and compare first law, adapted law and limit.
 
     Parameters
     ----------
     cases
-        Names, or what several names begin with; none: all.
+        Names of cases, or beginnings of names; none: all cases.
     seeds
-        Trainings of each case and budget.
+        Number of trainings of each case and budget.
     budgets
-        Rollouts of a training in all, explorations and checks among them.
+        Rollouts of a training, including explorations and checks.
     fields
-        Held-out initial fields.
+        Number of held-out initial fields.
     tuning
         Use the seeds and held-out fields with which constants may be chosen.
     bounds
-        Work out the best affine law and the limit of any controller first, and keep them.
+        First compute the best affine law and the limit of any controller, and keep them.
     jobs
-        Processes; one a core if not given.
+        Number of processes; one per core if not given.
     folder
-        Where finished trainings are kept.
+        Folder in which finished trainings are kept.
     save
-        File for all rows and bounds, as JSON.
+        JSON file to which all rows and bounds are written.
     """
     beginnings = tuple(word for word in cases if word not in CASES)
     chosen = {

@@ -46,28 +46,28 @@ def run(
     jobs: int | None = None,
     folder: Path = Path("runs/hidden-noise"),
 ) -> list[dict[str, Any]]:
-    """Train with noise that is not, or not rightly, declared.
+    """Train with noise that is declared wrongly or not at all.
 
     Parameters
     ----------
     problems
-        Names, or files.
+        Names of problems, or YAML files.
     noise
-        Standard deviations of a reading.
+        Standard deviations of the noise of a reading.
     told
-        Multiples of them that are declared; 0: none.
+        Multiples of the noise that are declared; 0: none is declared.
     optimizers
-        Names.
+        Names of optimisers.
     first
-        The first seed.
+        First seed.
     seeds
-        Trainings of each case.
+        Number of trainings of each case.
     rollouts
-        Of each, explorations and checks among them.
+        Rollouts of each training, including explorations and checks.
     jobs
-        Processes; one a core if not given.
+        Number of processes; one per core if not given.
     folder
-        Where finished trainings are kept.
+        Folder in which finished trainings are kept.
     """
     own = range(first, first + seeds)
     tasks = list(itertools.product(problems, optimizers, noise, told, own))

@@ -176,9 +176,9 @@ def run(*, batches: Sequence[int] = BATCHES, jax: str | None = None) -> list[dic
     Parameters
     ----------
     batches
-        Numbers of environments.
+        Batch sizes: numbers of environments.
     jax
-        Interpreter that can import JAX, which is left out where not given.
+        Python interpreter that can import JAX; if not given, JAX is left out.
     """
     rows = measure("pdeloop", batches) + measure_with(sys.executable, "numpy", batches)
     return rows + (measure_with(jax, "jax", batches) if jax else [])

@@ -53,7 +53,13 @@ def costs(problem: str) -> dict[str, Any]:
 
 
 def run(problems: Sequence[str]) -> list[dict[str, Any]]:
-    """One row for each problem: its costs."""
+    """Measure the cost of each problem with the LQR law of its exact linearisation.
+
+    Parameters
+    ----------
+    problems
+        Names of problems, or YAML files.
+    """
     return [{"problem": problem, **costs(problem)} for problem in problems]
 
 

@@ -116,24 +116,24 @@ def run(
     settings: Sequence[str] = (),
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """The limits of each problem, as JSON-able numbers.
+    """Compute the limits of the policy class and of any controller for each problem.
 
     Parameters
     ----------
     problems
         Shipped names or YAML files; none: the paper's.
     seeds
-        Trainings whose basis U is used.
+        Number of trainings whose basis U is used.
     fields
-        Initial fields that a law is optimised on.
+        Number of initial fields on which a law is optimised.
     evaluation_seed
-        Draws of held-out fields to measure on.
+        Seeds of the draws of held-out fields on which costs are measured.
     evaluation_fields
-        How many fields are in each.
+        Number of fields in each draw.
     tolerance
         Relative gain below which a descent ends.
     jobs
-        Processes; one a core if not given.
+        Number of processes; one per core if not given.
     settings
         Words NAME=JSON: parameters of the problems, like reduced_order=4.
     save

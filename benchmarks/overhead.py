@@ -68,18 +68,19 @@ def run(
     windows: int = 6,
     seconds: float = 3.0,
 ) -> dict[str, Any]:
-    """Time of an iteration, and processor time of plant and controller for one, without and beside.
+    """Measure the time of an iteration, and the processor time of plant and controller for it, with and
+    without another process.
 
     Parameters
     ----------
     what
-        Comes and goes.
+        The process that is started and stopped beside the loop.
     problem
-        The loop's.
+        The problem of the loop.
     windows
-        How many without it, and as many with it.
+        Number of windows without the process, and of windows with it.
     seconds
-        Of a window.
+        Duration of a window.
     """
     times: tuple[list[float], list[float]] = ([], [])
     processor: tuple[list[float], list[float]] = ([], [])

@@ -39,7 +39,17 @@ def run(
     seconds: float = 20.0,
     discovery: Literal["multicast", "server"] = "multicast",
 ) -> dict[str, Any]:
-    """Memory, and processor time over some seconds, with each number of pairs and before any."""
+    """Measure the memory and processor time of idle nodes, and of the machine before any is started.
+
+    Parameters
+    ----------
+    pairs
+        Numbers of pairs of plant and controller.
+    seconds
+        Duration over which processor time is measured.
+    discovery
+        How the nodes find each other.
+    """
     names = namespaces(max(pairs))
     need, before = NODE_MEMORY * (2 * len(names) + 1), memory_available()
     if need > before:

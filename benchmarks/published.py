@@ -43,12 +43,18 @@ FIELDS = np.arange(2000, 2010)
 def run(
     task: Task, *, rollouts: list[int] | None = None, cells: int = 50, seeds: int = 3
 ) -> list[Row]:
-    """Measure the controllers of a published task; what its source says is shown next to them.
+    """Measure controllers on a published task, and show the published figures beside them.
 
-    task: lid, convection, transport or reaction-diffusion
-    rollouts: budgets of trainings (default: 1 5 20 80); 1 is the first law, of one exploration
-    cells: of each direction of the convection
-    seeds: of what is random; the worst one is shown in brackets
+    Parameters
+    ----------
+    task
+        The published task.
+    rollouts
+        Budgets of the trainings; 1: the first law, from one exploration. [1 5 20 80]
+    cells
+        Cells in each direction, for the convection.
+    seeds
+        Number of seeds of what is random; the worst seed is shown in brackets.
     """
     budgets = [1, 5, 20, 80] if rollouts is None else rollouts
     with warnings.catch_warnings():

@@ -37,16 +37,16 @@ COLUMNS = {
 
 
 def run(*, seconds: float = 10.0, pin: bool = False, rates: Sequence[float] = RATES) -> Any:
-    """One row for each rate.
+    """Measure how well the loop keeps each rate.
 
     Parameters
     ----------
     seconds
-        Of each rate.
+        Duration at each rate.
     pin
-        Both nodes on one core.
+        Keep both nodes on one core.
     rates
-        States a second.
+        Rates, in states per second.
     """
     sample_time = load_parameters(PROBLEM, {})["sample_time"]
     rows = []

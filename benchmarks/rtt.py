@@ -99,18 +99,18 @@ def run(
     seconds: float = 0.4,
     cores: Sequence[Literal["any", "shared", "pinned"]] = ("any", "shared", "pinned"),
 ) -> dict[str, Any]:
-    """A row for each batch and place.
+    """Measure the loop for each batch size and placement of the nodes on the cores.
 
     Parameters
     ----------
     turns
-        Measurements of each row.
+        Number of measurements of each row.
     seconds
-        Of a measurement.
+        Duration of one measurement.
     cores
-        Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on
-        one core for both (as `pdeloop train` does it). The ping-pong is on any two, and with
-        `pinned`, which is `shared` for the pair, on one each, polling.
+        Where plant and controller run. `any`: wherever the scheduler puts them, as nodes started by
+        hand. `shared`: both on one core, as with `pdeloop train`. `pinned`: the same for the two
+        nodes, but the ping-pong polls on two cores of its own, where it otherwise takes any two.
     """
     rows = []
     for where in cores:

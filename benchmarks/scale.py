@@ -45,10 +45,16 @@ def run(
 ) -> list[Row]:
     """Train a reacting plate with ten actuators on finer and finer grids, each in a process of its own.
 
-    states: numbers of a state, squares
-    rollouts: budget of a training
-    steps: of an episode, at least 22
-    topics: also over topics, recorded
+    Parameters
+    ----------
+    states
+        Sizes of the state: square numbers.
+    rollouts
+        Rollouts of a training.
+    steps
+        Steps of an episode, at least 22.
+    topics
+        Also train over topics, with a recording.
     """
     return [_measured(count, rollouts, steps, topics) for count in states]
 

@@ -35,16 +35,16 @@ LIMIT = 600.0
 
 
 def run(*, problem: str = "burgers", turns: int = 3, iterations: int = 40) -> dict[str, Any]:
-    """One row for each way to train.
+    """Time a whole training, over topics and in one process.
 
     Parameters
     ----------
     problem
-        What is controlled.
+        The problem to train on.
     iterations
-        Of a training, of two rollouts each.
+        Iterations of a training, of two rollouts each.
     turns
-        Trainings of each way.
+        Number of trainings in each way.
     """
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}

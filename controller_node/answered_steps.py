@@ -48,5 +48,6 @@ class AnsweredSteps:
             return ""
         self._claimed = NONE, -1
         return (
-            f"a cost says that it went to step {step}, and the plant gave it up at step {cost.step}"
+            f"a cost claims that the episode reached step {step}, but the plant gave it up at step "
+            f"{cost.step}"
         )

@@ -59,7 +59,7 @@ class ControllerDiagnostics:
         if lacking := self.waiting(now):
             return (
                 Level.WARN,
-                f"a state waits for its action until there is: {', '.join(lacking)}",
+                f"a state is waiting for its action; still missing: {', '.join(lacking)}",
             )
         if responder.failure:
             return Level.ERROR, f"no reduced model: {responder.failure}"
@@ -70,6 +70,6 @@ class ControllerDiagnostics:
         if self.plant_paused:
             return Level.OK, f"the plant is paused at {where}"
         if now - self._heard > SILENT:
-            reason = ", and no plant any more" if gone else ""
+            reason = "; the plant is gone" if gone else ""
             return Level.STALE, f"no state for {now - self._heard:.0f} s, after {where}{reason}"
         return Level.OK, where

@@ -139,7 +139,7 @@ def identify(
             f"method is {method!r}; expected 'regression' or 'dmdc'{law if method == 'field' else ''}"
         )
     if p and method != "dmdc":
-        raise ValueError(f"p is the rank of 'dmdc', and method is {method!r}; leave it out")
+        raise ValueError(f"p is the rank of 'dmdc', but method is {method!r}; leave it out")
     n_s = n_s or study_orders(trajectories, channels=channels, settings=settings).suggested
     if method == "regression":
         return regression.exact_regression(trajectories, n_s=n_s, channels=channels)

@@ -118,9 +118,7 @@ class LawBatch:
         if step == 0:
             self._begin()
         elif step != self._next:
-            raise MemoryUnknownError(
-                f"the states before step {step} are not known, or not all of them"
-            )
+            raise MemoryUnknownError(f"some or all of the states before step {step} are unknown")
         with arithmetic_of_laws():
             actions = self._computed(step, states)
             self._memories = [

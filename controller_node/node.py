@@ -108,7 +108,7 @@ class ControllerNode:
                 self._senders[send.topic].send(send.frame)
             else:
                 self._failed.publish(String(data=send.to_json()))
-                what = "to be run again" if send.retry else "no reduced model"
+                what = "the exploration must be repeated" if send.retry else "no reduced model"
                 self._node.get_logger().error(f"{what}: {send.reason}", throttle_duration_sec=1.0)
 
     def _report(self, now: float) -> Status:
@@ -127,7 +127,7 @@ class ControllerNode:
     def _housekeeping(self, now: float) -> None:
         if lacking := self._diagnostics.waiting(now):
             self._node.get_logger().warning(
-                f"a state waits for its action until there is: {', '.join(lacking)}",
+                f"a state is waiting for its action; still missing: {', '.join(lacking)}",
                 throttle_duration_sec=5.0,
             )
 

@@ -302,7 +302,7 @@ class Responder:
         run = self._runs.setdefault(number, RunState())
         forget(self._runs, number, self._served[0])
         if not self._has_room(number, more):
-            raise FrameError(f"expected less than {MAX_BYTES} bytes of all runs together")
+            raise FrameError(f"expected fewer than {MAX_BYTES} bytes for all runs together")
         return run
 
     def _has_room(self, number: int, more: int) -> bool:

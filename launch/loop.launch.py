@@ -37,16 +37,16 @@ ARGUMENTS = {
     "pairs": ("1", PAIRS.description),
     "equation": (
         "",
-        "the problem's PDE; code of your own (file.py:Class) also has to be named here",
+        "the problem's PDE; your own code (file.py:Class) must also be named here",
     ),
     "plant": (
         "",
-        "a plant instead of it; code of your own (file.py:Class) also has to be named here",
+        "a plant instead of an equation; your own code (file.py:Class) must also be named here",
     ),
-    "law": ("", "the control law; code of your own (file.py:Class) also has to be named here"),
+    "law": ("", "the control law; your own code (file.py:Class) must also be named here"),
     **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
     "network": ("false", "true: let messages leave this machine; false: loopback only"),
-    "log_level": ("info", "least severe messages that are shown"),
+    "log_level": ("info", "lowest severity of the messages that are shown"),
 }
 """Defaults and meanings."""
 
@@ -115,4 +115,4 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
 def end_if_refused(event: ProcessExited, context: LaunchContext) -> None:
     """End the launch, with an error, when a node refuses its parameters; it has said why."""
     if event.returncode == REFUSED and not context.is_shutdown:
-        raise RuntimeError(f"{event.process_name} refuses to run; its last words are above")
+        raise RuntimeError(f"{event.process_name} refuses to run; its last messages above say why")

@@ -44,14 +44,14 @@ ARGUMENTS = {
         for s in FLAGS
         if "P" not in s.nodes and s is not LAW
     },
-    "set": ("", "other parameters as pdeloop train --set has them: NAME=VALUE,NAME=VALUE"),
+    "set": ("", "other parameters, as for pdeloop train --set: NAME=VALUE,NAME=VALUE"),
     "model": ("", "start from this model of pdeloop identify; empty: identify one"),
     "out": ("", "new folder of the results; empty: runs/PROBLEM-TIME"),
     "resume": ("", "folder of an interrupted run to continue; empty: a new run"),
     "record": ("false", "true: record all topics to a rosbag2 bag in the folder"),
-    "record_or_stop": ("false", "true: as record, and end if the recording fails"),
-    "record_every": ("1", "record the states of every so many steps only"),
-    "view": ("false", "true: a viewer_node, for RViz, Foxglove and PlotJuggler"),
+    "record_or_stop": ("false", "true: like record, but stop the training if the recording fails"),
+    "record_every": ("1", "record only the states of every N-th step"),
+    "view": ("false", "true: also start a viewer_node, for RViz, Foxglove and PlotJuggler"),
 }
 """Defaults and meanings."""
 ENDED = (0, 130, STOPPED)

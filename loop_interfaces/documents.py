@@ -75,9 +75,7 @@ def _check_yaml(text: str | bytes, most: int) -> None:
         nodes += isinstance(event, yaml.NodeEvent)
         depth += isinstance(event, yaml.CollectionStartEvent)
         if depth > MAX_DEPTH:
-            raise ValueError(
-                f"more than {MAX_DEPTH} maps and lists within each other, in line {line}"
-            )
+            raise ValueError(f"maps and lists nested more than {MAX_DEPTH} deep, in line {line}")
         if nodes > most:
             raise ValueError(f"more than {most} entries, in line {line}")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_YAML_SCALAR:

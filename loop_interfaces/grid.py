@@ -58,7 +58,7 @@ class Axis:
         object.__setattr__(self, "size", operator.index(self.size))
         if not (0 < self.length < math.inf and self.size >= 1):
             raise ValueError(
-                f"the axis {self.name} must have a positive length and 1 or more points, got "
+                f"the axis {self.name} must have a positive length and at least 1 point, got "
                 f"{self.length!r} and {self.size!r}"
             )
 
@@ -125,11 +125,11 @@ class Grid:
             raise ValueError(f"the axes of a grid must be of the class Axis, got {shown(other[0])}")
         object.__setattr__(self, "numbers", operator.index(self.numbers))  # NumPy's is not JSON
         if not self.components:
-            raise ValueError("a grid has one component or more, got none")
+            raise ValueError("a grid must have at least one component, got none")
         if self.numbers < 0 or bool(self.axes) == bool(self.numbers):
             raise ValueError(
-                "a state has axes, or is a plain vector of a positive number of numbers: give one of "
-                "both"
+                "a state has axes, or is a plain vector of a positive number of numbers: give one "
+                "of the two"
             )
 
     @classmethod
@@ -353,8 +353,8 @@ class Grid:
         ]
         if not found:
             raise ValueError(
-                f"sensors must be a product of numbers of at most "
-                f"{' and '.join(map(str, self.shape))} points along the axes, got {count}"
+                "sensors must be a product of one number per axis, of at most "
+                f"{' and '.join(map(str, self.shape))}, got {count}"
             )
 
         def unequal(own: tuple[int, ...]) -> float:

@@ -45,8 +45,8 @@ def read_problem(path: Path) -> dict[str, Any]:
         raise ParameterError(nothing_for("the nodes of a loop", [file]))
     if any(view != views[0] for view in views):
         raise ParameterError(
-            f"{path} has different parameters for the nodes in {' and in '.join(others)}; take a file "
-            "for each"
+            f"{path} has different parameters for the nodes in {' and in '.join(others)}; use a "
+            "separate file for each"
         )
     return views[0]
 

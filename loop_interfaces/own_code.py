@@ -328,7 +328,8 @@ def _bare(file: str, word: str, module: str, name: str, *arguments: Any) -> Any:
         raise ValueError(f"the {word} file {shown(file)} does not exist") from None
     if found.__name__ != module:
         raise ValueError(
-            f"the {word} file {shown(file)} has changed since the plant was pickled: make it again"
+            f"the {word} file {shown(file)} has changed since the plant was pickled: make the "
+            "plant again"
         )
     kind: Callable[..., Any] = vars(found)[name]
     return kind.__new__(kind, *arguments)  # type: ignore[arg-type]

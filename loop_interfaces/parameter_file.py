@@ -203,8 +203,8 @@ def _add(block: Block, body: yaml.MappingNode, group: str) -> None:
             value = _value(name, node)
         if name in values and _type(values[name]) != _type(value):
             block.misread = (
-                f"has '{name}' as {shown(values[name])} and as {shown(value)} in line {_line(node)}; "
-                "leave one"
+                f"has '{name}' as {shown(values[name])} and as {shown(value)} in line "
+                f"{_line(node)}; remove one of them"
             )
         values[name] = value
 
@@ -216,8 +216,8 @@ def _list(name: str, node: yaml.SequenceNode) -> list[Any] | None:
     items = [_value(name, item) for item in node.value]
     if len({type(item) for item in items}) > 1:
         raise ValueError(
-            f"the list '{name}' in line {_line(node)} has values of several types; ROS takes one, as "
-            "in [0.0, 1.5]"
+            f"the list '{name}' in line {_line(node)} has values of several types; a list in ROS "
+            "has values of one type, as in [0.0, 1.5]"
         )
     return items
 

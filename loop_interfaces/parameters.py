@@ -78,16 +78,16 @@ IDENTIFICATION = Spec(
     nodes="CT",
     group="budget and method",
 ).means(
-    "regression: least squares in reduced coordinates; field: a linearised model of the whole "
-    "field, where its law is better; subspace: a model in innovation form with its filter, from "
-    "measurements alone, for the laws extended_kalman and observer, whose default it is with few "
-    "sensors; dmdc: the paper's truncated DMDc. An optimiser may have its own default: gauss_newton "
-    "has regression, two_point dmdc"
+    "field: a linearised model of the whole field, where its law is better; regression: least "
+    "squares in reduced coordinates; subspace: a model in innovation form with its filter, from "
+    "measurements alone, for the laws extended_kalman and observer (their default with few "
+    "sensors); dmdc: the paper's truncated DMDc. Some optimisers have another default: regression "
+    "for gauss_newton, dmdc for two_point"
 )
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
     "control law: a shipped or installed name, or code that the user must allow, 'file.py:Class' "
-    "or 'module:Class'; the default of model_based is extended_kalman with few sensors"
+    "or 'module:Class'; with few sensors the default of model_based is extended_kalman"
 )
 
 PROBLEM = _section(
@@ -107,7 +107,8 @@ PROBLEM = _section(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
     Spec("cost", [], nodes="PCT").means(
-        "the cost as packed JSON, from Python or the plant; empty: numbers and a constant target"
+        "the cost as packed JSON, from Python or the plant; empty: scalar weights and a constant "
+        "target"
     ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
         "length L of the periodic domain"
@@ -121,7 +122,7 @@ PROBLEM = _section(
     ),
     *ACTUATORS,
     Spec("actuator_extents", [], 0.0, 1.0, nodes="T").means(
-        "centres, then widths, where an equation or plant has its own"
+        "centres, then widths, of an equation's or plant's own actuators"
     ),
     Spec("sample_time", 0.05, positive=True, unit="s").means(
         "sampling time; the action is held over it"
@@ -142,10 +143,10 @@ PROBLEM = _section(
     IDENTIFICATION,
     LAW,
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
-        "rank p of [Z; Y] in the identification dmdc; 0: n_s + n_a"
+        "rank p of [Z; Y] for the identification dmdc; 0: n_s + n_a"
     ),
     Spec("dmdc_order", 0, 0, 1024, nodes="CT").means(
-        "order n_s in the identification dmdc; 0: reduced_order"
+        "order n_s for the identification dmdc; 0: reduced_order"
     ),
     Spec("exploration_variance", 0.1, positive=True, nodes="T").means(
         "variance of each exploratory action, raised as measurement_noise requires"
@@ -218,7 +219,7 @@ TUNER = _section(
         "seed of all random numbers of the training"
     ),
     Spec("seeds", 1, 1, 1024, group="budget and method").means(
-        "trainings in one batch, with the seeds seed, seed + 1, ..."
+        "number of trainings in one batch, with the seeds seed, seed + 1, ..."
     ),
     Spec("rollouts", 0, 0, 2_000_000, group="budget and method").means(
         "budget of a seed: all rollouts before the closing evaluation, including explorations and "
@@ -232,8 +233,8 @@ TUNER = _section(
         "initial policy: the LQT gains of the reduced model, or zero"
     ),
     Spec("model", "").means(
-        "file of 'pdeloop identify --out' with the reduced model and warm start of every seed; empty: "
-        "identify"
+        "file from 'pdeloop identify --out' with the reduced model and warm start of every seed; "
+        "empty: identify one"
     ),
     Spec("identification_attempts", 3, 1, 1000).means(
         "exploratory episodes that a seed may use until its LQT law beats no control on a sampled "
@@ -241,10 +242,10 @@ TUNER = _section(
         "unchecked, as the paper does"
     ),
     Spec("evaluation_fields", 10, 1, 1000, group="budget and method").means(
-        "sampled initial fields of the closing evaluation"
+        "number of initial fields drawn for the closing evaluation"
     ),
     Spec("evaluation_seed", 0, 0, MAX_SEED, group="budget and method").means(
-        "seed of those fields, the same for every training seed, so that runs are comparable"
+        "seed of these fields, the same for every training seed, so that runs are comparable"
     ),
     Spec("out", "").means("folder of the results and the checkpoint; empty: keep nothing"),
     Spec("resume", False).means("continue the run whose checkpoint is in 'out'"),
@@ -262,8 +263,8 @@ TUNER = _section(
     ),
     OPTIMIZER,
     Spec("recorder", "none", choices=("none", "start", "required")).means(
-        "none: run without one; start: wait for a recorder, continue if it stops; required: stop if "
-        "it stops"
+        "none: no recorder; start: wait for one, and continue if it stops; required: wait, and "
+        "stop if it stops"
     ),
     Spec("pairs", [""], nodes="TR").means(
         "namespaces of the plant and controller pairs of this tuner, relative to its own"

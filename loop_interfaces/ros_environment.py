@@ -84,7 +84,7 @@ def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]
         elif confined:
             raise RosEnvironmentError(
                 f"RMW_IMPLEMENTATION={middleware}: only {MIDDLEWARE} keeps the messages on this "
-                f"machine; unset it, or let them leave it (--network, {NETWORK}=1)"
+                f"machine; unset it, or let messages leave the machine (--network, {NETWORK}=1)"
             )
     if not confined and found.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "OFF":
         raise RosEnvironmentError(
@@ -95,7 +95,9 @@ def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]
             f"ROS_LOCALHOST_ONLY=1 and {NETWORK}=1 (--network) contradict each other; unset one"
         )
     if found.get("FASTDDS_DEFAULT_PROFILES_FILE") and not environment.get(PROFILE):
-        remarks.append(f"FASTDDS_DEFAULT_PROFILES_FILE is not read by ROS 2 Jazzy: {PROFILE} is")
+        remarks.append(
+            f"FASTDDS_DEFAULT_PROFILES_FILE is not read by ROS 2 Jazzy; set {PROFILE} instead"
+        )
     libraries = found.get("LD_LIBRARY_PATH", "").split(os.pathsep)
     if found.get(_BOOTSTRAPPED) and str(Path(sys.prefix) / "lib") not in libraries:
         del found[_BOOTSTRAPPED]  # of another shell: the wheels have to find their libraries again

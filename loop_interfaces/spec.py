@@ -197,7 +197,7 @@ def assignment(text: str) -> tuple[str, Value]:
 def exponent_hint(value: object) -> str:
     """Advice on a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
     if isinstance(value, str) and len(value) < 100 and _EXPONENT.fullmatch(value):
-        return "; YAML reads a number with an exponent only with point and sign, like 1.0e+12"
+        return "; in YAML a number with an exponent needs a point and a sign, like 1.0e+12"
     return ""
 
 
@@ -211,7 +211,8 @@ def check_names(names: Iterable[str], known: Iterable[str]) -> None:
             hint = (
                 f"did you mean '{close[0]}'?"
                 if close
-                else f"docs/parameters.md has all; one of the equation or plant is given as {own}"
+                else "docs/parameters.md lists all; a constant of the equation or plant is given "
+                f"as {own}"
             )
             raise ParameterError(f"unknown parameter {shown(name)}; {hint}")
 

@@ -151,7 +151,7 @@ VIEW_NUMBERS = {
     "final_error": "the same at the last step of the last episode",
     "action_norm": "|a_k| of the newest sample",
     "gain_norm": "Frobenius norm of the current gains [K_a K_b], or of another law's parameters",
-    "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
+    "gain_change": "Frobenius norm of their difference from the LQT gains, relative to the latter",
     "step": "k of the newest sample",
 }
 """Names and meanings of the numbers that a viewer publishes below `view/`."""

@@ -117,11 +117,11 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
     for name in (*_FIXED, *SETTABLE):
         if name in values and values[name] != getattr(plant, name):
             raise ParameterError(
-                f"parameter '{name}' is {values[name]!r}, and that of {values['plant']} is "
+                f"parameter '{name}' is {values[name]!r}, but the plant {values['plant']} has "
                 f"{getattr(plant, name)!r}; leave it out"
             )
     if values.get("cost") and "".join(values["cost"]) != "".join(plant.cost.texts):
         raise ParameterError(
-            f"parameter 'cost' differs from that of {values['plant']}; leave it out"
+            f"parameter 'cost' differs from that of the plant {values['plant']}; leave it out"
         )
     return plant, made.parameters

@@ -197,7 +197,7 @@ class Lockstep:
         if not self.paused:
             raise ValueError("the plant is not paused; expected a pause before a step")
         if not self.active:
-            raise ValueError("no episode is under way; expected one to step in")
+            raise ValueError("no episode is under way; a step needs one")
         if self._stepping:
             raise ValueError(f"step {self.step} still waits for its action")
         self._stepping = True

@@ -123,7 +123,7 @@ class PlantNode:
         )
         if self._lockstep.paused:
             node.get_logger().warning(
-                "still paused, as when its process ended; call ~/resume to continue"
+                "still paused, as it was when its previous process ended; call ~/resume to continue"
             )
 
     def join(self, node: Node, loop: NodeLoop) -> None:
@@ -167,7 +167,7 @@ class PlantNode:
         self._record_run()
         last = self._lockstep.last_state
         self._batcher.show(self._senders[STATE].encoded(last) if last else None)
-        return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
+        return f"paused at step {self._lockstep.step}; an answer on its way is still accepted"
 
     def _resume(self) -> str:
         was = "resumed" if self._lockstep.paused else "was not paused"
@@ -182,7 +182,8 @@ class PlantNode:
             self._run_record.keep(lockstep.paused, lockstep.signed_run)
         except (OSError, FileError) as error:
             self._node.get_logger().warning(
-                f"a pause and a signing controller are forgotten with this process: {error}",
+                "cannot record a pause and a signing controller, which are lost when this "
+                f"process ends: {error}",
                 throttle_duration_sec=10.0,
             )
 

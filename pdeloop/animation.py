@@ -60,7 +60,7 @@ def animated(run: FinishedRun, *, field: int = 0, seconds: float = 6.0) -> Pictu
         )
     problem = ProblemData({"adapted": run}, [], 0, build_plant(run.values))
     if reason := another_loop(run):
-        raise RunFolderError(f"{reason}; so it cannot be animated")
+        raise RunFolderError(f"{reason}, so it cannot be animated")
     return pictures(problem, field=field, seconds=seconds)
 
 

@@ -102,9 +102,9 @@ def _sentence(error: Exception) -> str:
     if type(error).__name__ != "LinAlgError":  # of NumPy, which not every command imports
         return str(error)
     return (
-        "these numbers lead to a singular matrix and so to no unique result: check the data for "
-        "states or actions that are constant, equal or badly scaled, and the weights for extreme "
-        "values"
+        "these numbers lead to a singular matrix, so there is no unique result: check the data "
+        "for states or actions that are constant, equal or badly scaled, and the weights for "
+        "extreme values"
     )
 
 

@@ -41,8 +41,8 @@ def beyond_bounds(plant: Plant, actions: Array) -> tuple[bool, str]:
     changed = ~np.isclose(plant.applied(actions), linear, rtol=1e-6, atol=1e-9)
     share = float(changed.any(axis=1).mean())
     told = (
-        f"{100 * share:.0f} % of the exploratory actions are beyond the actuators' bounds, which "
-        "models do not know: lower exploration_variance"
+        f"{100 * share:.0f} % of the exploratory actions exceed the actuators' bounds, which the "
+        "models do not include: lower exploration_variance"
     )
     return share <= MOST_BEYOND, told if share > SOME_BEYOND else ""
 
@@ -57,19 +57,19 @@ def judged(none: float, law: float, *, compared: bool = False) -> tuple[bool, st
     """
     if not none:
         return False, (
-            "nothing is to be controlled, as these fields are at the target; draw others, or set "
+            "there is nothing to control, as these fields are at the target; draw others, or set "
             "another target"
         )
     if abs(none - law) < LITTLE * none:
         return law < none or compared, (
-            "the law does next to nothing: its actions hardly move the states, are dear (lower "
-            "action_weight), or cannot reach the target"
+            "the law has almost no effect: its actions hardly move the states, are expensive "
+            "(lower action_weight), or cannot reach the target"
         )
     if law < none:
         return True, ""
     if compared and np.isfinite(none):
         return (
             True,
-            "the law does not help; the adaptation compares it with no control, and makes others",
+            "the law does not help; the adaptation compares it with no control, and designs others",
         )
     return False, "the adaptation begins with a law that does not help; try another order"

@@ -112,7 +112,7 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, most: int) -
         if stamp.lower() == TARGET:
             if target is not None:
                 raise ValueError(
-                    f"expected one row whose t is the word target, got another, row {row}"
+                    f"expected one row whose t is the word target, got a second one, row {row}"
                 )
             target = np.array([numbers.read(line, i, row) for i in places.states])
             if not np.isfinite(target).all():
@@ -167,7 +167,8 @@ def _cut(
     remarks = []
     if single:
         remarks.append(
-            f"left out row {listed([str(row) for row in single])}: t grows neither before nor after it"
+            f"left out row {listed([str(row) for row in single])}: t increases neither before nor "
+            "after it"
         )
     trajectories = [(values[p, :n_z], values[p.start : p.stop - 1, n_z:]) for p in parts]
     return Table(channels, trajectories, target, step, remarks)
@@ -364,7 +365,7 @@ class _Numbers:
                 "them by semicolons, or write points"
             )
         if text.count(",") + text.count(".") > 1 or (mark and self._mark not in ("", mark)):
-            after = f", after '{self._mark}' before" if self._mark else ""
+            after = f", after '{self._mark}' in an earlier number" if self._mark else ""
             raise ValueError(
                 f"expected one decimal mark and no mark of thousands, got {where}{after}"
             )

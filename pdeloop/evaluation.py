@@ -52,7 +52,7 @@ def evaluate(
     """
     build_plant(run.values)  # refuses code that the user has not named
     if reason := another_loop(run):
-        raise RunFolderError(f"{reason}; its policies cannot be evaluated here")
+        raise RunFolderError(f"{reason}, so its policies cannot be evaluated here")
     seeds = len(run.policies)
     if changes:
         run = changed(run, changes)
@@ -72,14 +72,14 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
     size, n_a = len(run.models[0].U), run.models[0].B.shape[1]
     if (plant.state_size, plant.n_a) != (size, n_a):
         raise ParameterError(
-            f"the policies are of a state of {size} numbers and of {n_a} actuators; the changed plant "
-            f"has {plant.state_size} and {plant.n_a}"
+            f"the policies are for a state of {size} numbers and {n_a} actuators, but the changed "
+            f"plant has {plant.state_size} and {plant.n_a}"
         )
     there = replace(run, values=values)
     if (shape := there.laws[0].shape) != run.policies.shape[1:]:
         raise ParameterError(
-            f"the law '{values['law']}' has parameters of shape {shape} for the changed plant, and "
-            f"those of the run are of shape {run.policies.shape[1:]}"
+            f"the law '{values['law']}' has parameters of shape {shape} for the changed plant, but "
+            f"those of the run have shape {run.policies.shape[1:]}"
         )
     return there
 
@@ -93,7 +93,7 @@ def another_loop(run: FinishedRun) -> str:
     try:
         pair = _pair(run)
     except ValueError as error:
-        return f"the run had another plant than the built-in one ({error})"
+        return f"the plant of the run was not the built-in one ({error})"
     count, seed = run.costs["none"].shape[1], int(run.values["evaluation_seed"])
     here = _costs(run, pair, 1, fields=count, seed=seed)
     same_plant = run.result.get("plant") == pair.fingerprint
@@ -109,8 +109,8 @@ def another_loop(run: FinishedRun) -> str:
             if name == "none" and not same_plant:
                 whose = " (with another fingerprint)"
             return (
-                f"the run had another {what} than the built-in one{whose}: {law} cost "
-                f"{_text(there)} in its closing evaluation, and {_text(own)} here"
+                f"the {what} of the run was not the built-in one{whose}: {law} cost {_text(there)} "
+                f"in the closing evaluation, but {_text(own)} here"
             )
     return ""
 

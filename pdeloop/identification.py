@@ -204,7 +204,7 @@ def identify_bag(
     chosen = [e for e in bag.episodes() if episode in (None, e.number) and _usable(e)]
     if chosen and (every := max(e.state_every for e in chosen)) > 1:
         raise BagError(
-            f"{bag.path} has the state of every {every} steps only, and a model needs all of them; "
+            f"{bag.path} has the state of every {every} steps only, but a model needs all of them; "
             "record without --record-every (state_every)"
         )
     if any(e.exploratory for e in chosen):

@@ -63,7 +63,9 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
         yield _repeatable(plant, explored)
         if plant.settable and (idle := idle_actuators(plant, *_some_steps(explored))):
             which = "no action moves" if len(idle) == plant.n_a else f"actuators {idle} do not move"
-            yield Finding("actuators", False, f"{which} the state: see what step does with its a")
+            yield Finding(
+                "actuators", False, f"{which} the state: check how step uses its argument a"
+            )
     yield _halving(plant, values, explored)
     yield _actuators(plant)
     if sensors := few_sensors(values):
@@ -73,9 +75,9 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "no control",
             True,
-            f"the plant diverges without control from {len(lost)} of {DRAWN + 1} initial fields, the "
-            f"first at step {lost.min()} of {plant.horizon}: there, no control has no cost to compare "
-            "a law with",
+            f"the plant diverges without control from {len(lost)} of {DRAWN + 1} initial fields, "
+            f"the first at step {lost.min()} of {plant.horizon}: from these fields there is no "
+            "cost without control to compare a law with",
             note=True,
         )
     diverged = explored.costs.diverged_step[explored.costs.diverged_step >= 0]
@@ -90,7 +92,7 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "exploration",
             False,
-            f"{len(diverged)} of {len(explored.costs.mean)} explorations under inputs of variance "
+            f"{len(diverged)} of {len(explored.costs.mean)} explorations with inputs of variance "
             f"{_variance(values):.3g} diverge, the first at step {diverged.min()}: {remedy}",
         )
         return
@@ -174,7 +176,8 @@ def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
     together = plant.evaluate(states, actions)[0]
     if not np.array_equal(plant.evaluate(states, actions)[0], together):
         told = (
-            "a step is another one when it is computed again from the same state and action: keep "
+            "a step gives another result when it is computed again from the same state and "
+            "action: keep "
         )
         return Finding(name, False, f"{told}nothing between calls, and draw no random numbers")
     alone = [plant.evaluate(z[None], a[None])[0][0] for z, a in zip(states, actions, strict=True)]
@@ -201,7 +204,10 @@ def _actuators(plant: Plant) -> Finding:
     lost = found.waves[found.margins < REACHED]
     if not len(lost):
         return Finding(
-            name, True, f"{text}; the actuators reach all, the least by {found.margins.min():.2g}"
+            name,
+            True,
+            f"{text}; the actuators reach them all, with a margin of at least "
+            f"{found.margins.min():.2g}",
         )
     waves = named_waves(plant.grid, lost)
     return Finding(
@@ -224,14 +230,14 @@ def _sensors(plant: Plant, sensors: int) -> Finding:
         return Finding(
             name,
             False,
-            f"of {len(found.growth)} unstable modes these are not observed: {waves}; take more "
-            "sensors, or another number",
+            f"of the {len(found.growth)} unstable modes, the sensors do not observe {waves}; use "
+            "more sensors, or a different number",
         )
     return Finding(
         name,
         True,
         f"the {len(found.growth)} unstable modes are observed, with a margin of at least "
-        f"{found.margins.min():.2g} (1: that of the whole state)",
+        f"{found.margins.min():.2g} (1: as with the whole state)",
     )
 
 
@@ -254,7 +260,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     yield Finding(
         "exploration",
         True,
-        f"inputs of variance {_variance(values):.3g} keep the plant within its bound on "
+        f"with inputs of variance {_variance(values):.3g} the plant stays within its bound from "
         f"{DRAWN + 1} initial fields (largest {np.abs(explored.fields).max():.3g} of "
         f"{plant.divergence_bound:g})",
     )
@@ -270,7 +276,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             return
         orders = [settings.reduced_order or suggested, suggested]
         told = (
-            f"reduced_order {orders[0]}; one episode suggests {suggested}, and dmdc a rank of "
+            f"reduced_order {orders[0]}; one episode suggests {suggested}, and for dmdc a rank of "
             f"{suggested + plant.n_a} or more"
         )
     yield Finding("order", True, told)
@@ -297,5 +303,5 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     )
     law = next(cost for name, cost in costs.items() if name != "no control")
     good, hint = judged(costs["no control"], law, compared=compared)
-    told = f"mean stage cost of {DRAWN} drawn fields {told}" + (hint and f": {hint}")
+    told = f"mean stage cost from {DRAWN} drawn fields: {told}" + (hint and f": {hint}")
     yield Finding("first law", good, told, note=good and bool(hint))

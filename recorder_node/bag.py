@@ -187,8 +187,8 @@ class BagWriter:
     def _stopped(self, error: OSError) -> BagError:
         self._file.close()
         return BagError(
-            f"cannot write to {self.path}: {_reason(error)}; recording stopped, what was written "
-            "before can be read (docs/recording.md)"
+            f"cannot write to {self.path}: {_reason(error)}; recording has stopped, but what was "
+            "written before can be read (docs/recording.md)"
         )
 
 

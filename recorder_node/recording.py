@@ -43,8 +43,8 @@ def large_bag(values: Mapping[str, Any], every: int = 1) -> str:
     if size < LARGE_BAG:
         return ""
     return (
-        f"the states of this run take about {size / 1e9:.1f} GB in its bag: --record-every N ({EVERY}) "
-        "keeps fewer"
+        f"the states of this run take about {size / 1e9:.1f} GB in its bag; to record fewer of "
+        f"them: --record-every N ({EVERY})"
     )
 
 

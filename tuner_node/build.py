@@ -50,8 +50,8 @@ def read_model(path: Path, n_a: int, law: type[Law] = Affine) -> NDArray[np.floa
         )
     if actuators != n_a:
         raise ValueError(
-            f"the model in {path} has {actuators} actuators, the plant has {n_a}; identify one of this "
-            "plant"
+            f"the model in {path} has {actuators} actuators, the plant has {n_a}; identify a model "
+            "of this plant"
         )
     if filtered != law.filtered:
         gain = "has a filter gain" if filtered else "has no filter gain"
@@ -87,8 +87,8 @@ def check_budget(
             )
         if not kind.iteration_rollouts:
             raise ParameterError(
-                f"parameter 'iterations' is {values['iterations']}; expected 'rollouts' instead: the "
-                f"optimizer '{name}' counts no iterations"
+                f"parameter 'iterations' is {values['iterations']}; expected 'rollouts' instead, "
+                f"as the optimizer '{name}' does not count iterations"
             )
         return
     parts = {}
@@ -119,8 +119,9 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
         )
     if law.needs_model and law.name not in kind.also_improves:
         raise ParameterError(
-            f"the law '{law.name}' has a model of the plant in its parameters, which the optimizer "
-            f"'{values['optimizer']}' does not know; choose model_based, or the law 'observer'"
+            f"the parameters of the law '{law.name}' include a model of the plant, which the "
+            f"optimizer '{values['optimizer']}' does not support; choose model_based, or the law "
+            "'observer'"
         )
     if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
@@ -169,13 +170,14 @@ def remarks_on(values: Mapping[str, Any]) -> list[str]:
         return []  # no field between sensors is ever modelled
     if not grid.axes:
         return [
-            f"the plant declares no axis, so that the readings of {values['sensors']} sensors are "
-            "modelled without the field between them; if its state is a field on an axis, give the "
-            "plant a 'grid', and 'supports' for the places of its actuators (docs/bring-your-own.md)"
+            f"the plant declares no axis, so the readings of {values['sensors']} sensors are "
+            "modelled without the field between them; if its state is a field on an axis, give "
+            "the plant a 'grid', and 'supports' for the positions of its actuators "
+            "(docs/bring-your-own.md)"
         ]
     if grid.is_circle and values.get("plant") and not values["actuator_extents"]:
         return [
-            "the plant does not say where its actuators act, so that they are taken to be equally "
+            "the plant does not say where its actuators act, so they are assumed to be equally "
             "spaced; give the plant 'supports' (docs/bring-your-own.md)"
         ]
     return []
@@ -205,9 +207,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
     order = model_order(values)
     if not order and values["seeds"] > 1:
         raise ParameterError(
-            f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, as "
-            "the models of a batch have one order; give --reduced-order N (a training of one seed "
-            "says which), or train each seed on its own with pdeloop study"
+            f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, "
+            "as all models of a batch share one order; give --reduced-order N (a training of one "
+            "seed shows a suitable one), or train each seed on its own with pdeloop study"
         )
     named, kind, sensors = kind_of(values), kind_used(values), few_sensors(values)
     chosen = settings_of(named, values)

@@ -138,7 +138,7 @@ class Dispatcher:
         known.last_heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             void = f"the plant declared episode {episode_name(known.episode)} void"
-            self._retry(known, f"{void}: no action came, or different starts or actions")
+            self._retry(known, f"{void}: no action came, or different starts or actions arrived")
         else:
             known.take_answer(topics.COST.name, frame)
             known.chunk.costs, known.chunk.steps = frame.values.copy(), frame.step
@@ -341,7 +341,7 @@ class Dispatcher:
     def _retry(self, pair: Pair, reason: str) -> None:
         assert self._queue is not None
         chunk = pair.drop()
-        self.notes.append(f"{reason}; starting it again with the same seeds")
+        self.notes.append(f"{reason}; starting the episode again with the same seeds")
         self.counters["episodes repeated"] += 1
         self._queue.retry(chunk, reason, self.max_attempts)
 
@@ -374,7 +374,8 @@ class Dispatcher:
             if pair.missing and pair.chunk is not None:
                 self.notes.append(
                     f"pair {pair.number} lost its {' and '.join(pair.missing)} in episode "
-                    f"{episode_name(pair.episode)}; another pair starts it again with the same seeds"
+                    f"{episode_name(pair.episode)}; another pair runs the episode again with the "
+                    "same seeds"
                 )
                 self.counters["episodes taken over"] += 1
                 queue.waiting.append(pair.drop())

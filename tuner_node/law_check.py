@@ -50,7 +50,7 @@ def check_law(
             words = AFFINE if law.compiled else f"'{law.name}'"
             raise ValueError(
                 f"the actions are not those of the law {words}, which this optimizer needs; with a "
-                "controller of your own use one that learns from costs alone"
+                "controller of your own, choose an optimizer that learns from costs alone"
             )
 
 

@@ -15,8 +15,8 @@ LITTLE = 0.05
 REPEATS = 1e-6
 """Relative difference of the costs of one law on the same fields that is no rounding."""
 IDLE = (
-    "actions that hardly move the state or are dear (action_weight), a target out of their reach, or "
-    "too few rollouts; `pdeloop check` looks for causes"
+    "actions that hardly move the state or are expensive (action_weight), a target beyond their "
+    "reach, or too few rollouts; `pdeloop check` looks for the cause"
 )
 _TOGETHER = ("designed", "checked", "evaluated")
 """Events that every seed has, one after the other."""
@@ -105,7 +105,7 @@ class Narration:
             told = f"  {who}: reduced model of order {orders}, spectral radius {radius}"
             if lost := sum(not row.get("stabilised", True) for row in rows):
                 count = "" if self._seeds == 1 else f" for {lost} of them"
-                told += f"; it has no stabilising gains{count}, so that no control is the first law"
+                told += f"; it has no stabilising gains{count}, so the first law is no control"
             return [told]
         if event == "evaluated":
             costs = f"cost {cost('none')} without control, {cost('lqt')} with LQT, "
@@ -113,11 +113,11 @@ class Narration:
         verdict = f"a rollout costs {cost('none')} without control, {cost('lqt')} with LQT"
         for again, words in (
             (True, "exploring again"),
-            (False, "and no other exploration is left: a poor warm start"),
+            (False, "and no exploration is left, so the warm start is poor"),
         ):
             bad = sum(row["again"] == again and not row["accepted"] for row in rows)
             count = "" if self._seeds == 1 else f" for {bad} of them"
-            verdict += f"; no better{count}, {words}" if bad else ""
+            verdict += f"; LQT is no better{count}, {words}" if bad else ""
         return [f"  {who}: {verdict}"]
 
 
@@ -159,10 +159,12 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         )
     if comparable and not diverged["none"] and 0 < none - adapted < LITTLE * none:
         share = f"{100 * (1 - adapted / none):.2g}"
-        lines.append(f"  control saves only {share} % of the cost without it: {IDLE}")
+        lines.append(
+            f"  control saves only {share} % of the cost without control; likely causes: {IDLE}"
+        )
     if not any(summary["changed"]):
         lines.append(
-            "  nothing was adapted: the policies are those that the adaptation started from"
+            "  nothing was adapted: the policies are those with which the adaptation started"
         )
     elif worse := _worse_than_lqt(summary):
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
@@ -181,8 +183,8 @@ def differences(summary: Row) -> list[str]:
         found = [own for own in known if own]
         less, more = sum(own["high"] < 0 for own in found), sum(own["low"] > 0 for own in found)
         return [
-            f"on the same fields (95 % intervals) the adapted law costs less than the LQT law for "
-            f"{less} of {len(known)} seeds, more for {more}"
+            "on the same fields (95 % intervals) the adapted law costs less than the LQT law for "
+            f"{less} of {len(known)} seeds and more for {more}"
         ]
     (own,) = known
     return [
@@ -242,9 +244,10 @@ def warnings(summary: Row) -> list[str]:
     found += misjudged_noise(summary)
     if not _repeatable(summary):
         found.append(
-            "one law cost otherwise when it ran again from the same initial fields: the plant is no "
-            "function of state, action and seed, as a machine or one that draws random numbers of its "
-            "own, so that differences of costs are partly chance; `pdeloop check` tests its steps"
+            "the same law had another cost when it ran again from the same initial fields, so the "
+            "plant is not a function of state, action and seed (it is a machine, or draws random "
+            "numbers of its own) and differences in cost are partly chance; `pdeloop check` tests "
+            "its steps"
         )
     if lost["lqt"] == rollouts:
         found.append(
@@ -263,8 +266,8 @@ def warnings(summary: Row) -> list[str]:
     ]
     if worse and not any(costs["none"]):
         found.append(
-            "without control the fields cost nothing, as they are at the target: there is nothing to "
-            "control; draw other initial fields, or set another target"
+            "there is nothing to control: the initial fields are at the target and cost nothing "
+            "without control; draw other initial fields, or set another target"
         )
     elif worse:
         which = (
@@ -298,18 +301,19 @@ def misjudged_noise(summary: Row) -> list[str]:
     declared = f"{noise['declared']:.2g}" if noise["declared"] else "none"
     said = []
     if found := [one for one in noise["found"] if one]:
-        weak = ", and was explored too weakly" if max(found) > noise["declared"] else ""
+        weak = ", and its exploration was too weak" if max(found) > noise["declared"] else ""
         said.append(
-            f"measurement noise of about {span(found, '.2g')} was found{_share(found, summary)}, and "
-            f"{declared} was declared (measurement_noise): the optimiser accounted for it, the first "
-            f"law did not{weak}"
+            f"measurement noise of about {span(found, '.2g')} was found{_share(found, summary)}, "
+            f"but {declared} was declared (measurement_noise): the optimiser accounted for it, while "
+            f"the first law did not{weak}"
         )
     if seeming := [one for one in noise.get("seeming", []) if one]:
         about = "at most" if max(seeming) < noise["declared"] else "about"
         said.append(
-            f"the readings seem to have measurement noise of {about} {span(seeming, '.2g')}"
-            f"{_share(seeming, summary)}, and {declared} was declared: the optimiser did not account "
-            "for it; if the sensors are as noisy, set measurement_noise and train again"
+            f"the readings seem to have measurement noise of {about} "
+            f"{span(seeming, '.2g')}{_share(seeming, summary)}, but {declared} was declared: the "
+            "optimiser did not account for it; if the sensors really are that noisy, set "
+            "measurement_noise and train again"
         )
     return said
 
@@ -343,8 +347,8 @@ def _diverged(row: Row) -> str:
     told = f"  seed {row['seed']}: the plant diverged under exploration at step {row['step']}"
     if "next_variance" not in row:
         return (
-            f"{told}, and no other exploration is left; going on with the model from before, whose "
-            "law was no better than no control"
+            f"{told}, and no exploration is left; continuing with the previous model, whose law "
+            "was no better than no control"
         )
     return (
         f"{told}; exploring again with variance {row['next_variance']:.3g} instead of "

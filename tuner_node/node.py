@@ -82,7 +82,9 @@ class TunerNode:
             log.warning(remark)
         if identity.paused:
             dispatcher.pause()
-            log.warning("still paused, as when its process ended; call ~/resume to continue")
+            log.warning(
+                "still paused, as it was when its previous process ended; call ~/resume to continue"
+            )
         self._session = Session(training, dispatcher, self._rows.append)
         self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
@@ -172,7 +174,9 @@ class TunerNode:
         if self._writer:
             self._writer.hold(True)
         under_way = len(self._session.dispatcher.episodes())
-        return "paused" + (f"; {under_way} episode(s) under way will end" if under_way else "")
+        return "paused" + (
+            f"; {under_way} episode(s) under way will be completed" if under_way else ""
+        )
 
     def _resume(self) -> str:
         was = "resumed" if self._session.dispatcher.paused else "was not paused"
@@ -188,7 +192,7 @@ class TunerNode:
         if self._session.stopped:
             return "stopping now"
         return "stopping after the rollouts under way" + (
-            ", which wait for a paused plant"
+            ", which are waiting for a paused plant"
             if self._session.dispatcher.paused_pairs(self._loop.now())
             else ""
         )
@@ -245,7 +249,7 @@ class TunerNode:
         self._guarded(partial(self._participants.update, self._publishers()))
         missing, seconds = self._diagnostics.absent(now)
         if missing:
-            hint = "; do they have this ROS_DOMAIN_ID, namespace and DDS profile?"
+            hint = "; do they use this ROS_DOMAIN_ID, namespace and DDS profile?"
             self._log.warning(
                 f"waiting for {' and '.join(missing)} for {seconds:.0f} s"
                 + (hint if seconds > 2 * ABSENCE_REPORT else ""),

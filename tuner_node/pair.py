@@ -171,8 +171,8 @@ class Pair:
         self.foreign_since = min(self.foreign_since, now) if foreign else math.inf
         if now - self.foreign_since > FOREIGN_PLANT_GRACE:
             raise DispatchError(
-                f"the plant has other parameters (fingerprint {cost.plant}) than the one this "
-                f"run began with ({plant}); continue it with that one, or start a new run"
+                f"the plant has other parameters (fingerprint {cost.plant}) than the one this run "
+                f"began with ({plant}); continue with that plant, or start a new run"
             )
         if cost.plant != plant:
             raise FrameError(

@@ -80,8 +80,8 @@ class Participants:
         """
         if self._recorder == "required" and self._recorder_seen and not there.recorders:
             raise DispatchError(
-                "the recorder is gone, and this training is required to be recorded; "
-                "it can be continued from its folder with resume:=true"
+                "the recorder has gone, but this training has to be recorded; continue it from "
+                "its folder with resume:=true"
             )
         self._recorder_seen |= there.recorders > there.unmatched
 

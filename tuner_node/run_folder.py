@@ -240,8 +240,8 @@ class RunFolder:
         known = self.parameters()
         if "rollouts" not in known:
             raise RunFolderError(
-                f"the run in {self.path} is of an older version, which did not count its rollouts; "
-                "it cannot be continued, start a new one"
+                f"the run in {self.path} is from an older version, which did not count its "
+                "rollouts, so it cannot be continued; start a new run"
             )
         return known
 
@@ -339,8 +339,8 @@ class RunFolder:
             }
         except ValueError as error:
             raise RunFolderError(
-                f"{path} cannot be read ({error}); to rewrite it, delete it and "
-                f"result.json, then {resuming(self.path)}"
+                f"{path} cannot be read ({error}); to write it anew, delete it and result.json, "
+                f"and then: {resuming(self.path)}"
             ) from error
 
     def result(self) -> dict[str, Any]:
@@ -353,8 +353,8 @@ class RunFolder:
             return content
         except (ValueError, TypeError) as error:
             raise RunFolderError(
-                f"{path} cannot be used ({error}); is the run finished? Else delete it, "
-                f"and: {resuming(self.path)}"
+                f"{path} cannot be used ({error}); if the run is not finished, delete this file "
+                f"and continue with: {resuming(self.path)}"
             ) from error
 
     def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:

@@ -67,8 +67,8 @@ class RunWriter:
             self._changed = False
         except OSError as error:
             self._warn(
-                f"cannot write the checkpoint to {self._folder.path}: {error.strerror}; "
-                "the training continues, the previous checkpoint stays"
+                f"cannot write the checkpoint to {self._folder.path}: {error.strerror}; the "
+                "training continues and the previous checkpoint is kept"
             )
         took = time.monotonic() - began
         self._save_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
@@ -79,7 +79,8 @@ class RunWriter:
             self._folder.give_up(reason)
         except (OSError, FileError) as error:
             self._warn(
-                f"do not continue the run in {self._folder.path}, although it can be: {error}"
+                f"do not continue the run in {self._folder.path}: it used contradicted results, "
+                f"which could not be recorded ({error})"
             )
 
     def fail(self, reason: str) -> None:
@@ -87,14 +88,14 @@ class RunWriter:
         try:
             self._folder.fail(reason)
         except (OSError, FileError) as error:
-            self._warn(f"the folder does not say that the training failed: {error}")
+            self._warn(f"cannot record that the training failed: {error}")
 
     def hold(self, paused: bool) -> None:
         """Remember whether an operator has paused the training, for its tuner's next process."""
         try:
             self._folder.hold(paused)
         except (OSError, FileError) as error:
-            self._warn(f"a pause is forgotten with this process: {error}")
+            self._warn(f"cannot record the pause, which is lost when this process ends: {error}")
 
     def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write the results of the finished training. Raises OSError if they cannot be written."""

@@ -132,8 +132,8 @@ class Training:
         """Take the results of the batch that `next_batch` gave, in its order."""
         if self.plant not in (UNKNOWN_PLANT, result.plant):
             raise ValueError(
-                f"the plant has other parameters (fingerprint {result.plant}) than the one this run "
-                f"began with ({self.plant}); continue it with that one, or start a new run"
+                f"the plant has other parameters (fingerprint {result.plant}) than the one this "
+                f"run began with ({self.plant}); continue with that plant, or start a new run"
             )
         self.plant, self.steps = result.plant, same_steps(result, self.steps)
         if self.phase == "identify":
@@ -280,8 +280,8 @@ class Training:
         own, size = (len(self._unpacked(rows).U) for rows in (self.settings.model, identified[0]))
         if own != size:
             raise NoModelError(
-                f"the given model is of a state of {own} numbers, the plant's has {size}; "
-                "identify one of this plant"
+                f"the given model is for a state of {own} numbers, but the plant's state has "
+                f"{size}; identify a model of this plant"
             )
         self.budget.count("identify", np.repeat(self.pending, self.settings.explorations))
         self._take_given_model(self.settings.model)

@@ -55,12 +55,12 @@ def no_model(settings: TrainingSettings, steps: Sequence[int], *, paid_up: bool)
     if len(steps) > 1 and steps[-1] <= steps[0]:
         shorter = f"set a horizon of {min(steps)} steps or fewer, " if min(steps) else ""
         return (
-            f"{told}weaker inputs did not delay it: if it diverges without control, which `pdeloop "
-            f"check` tells, {shorter}raise divergence_bound, or begin nearer to the target; else lower "
-            "exploration_variance by more"
+            f"{told}weaker inputs did not delay it: if the plant diverges without control "
+            f"(`pdeloop check` shows this), {shorter}raise divergence_bound, or begin nearer to "
+            "the target; otherwise lower exploration_variance further"
         )
     noise = ", or measurement_noise, which raises it" if settings.measurement_noise else ""
     return (
-        f"{told}lower exploration_variance{noise}, or shorten the horizon where the plant diverges "
-        "without control too"
+        f"{told}lower exploration_variance{noise}, or shorten the horizon if the plant also "
+        "diverges without control"
     )

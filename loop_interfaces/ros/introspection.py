@@ -212,7 +212,9 @@ class Introspection:
                 verdict, reason = qos_check_compatible(offered, asked)
                 if verdict == QoSCompatibility.ERROR:
                     reason = reason.removeprefix("ERROR: ").rstrip(";")
-                    text = f"{name} publishes {topic} so that it does not arrive (QoS: {reason})"
+                    text = (
+                        f"{name} publishes {topic}, but its messages cannot arrive (QoS: {reason})"
+                    )
                     if self._is_due(text, now):
                         self._node.get_logger().error(
                             f"{text}; expected a publisher as in docs/protocol.md"

@@ -41,8 +41,8 @@ def optimizer_kind(name: str) -> type[Optimizer]:
     """
     if not OWN_OPTIMIZERS.shipped:
         raise ValueError(
-            f"optimizer {name!r}: not even the optimizers of pdeloop are installed; install it again, "
-            "as its entry points are out of date"
+            f"optimizer {name!r}: the entry points of pdeloop are out of date, as not even its own "
+            "optimizers are found; install pdeloop again"
         )
     return complete(name, OWN_OPTIMIZERS.configured(name))
 

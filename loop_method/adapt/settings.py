@@ -39,15 +39,15 @@ class ImprovementSettings(Settings):
     )
     most_mixtures: int = setting(
         96,
-        "the same for the final law where fewer fields make one that the fields left out do not "
-        "confirm",
+        "the same for the final law if the one from fewer fields is not confirmed by the fields "
+        "left out",
         0,
         1000,
     )
     confirmed: float = setting(
         0.5,
-        "share of its gain on its own fields that a law must have on those left out, or it is made "
-        "again on more drawn fields",
+        "share of the gain on its own fields that a law must reach on those left out; otherwise "
+        "it is made again on more drawn fields",
         0.0,
         1.0,
     )
@@ -59,16 +59,20 @@ class ImprovementSettings(Settings):
     )
     chaotic_most: int = setting(
         96,
-        "the same where the gain of a law from fewer states is not clear from the others",
+        "the same if the gain of a law from fewer states is not clear on the other states",
         4,
         1000,
     )
     chaotic_clear: float = setting(
-        10.0, "multiple of the standard errors of the verdict at which it is clear", 0.0, 100.0
+        10.0,
+        "multiple of the standard errors of the verdict at which this gain is clear",
+        0.0,
+        100.0,
     )
     chaotic_confirmed: float = setting(
         0.8,
-        "share of a law's gain on its own states, on those left out, at which few suffice",
+        "share of the gain on its own states that a law must reach on those left out for few "
+        "states to suffice",
         0.0,
         1.0,
     )
@@ -79,7 +83,7 @@ class ImprovementSettings(Settings):
         20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
     )
     measured_share: float = setting(
-        0.5, "weight of the measured fields against the drawn ones", 0.0, 1.0
+        0.5, "weight of the measured fields relative to the drawn ones", 0.0, 1.0
     )
     iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
     memory: int = setting(40, "gradient differences that L-BFGS keeps", 1, 1000)
@@ -107,7 +111,10 @@ class ImprovementSettings(Settings):
         100,
     )
     fractions: int = setting(
-        4, "equal steps from the first law to the improved one to choose from", 1, 100
+        4,
+        "number of equal steps from the first law to the improved one, among which one is chosen",
+        1,
+        100,
     )
     close: float = setting(
         0.2,
@@ -124,8 +131,8 @@ class ImprovementSettings(Settings):
     )
     confidence: float = setting(
         1.0,
-        "exact standard errors by which a law must beat the first one; estimated from few rollouts, "
-        "they have to be more",
+        "standard errors by which a law must beat the first one if they are known exactly; more "
+        "if they are estimated from few rollouts",
         0.0,
         10.0,
     )
@@ -151,11 +158,11 @@ class ModelBasedSettings(ImprovementSettings):
         1,
         10_000,
     )
-    observer_gain: float = setting(3e-4, "as least_gain, likewise", 0.0, 1.0)
+    observer_gain: float = setting(3e-4, "as least_gain, for that improvement", 0.0, 1.0)
     observer_draws: int = setting(
         2,
-        "sets of drawn initial fields, each of at most mixtures, likewise and of the law "
-        "extended_kalman",
+        "sets of drawn initial fields, each of at most mixtures, for that improvement and for "
+        "the law extended_kalman",
         1,
         100,
     )
@@ -164,17 +171,17 @@ class ModelBasedSettings(ImprovementSettings):
     )
     filter_unpredicted: float = setting(
         0.04,
-        "share of the size of a field that its filter adds to the noise of a reading, as no model "
-        "predicts it; 6 or else 3 times as much within filter_margin",
+        "share of the size of a field that its filter adds to the noise of a reading for what no "
+        "model predicts; 6 times as much, or else 3 times, where filter_margin allows it",
         0.0,
         1.0,
     )
     filter_inflation: float = setting(
-        1.0, "factor of the standard deviations of its estimate in every step", 1.0, 2.0
+        1.0, "factor by which the standard deviations of its estimate grow in every step", 1.0, 2.0
     )
     filter_seen: float = setting(
         0.2,
-        "share of the size of a field that is noise on what one of its laws is optimised for",
+        "noise, as a share of the size of a field, for which one of its laws is optimised",
         0.0,
         10.0,
     )
@@ -182,19 +189,20 @@ class ModelBasedSettings(ImprovementSettings):
         30, "as iterations, for a law on an estimate that is improved through its filter", 1, 10_000
     )
     filter_draws: int = setting(
-        4, "sets of drawn initial fields, each of at most mixtures, likewise", 1, 100
+        4, "sets of drawn initial fields, each of at most mixtures, for such a law", 1, 100
     )
     filter_equations: int = setting(
         1,
-        "equations, the newest and those before it, on which laws between few sensors are compared; "
-        "with more than 1 the last law on an estimate is also improved through its filter",
+        "number of equations, the newest and those before it, on which laws between few sensors "
+        "are compared; with more than 1 the last law on an estimate is also improved through its "
+        "filter",
         1,
         100,
     )
     filter_margin: float = setting(
         0.03,
-        "largest relative increase of the cost on the model with which a filter that trusts the "
-        "equation less is used",
+        "largest relative increase in the cost on the model at which a filter that trusts the "
+        "equation less is still used",
         0.0,
         1.0,
     )
@@ -237,16 +245,21 @@ class GaussNewtonSettings(ImprovementSettings):
         100.0,
     )
     small_gain: float = setting(
-        0.02, "share of the cost below which an accepted step adds a field", 0.0, 1.0
+        0.02,
+        "gain of an accepted step, as a share of the cost, below which a field is added",
+        0.0,
+        1.0,
     )
-    remembered: int = setting(40, "newest rollouts, to which models are fitted", 1, 1_000_000)
+    remembered: int = setting(
+        40, "number of newest rollouts to which models are fitted", 1, 1_000_000
+    )
     first_damping: float = setting(1.0, "initial damping", 1e-12, 1e12)
     least_damping: float = setting(1e-4, "smallest damping", 1e-12, 1e12)
     largest_damping: float = setting(100.0, "largest damping after a rejection", 1e-12, 1e12)
     good_ratio: float = setting(
         0.5, "ratio of measured to predicted fall above which the damping is reduced", 0.0, 10.0
     )
-    poor_ratio: float = setting(0.2, "the same up to which it is raised", 0.0, 10.0)
+    poor_ratio: float = setting(0.2, "the same ratio up to which it is raised", 0.0, 10.0)
     damping_fall: float = setting(3.0, "divisor of the damping after a good step", 1.0, 1e6)
     damping_rise: float = setting(2.0, "factor of the damping after a poor step", 1.0, 1e6)
     damping_rejected: float = setting(4.0, "factor of the damping after a rejection", 1.0, 1e6)
@@ -259,9 +272,14 @@ class GaussNewtonSettings(ImprovementSettings):
         0.0,
         1e6,
     )
-    newest: int = setting(8, "newest initial fields of a step on such a model", 1, 1000)
+    newest: int = setting(
+        8, "number of newest initial fields used for a step on such a model", 1, 1000
+    )
     extrapolation: float = setting(
-        1.5, "ratio of the distances from their mean of further fields and of these", 0.0, 100.0
+        1.5,
+        "distance of further fields from the mean of these, relative to that of these fields",
+        0.0,
+        100.0,
     )
     chaotic_share: int = setting(
         3,
@@ -279,7 +297,7 @@ class GaussNewtonSettings(ImprovementSettings):
     linear_ridge: float = setting(1e-5, "ridge of the linear part", 0.0, 1.0)
     action_ridge: float = setting(1e-8, "ridge of the inputs", 0.0, 1.0)
     ageing: float = setting(
-        0.9, "weight of a rollout against one that is M rollouts newer", 1e-6, 1.0
+        0.9, "weight of a rollout relative to one that is M rollouts newer", 1e-6, 1.0
     )
     least_weight: float = setting(0.3, "smallest such weight", 0.0, 1.0)
     low_forgetting: float = setting(
@@ -288,17 +306,22 @@ class GaussNewtonSettings(ImprovementSettings):
     middle_forgetting: float = setting(15.0, "the next one", 0.0, 1e3)
     high_forgetting: float = setting(50.0, "the largest one", 0.0, 1e3)
     local_cost: float = setting(
-        3.0, "maximum cost of a rollout compared with the incumbent, per cost of that", 1.0, 1e6
+        3.0,
+        "maximum cost of a rollout that is compared with the incumbent, relative to the cost "
+        "of the incumbent",
+        1.0,
+        1e6,
     )
     worst: float = setting(2.0, "E assigned to a local model that diverges", 1.0, 1e6)
     enough_factor: float = setting(
         1.5,
-        "after an acceptance, the smallest kappa whose E is at most this times the minimum is used",
+        "after an acceptance, the smallest kappa is used whose E is at most this multiple of the "
+        "minimum",
         1.0,
         1e3,
     )
     alike_factor: float = setting(
-        3.0, "models whose E is at most this times the minimum are averaged", 1.0, 1e3
+        3.0, "models whose E is at most this multiple of the minimum are averaged", 1.0, 1e3
     )
     alike_margin: float = setting(0.03, "added to both of these bounds", 0.0, 2.0)
     alike_distance: float = setting(

@@ -95,7 +95,7 @@ class FieldLaw:
         """The report as text."""
         fitted = self.fitted
         if fitted is None:
-            return ["no model of the whole field can be fitted: the law is that of the regression"]
+            return ["no model of the whole field can be fitted: the law of the regression is used"]
         lines = [
             f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} in "
             "predicting the data",
@@ -104,12 +104,12 @@ class FieldLaw:
         if self.noise:
             return [
                 *lines,
-                f"  measurement noise of about {self.noise:.2g} was found, which was not declared: the "
-                "law is that of the regression; declare it (measurement_noise) and explore again, as "
+                f"  undeclared measurement noise of about {self.noise:.2g} was found: the law of "
+                "the regression is used; declare it (measurement_noise) and explore again, as "
                 "strongly as it requires",
             ]
         if self.rows is None:
-            return [*lines, "  it is not accurate enough: the law is that of the regression"]
+            return [*lines, "  it is not accurate enough: the law of the regression is used"]
         taken = "its law is used" if self.better else "the law of the regression is used"
         costs = (
             f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
@@ -122,7 +122,7 @@ def _number(cost: float) -> float | None:
 
 
 def _cost(cost: float) -> str:
-    return f"{cost:.4g}" if np.isfinite(cost) else "none, as it runs away,"
+    return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
 
 
 def best_model(

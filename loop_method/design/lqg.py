@@ -146,7 +146,8 @@ def require_detectable(A: Array, C: Array) -> None:
             raise DesignError(
                 f"the readings do not observe a mode that grows by the factor {growth:.6g} a "
                 f"step{wave} (smallest singular value of [lambda I - A; C] {seen:.1e}), so no "
-                "filter can estimate it: move or add sensors so that it is not 0 at all of them"
+                "filter can estimate it: move or add sensors so that at least one is where the "
+                "mode is not 0"
             )
 
 

@@ -43,7 +43,10 @@ class FieldModelSettings(Settings):
     fewest_points: int = setting(8, "minimum number of grid points of a spectral model", 4, 65536)
     # Spectral models.
     passes: int = setting(
-        12, "times that an equation is refitted along the paths of the previous fit", 1, 20
+        12,
+        "number of times that an equation is refitted along the paths of the previous fit",
+        1,
+        20,
     )
     settled: float = setting(
         1e-3, "relative change of the one-step error at which the passes end", 0, 0.1
@@ -90,7 +93,7 @@ class FieldModelSettings(Settings):
     )
     near_reach: float = setting(0.5, "as `point_reach`, for models of neighbours", 0.1, 2.8)
     near_dropped: float = setting(
-        0.5, "share by which its residual may grow for products that are left out", 0, 100
+        0.5, "share by which its residual may grow when products are left out", 0, 100
     )
     near_negligible: float = setting(
         1e-12, "squared error that counts as none there, as a share of the squared change", 0, 1
@@ -153,7 +156,8 @@ class FieldModelSettings(Settings):
     # Noise that was not declared, or not as it is.
     noise_misjudged: float = setting(
         2.0,
-        "ratio of the noise in the data to the declared one, or its inverse, that counts",
+        "ratio of the noise in the data to the declared noise, or its inverse, from which they "
+        "count as different",
         1.1,
         100,
     )
@@ -201,7 +205,8 @@ class FieldModelSettings(Settings):
     )
     sensed_varying: float = setting(
         3e-4,
-        "error of constant coefficients, fitted from nothing, above which ones of x are tried",
+        "error of an equation with constant coefficients, fitted from nothing, above which "
+        "coefficients that depend on x are tried",
         0,
         1,
     )
@@ -223,8 +228,8 @@ class FieldModelSettings(Settings):
     )
     sensed_likelier: float = setting(
         30.0,
-        "log-likelihood that a fit from nothing, without the spread of waves that followed from an "
-        "earlier equation, must have more than the fit with it",
+        "margin in log-likelihood by which a fit from nothing, without the spread of waves that "
+        "followed from an earlier equation, must exceed the fit with it",
         0,
         1e6,
     )
@@ -292,13 +297,13 @@ class FieldModelSettings(Settings):
     sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
     sensed_alike_chi: float = setting(
         4.0,
-        "standard deviations of what noise has in an error by which it must fall for differences "
-        "between actuators, or coefficients of x, to count",
+        "fall of an error, in standard deviations of the part due to noise, from which "
+        "differences between actuators, or coefficients that depend on x, count",
         0,
         1000,
     )
     sensed_alike_ridge: float = setting(
-        1e-2, "that ridge while actuators are held near to one strength", 0, 1
+        1e-2, "ridge of these differences while the actuators are held close to one strength", 0, 1
     )
     sensed_deviation: float = setting(
         10.0,
@@ -309,7 +314,7 @@ class FieldModelSettings(Settings):
     sensed_unequal: float = setting(
         1.0, "the same for the differences between actuators", 1e-6, 1e12
     )
-    sensed_alike_unequal: float = setting(0.1, "the same while they are held", 1e-6, 1e12)
+    sensed_alike_unequal: float = setting(0.1, "the same while they are held close", 1e-6, 1e12)
     sensed_field_ridge: float = setting(
         1e-3, "ridge of the Fourier coefficients of an initial field", 0, 1
     )
@@ -320,7 +325,7 @@ class FieldModelSettings(Settings):
         1e6,
     )
     sensed_field_wave: float = setting(
-        4.0, "wavenumber beyond which both become stricter, with its square", 0.1, 1e3
+        4.0, "wavenumber beyond which both grow stricter with its square", 0.1, 1e3
     )
     sensed_learning: int = setting(
         5, "maximum number of iterations towards the most likely spread of waves", 0, 100
@@ -329,7 +334,7 @@ class FieldModelSettings(Settings):
         0.05, "relative change of this spread below which nothing is iterated or fitted again", 0, 1
     )
     sensed_least_told: float = setting(
-        0.05, "minimum share of a coefficient that a rollout counts as determined", 1e-6, 1
+        0.05, "minimum share of a coefficient that a rollout is taken to determine", 1e-6, 1
     )
     sensed_least_spread: float = setting(
         1e-2, "minimum spread of a wave, relative to the largest", 1e-9, 1

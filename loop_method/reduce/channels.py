@@ -76,9 +76,9 @@ def never_moved(names: Sequence[str], values: Sequence[float]) -> str:
     """Message about constant inputs."""
     one, at = len(names) == 1, ", ".join(dict.fromkeys(f"{value:.4g}" for value in values[:SHOWN]))
     return (
-        f"the input{'' if one else 's'} {listed(names)} never moved (constant at {at}), which says "
-        f"nothing of {'its effect: excite it' if one else 'their effects: excite them'}, or add a log "
-        "in which that was done"
+        f"the input{'' if one else 's'} {listed(names)} never moved (constant at {at}), which "
+        f"shows nothing of {'its effect: excite it' if one else 'their effects: excite them'}, or "
+        "add a log in which that was done"
     )
 
 
@@ -88,7 +88,7 @@ def moved_together(name: str, terms: Mapping[str, float], offset: float) -> str:
     text += f" + {offset:.4g}" if offset else ""
     return (
         f"the inputs {listed([*terms, name])} always moved together ({name} = "
-        f"{text.replace('+ -', '- ')}), so that their effects cannot be told apart: excite them one by "
+        f"{text.replace('+ -', '- ')}), so their effects cannot be told apart: excite them one by "
         "one or at random, or add a log in which that was done"
     )
 
@@ -98,8 +98,8 @@ def followed_the_state(names: Sequence[str]) -> str:
     one = len(names) == 1
     what = f"the input {names[0]}" if one else f"a combination of the inputs {listed(names)}"
     return (
-        f"{what} always followed from the state (feedback without excitation, or a signal that is too "
-        "regular), so that its effect cannot be told apart from what the plant does by itself: add "
+        f"{what} always followed from the state (feedback without excitation, or a signal that is "
+        "too regular), so its effect cannot be told apart from what the plant does by itself: add "
         f"random excitation to {'it' if one else 'them'}, or add a log that has some"
     )
 
@@ -109,7 +109,7 @@ def hardly_independent(names: Sequence[str], shares: Sequence[float]) -> str:
     own = ", ".join(f"{100 * share:.2g} %" for share in shares[:SHOWN])
     return (
         f"of the variation of {listed(names)} only {own} is independent of the state and the other "
-        "inputs, so that what was identified of their effects is uncertain: excite each input by "
+        "inputs, so what was identified of their effects is uncertain: excite each input by "
         "itself, or add a log in which that was done"
     )
 
@@ -144,8 +144,8 @@ def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
     large = int(moving[np.argmax(sizes[moving])])
     if sizes[small] < UNITS * sizes[large]:
         found.append(
-            f"{channels.state(small)} is at most {sizes[small]:.1g} and {channels.state(large)} up to "
-            f"{sizes[large]:.1g} (choose units in which they are of one size)"
+            f"{channels.state(small)} is at most {sizes[small]:.1g} and {channels.state(large)} up "
+            f"to {sizes[large]:.1g} (choose units in which they are of similar size)"
         )
     return found
 

@@ -119,9 +119,7 @@ def examine(
         found = examine_steps(data, U, channels)
     remarks = list(found.remarks)
     if copies := repeated(trajectories):
-        told = ", ".join(
-            f"{i} is {first} again" for i, first in list(copies.items())[: words.SHOWN]
-        )
+        told = ", ".join(f"{i} repeats {first}" for i, first in list(copies.items())[: words.SHOWN])
         remarks.append(f"of the trajectories, {told}; each counts once")
     if suspicious := words.state_faults(data.after, channels):
         remarks.append(f"of the state, {'; '.join(suspicious)}: leave out what is not measured")

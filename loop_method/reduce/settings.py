@@ -16,9 +16,9 @@ class IdentificationSettings(Settings):
     """
 
     order_pieces: int = setting(
-        8, "pieces of an exploratory episode when an order is suggested", 2, 1000
+        8, "number of pieces of an exploratory episode from which an order is suggested", 2, 1000
     )
-    order_folds: int = setting(4, "parts of these pieces, each held out once", 2, 1000)
+    order_folds: int = setting(4, "number of groups of these pieces, each held out once", 2, 1000)
     order_share: float = setting(
         0.8,
         "share of the best order's reduction of the one-step error, on a logarithmic scale, that "
@@ -43,7 +43,7 @@ class IdentificationSettings(Settings):
     )
     field_room: float = setting(
         2.0,
-        "modes per actuator from which the rows of the full-state feedback are part of the basis",
+        "modes per actuator from which on the basis includes the rows of the full-state feedback",
         1.0,
         1000.0,
     )

@@ -66,9 +66,7 @@ def info_text(content: dict[str, Any]) -> str:
         f"{content['bytes'] / 1e6:.1f} MB, {content['seconds']:.1f} s"
     ]
     if not content["finished"]:
-        lines.append(
-            "  not finished: its recorder was stopped; what follows is what it had written"
-        )
+        lines.append("  not finished: its recorder was stopped; this lists what it had written")
     lines += [f"  missing: {text}" for text in content["missing"]]
     lines += [f"  {text}" for text in content["differences"]]
     width = max((len(topic["topic"]) for topic in content["topics"]), default=0)
@@ -99,7 +97,7 @@ def _listed(episodes: Sequence[dict[str, Any]]) -> list[str]:
         )
         found = ["exploratory"] if episode["exploratory"] else []
         every = episode["state_every"]
-        found += [f"every {every} steps a state"] if every > 1 else []
+        found += [f"a state every {every} steps"] if every > 1 else []
         found += [f"lacks {what}" for what in episode["missing"]]
         found += [f"of {episode['namespace']}"] if several else []
         notes.append(", ".join(found))

@@ -74,7 +74,7 @@ def read(path: Path) -> Iterator[Message]:
                 yield Message(channel.topic, kind, record.log_time, record.data)
     except (McapError, ValueError) as error:
         text = f"{type(error).__name__} {error}" if isinstance(error, McapError) else error
-        raise BagError(f"{path} cannot be read, it is damaged: {text}") from error
+        raise BagError(f"{path} cannot be read, as it is damaged: {text}") from error
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror}") from error
 

@@ -122,12 +122,12 @@ def check(folder: Path, told: Metadata, found: Survey) -> Findings:
             findings.differences.append(f"{METADATA} names {shown(name)[1:-1]} {times} times")
     for name in files:
         if name not in told.files:
-            findings.differences.append(f"{name} is in {folder}, and {METADATA} does not name it")
+            findings.differences.append(f"{name} is in {folder}, but {METADATA} does not name it")
     listed = [name for name in dict.fromkeys(told.files) if name in files]
     if listed != (order := [name for name in files if name in listed]):
         findings.differences.append(
-            f"{METADATA} has its files in the order {', '.join(listed[:NAMED])}, their messages are "
-            f"from the times of {', '.join(order[:NAMED])}"
+            f"{METADATA} lists its files in the order {', '.join(listed[:NAMED])}, but their "
+            f"messages are in the order {', '.join(order[:NAMED])}"
         )
     _check_whole(told, Survey([files[name] for name in listed]), findings)
     return findings
@@ -167,7 +167,7 @@ def _check_whole(told: Metadata, found: Survey, findings: Findings) -> None:
         return
     parts = [f"{count} of {said} of {shown(topic)[1:-1]}" for topic, said, count in others[:NAMED]]
     more = f" and of {len(others) - NAMED} more topics" if len(others) > NAMED else ""
-    text = f"{METADATA} counts other messages than are there: {', '.join(parts)}{more}"
+    text = f"the numbers of messages differ from those in {METADATA}: {', '.join(parts)}{more}"
     lost = all(count < said for _, said, count in others)
     (findings.missing if lost else findings.differences).append(text)
 
@@ -176,12 +176,12 @@ def _check_extent(
     what: str, messages: int, first: int | None, last: int | None, told: Extent, findings: Findings
 ) -> None:
     if told.messages is not None and messages != told.messages:
-        text = f"{what} has {messages} messages, {METADATA} says {told.messages}"
+        text = f"{what} has {messages} messages, but {METADATA} says {told.messages}"
         (findings.missing if messages < told.messages else findings.differences).append(text)
     elif messages and told.first is not None and told.duration is not None:
         assert first is not None and last is not None
         if (first, last - first) != (told.first, told.duration):
             findings.differences.append(
-                f"the messages of {what} are from {first} to {last} ns, {METADATA} says from "
+                f"the messages of {what} are from {first} to {last} ns, but {METADATA} says from "
                 f"{told.first} to {told.first + told.duration} ns"
             )

@@ -94,7 +94,7 @@ class Bag:
     def contradicting_parameters(self) -> list[str]:
         """Differences between the parameters next to the bag and those in it, in words."""
         return [
-            f"{PARAMETERS} has other parameters of run {run} than the bag itself: {name}"
+            f"{PARAMETERS} differs from the bag itself in a parameter of run {run}: {name}"
             for run, values in _beside(self.path / PARAMETERS).items()
             for name, value in values.items()
             if value != self.survey.parameters.get(run, {}).get(name, value)

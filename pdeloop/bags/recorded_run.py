@@ -60,8 +60,7 @@ class RecordedRun:
             return
         if not any(spec.name in values for spec in PLANT):
             self._note(
-                "its plant told no parameters, as one that is a node of its own, so nothing is "
-                "recomputed"
+                "its plant gave no parameters, as a node of your own may, so nothing is recomputed"
             )
             return
         self._given = set(values)
@@ -93,8 +92,8 @@ class RecordedRun:
             self._same_plant = False
             self._note(
                 f"recorded with another fingerprint of the plant ({episode.cost.plant}; here it is "
-                f"{self._fingerprint}): its parameters or the source of its equation are others. "
-                "The states that it computes are compared nevertheless"
+                f"{self._fingerprint}): its parameters or the source of its equation differ. The "
+                "states that it computes are compared all the same"
             )
         if not episode.missing:
             self._run_again(episode, where)
@@ -114,9 +113,7 @@ class RecordedRun:
         if self._values is None or not (self._rollouts or claims):
             return False
         if unknown := [name for name in _TUNERS if name not in self._given]:
-            self._note(
-                f"the tuner's {', '.join(unknown)} not known, so its policies cannot be followed"
-            )
+            self._note(f"the tuner's policies cannot be followed without its {', '.join(unknown)}")
             return False
         training = build_training({**self._values, "plant_fingerprint": self._fingerprint})
         pair = LocalPair(self._values, self._pair.plant)
@@ -144,7 +141,7 @@ class RecordedRun:
             pair.follow(training)
         for places in unseen.values():
             for place in places:
-                self._report.differs(f"policy of {place}: the training asks for none like it")
+                self._report.differs(f"policy of {place}: the training never asks for it")
         if claims is not None:
             lost.reach_end()
             compare_results(claims, training, self._report)

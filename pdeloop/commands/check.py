@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
         nargs="?",
         default="",
         metavar="FILE",
-        help="a problem's YAML file or a shipped name, or one of plant, controller and tuner; not "
+        help="a problem's YAML file or shipped name, or one of plant, controller and tuner; not "
         "needed with --plant",
     )
     whole, real = _number(int, 1, 65536), _number(float, 0.1, 86400.0)
@@ -65,7 +65,7 @@ def add(commands: Commands) -> None:
         "--n-z",
         type=whole,
         metavar="N",
-        help="size of the state sent to a controller [64, and its order]",
+        help="size of the state sent to a controller [64, then the order of its model]",
     )
     add_option("--patience", type=real, metavar="S", help="seconds to wait for an answer [10]")
     add_option(
@@ -101,7 +101,9 @@ def _check(options: argparse.Namespace) -> int:
         if options.problem in takers if takers else not of_a_node:
             continue
         what = "a problem's FILE" if takers is None else f"a node ({', '.join(takers)})"
-        options.refuse(f"leave out --{name.replace('_', '-')}: only for the check of {what}")
+        options.refuse(
+            f"--{name.replace('_', '-')} applies only to the check of {what}; leave it out"
+        )
     if of_a_node:
         from pdeloop.conformance.node import check_node
 

@@ -76,7 +76,7 @@ def _monitor(options: argparse.Namespace) -> int:
     if options.environment < 0:
         raise ParameterError(f"--environment is {options.environment}; expected 0 or more")
     if folder is not None and run_id(folder) is None:
-        raise ParameterError(f"no run in {folder}; give the folder of one, or none")
+        raise ParameterError(f"no run in {folder}; give the folder of a run, or no folder")
     finder = Finder(folder, given_domain())
     if folder is not None and finder.find() is None:
         way = RunFolder(folder).without_results()

@@ -67,7 +67,7 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
 
 def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
     """ParameterError if a problem or plant, its module or its class cannot have this name."""
-    another = "; take another name"
+    another = "; choose another name"
     if plant:
         from pde_sim_node.plants.loading import PLANTS
 
@@ -76,14 +76,14 @@ def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
     if module in {problem.replace("-", "_") for problem in shipped_problems()}:
         raise ParameterError(f"'{name}' is a shipped problem{another}")
     if iskeyword(module) or _is_module(module):
-        raise ParameterError(f"Python has '{module}' already{another}")
+        raise ParameterError(f"Python already has '{module}'{another}")
     if iskeyword(kind) or hasattr(builtins, kind):
-        raise ParameterError(f"its class would be '{kind}', which Python has already{another}")
+        raise ParameterError(f"its class would be '{kind}', which Python already has{another}")
     imports = re.findall(r"import (.+)", (_TEMPLATES / "equation.py.txt").read_text())
     if kind in ", ".join(imports).split(", "):
         raise ParameterError(f"its class would be '{kind}', which its own file imports{another}")
     if module == "conftest" or module.startswith("test_"):
-        raise ParameterError(f"pytest would take {module}.py for its own{another}")
+        raise ParameterError(f"pytest would take {module}.py for a file of its own{another}")
 
 
 def _is_module(name: str) -> bool:

@@ -100,8 +100,8 @@ def carry_out(
 
     if options.processes is not None and (options.processes < 1 or options.scheduler is not None):
         raise ParameterError(
-            "--processes is how many trainings run on this machine: expected at least 1, and no "
-            "--scheduler"
+            "--processes is the number of trainings at a time on this machine; expected at least "
+            "1, without --scheduler"
         )
     folder: Path = options.out or Path("runs") / f"{name}-{timestamp()}"
     study = study_in(folder)
@@ -152,7 +152,9 @@ def _study(options: argparse.Namespace) -> int:
 
     settings = read_settings(options.set)
     if options.file is None and settings:
-        raise ParameterError("--out DIR alone continues a study with its own parameters: no --set")
+        raise ParameterError(
+            "--out DIR alone continues a study with its own parameters; leave out --set"
+        )
 
     def study_in(folder: Path) -> Study:
         if options.file is None:

@@ -195,7 +195,7 @@ class ControllerCheck(Check):
     # The probes.
 
     def every_state(self) -> None:
-        """Every state is answered, with its ids and time; a repeated one again, and alike."""
+        """Every state is answered, with its ids and time; if repeated, with the same actions."""
         explored = self.explore(5, steps=20)
         for step in (20, 20, 3):
             again = self.answer(self.state(explored.start, step, *explored.states[step]))
@@ -206,7 +206,7 @@ class ControllerCheck(Check):
         assert self.first
 
     def exploration(self) -> None:
-        """An exploratory action depends on excitation seed, variance and step only."""
+        """An exploratory action depends only on excitation seed, variance and step."""
         known = self.first[0].actions
         start = self.new_start([(4, 5, variance(5), 0)])
         self.publish(START, start)
@@ -229,7 +229,7 @@ class ControllerCheck(Check):
         require(good, f"the covariance {v} I", covariance.tolist())
 
     def result_again(self) -> None:
-        """The same data give the same result, and cost or start again gives it again."""
+        """The same data give the same result, and a repeated cost or start brings it again."""
         explored = self.explore(5)
         cost = explored.cost()
         for topic, frame in ((COST, cost), (COST, cost), (START, explored.start)):
@@ -271,7 +271,7 @@ class ControllerCheck(Check):
             raise NoteError(f"with K_a the spectral radius of the plant is {radius:.3g}")
 
     def lost_states(self) -> None:
-        """An exploration of which states are missing gives `model/failed`, retry true."""
+        """An exploration with missing states gives `model/failed`, retry true."""
         known = self.first[1]
         self.explore(6, steps=20)
         cost = self.explore(5, lost=(7, 8)).cost()
@@ -288,7 +288,7 @@ class ControllerCheck(Check):
         self.fails(self.explore(5).cost(50.0), retry=False)
 
     def two_explorations(self) -> None:
-        """Two rows are explored, and give their models, as the two single ones, to the bit."""
+        """Two rows are explored, and give models, to the bit as two single ones."""
         (one, first), two = self.first, self.explore(6)
         second = self.identified(two)
         both = self.explore(5, 6)
@@ -349,7 +349,7 @@ class ControllerCheck(Check):
                 )
 
     def two_policies(self) -> None:
-        """Two rows are answered as the two single ones to the bit, in either order."""
+        """Two rows are answered to the bit as two single ones, in either order."""
         n_z = self.plant.n_z
         one = self.gains, 1, np.linspace(0.5, 1.5, n_z)
         two = 2.0 * self.gains[::-1], 0, np.linspace(1.5, 0.0, n_z)

@@ -191,7 +191,7 @@ class PlantCheck(Check):
             raise NoteError(f"diverged at step {ended:g}, by actions of standard deviation {SIZE}")
 
     def repeat(self) -> None:
-        """The same seed and actions give the same bits, whatever was between."""
+        """The same seed and actions give the same bits, whatever came in between."""
         assert self.reference and self.second
         self.episode((1, 1), like=[self.reference])
 
@@ -234,7 +234,7 @@ class PlantCheck(Check):
         self.beginning(before=disturb)
 
     def silence(self) -> None:
-        """Without its action the last state comes again, and no cost, also state T."""
+        """Without its action the last state, even state T, comes again, and no cost."""
 
         def withhold(state: Frame) -> None:
             if state.step in (0, self.horizon):
@@ -272,7 +272,7 @@ class PlantCheck(Check):
         )
 
     def start_columns(self) -> None:
-        """Of a row the plant uses the seed; the rest is the controller's."""
+        """The plant uses only the seed of a row; the rest is for the controller."""
         self.beginning(columns=(7.0, 0.1, 1.0))
 
     def seeds(self) -> None:
@@ -285,7 +285,7 @@ class PlantCheck(Check):
         require(not equal, "other states than that of seed 1", f"the same for the seeds {equal}")
 
     def two_rows(self) -> None:
-        """Two rows are the two single episodes to the bit, in either order."""
+        """Two rows give the same bits as two single episodes, in either order."""
         one, two = self.reference, self.second
         if not self.serves_two:
             raise NoteError("two rows are not answered: right for a plant of one environment")

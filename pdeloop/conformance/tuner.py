@@ -152,7 +152,7 @@ class TunerCheck(Check):
         self._started_anew(ended=VOID)
 
     def failure(self) -> None:
-        """So are those of an exploration with `model/failed`, retry true."""
+        """The rows of an exploration with `model/failed`, retry true, are started again."""
         self._started_anew(failure="states are missing, says the check")
 
     def other_models(self) -> None:

@@ -134,7 +134,7 @@ class VecEnvironment(VecEnv):  # type: ignore[misc, unused-ignore]  # untyped wh
         """Set an attribute of the batch; AttributeError if it is to be that of some environments."""
         if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
             raise AttributeError(
-                f"the environments are one batch: {attr_name!r} can be set for all of them only"
+                f"the environments are one batch, so {attr_name!r} can only be set for all of them"
             )
         setattr(self.environments, attr_name, value)
 
@@ -143,7 +143,7 @@ class VecEnvironment(VecEnv):  # type: ignore[misc, unused-ignore]  # untyped wh
     ) -> list[Any]:
         """AttributeError: there are no single environments that have methods."""
         raise AttributeError(
-            f"the environments are one batch, of which {method_name!r} cannot be called one by one; "
+            f"the environments are one batch, so {method_name!r} cannot be called for one of them; "
             "make_vec_env makes single ones"
         )
 

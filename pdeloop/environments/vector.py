@@ -112,8 +112,8 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         seeds = seed_of_each(seed, self.num_envs)
         if not (mask.all() or self.plant.step_index < self.plant.horizon):
             raise ValueError(
-                f"the {self.num_envs} environments share a horizon, which is reached: reset_mask must "
-                "choose all of them"
+                f"the {self.num_envs} environments share a horizon, which has been reached: "
+                "reset_mask must choose all of them"
             )
         return self._begin(mask, seeds, fields), masked(self._told_at_first(), mask)
 

@@ -115,7 +115,7 @@ def no_worker(pool: Executor) -> str:
     with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
         if client is not None and not client.scheduler_info()["workers"]:
             start = WORKER.format(address=client.scheduler.address)
-            return f"no worker is left, waiting for one: {start}"
+            return f"no worker is left; waiting for one to be started: {start}"
     return ""
 
 

@@ -32,7 +32,7 @@ def test_a_cost_beyond_the_answered_steps_contradicts_a_void_one_before_it_once(
     steps = answered(furthest)
     assert not steps.contradiction(cost(furthest + 1))
     said = steps.contradiction(cost(furthest, void=True))
-    assert f"went to step {furthest + 1}" in said and f"gave it up at step {furthest}" in said
+    assert f"reached step {furthest + 1}" in said and f"gave it up at step {furthest}" in said
     assert not steps.contradiction(cost(furthest, void=True))
 
 

@@ -127,10 +127,10 @@ def test_a_memory_that_is_not_known_is_never_made_up() -> None:
     policies, index, states = episode(Observer, 3)
     batch = made(Observer)
     batch.set(policies, index)
-    with pytest.raises(MemoryUnknownError, match="before step 2 are not known"):
+    with pytest.raises(MemoryUnknownError, match="before step 2 are unknown"):
         batch.actions(2, states[2])
     first = batch.actions(0, states[0])
-    with pytest.raises(MemoryUnknownError, match="before step 2 are not known"):
+    with pytest.raises(MemoryUnknownError, match="before step 2 are unknown"):
         batch.actions(2, states[2])
     batch.actions(1, states[1])
     with pytest.raises(MemoryUnknownError, match="two different states arrived for step 1"):

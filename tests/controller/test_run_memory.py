@@ -40,7 +40,7 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
     (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, COSTS))
     assert isinstance(failure, ModelFailure) and not failure.retry
     assert "more than 100000 bytes; explore fewer seeds at once" in failure.reason
-    with pytest.raises(FrameError, match="expected less than 100000 bytes of all runs"):
+    with pytest.raises(FrameError, match="expected fewer than 100000 bytes for all runs"):
         responder.policy(Frame(7, 1, 0, 0.0, np.ones((50, 4, 80))))
     (model,) = explore(responder, 5)  # the run with room is served as before
     assert model.topic is MODEL_IDENTIFIED

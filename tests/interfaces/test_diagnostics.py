@@ -57,7 +57,9 @@ def test_a_publisher_whose_messages_do_not_arrive_is_named_with_its_topic():
     found.supervise("/target", reader_qos(TARGET))
     found.round(1.0)
     ((said,), _) = node.get_logger().error.call_args
-    assert said.startswith("/lab/mine publishes /target so that it does not arrive (QoS: Volatile")
+    assert said.startswith(
+        "/lab/mine publishes /target, but its messages cannot arrive (QoS: Volatile"
+    )
     assert node.get_logger().error.call_count == 1
     assert found.several_publishers == {"/target": ["/good", "/lab/mine"]}
 
@@ -73,7 +75,7 @@ def test_every_topic_with_a_wrong_publisher_is_named_and_again_while_it_lasts(mo
     for topic in ("/target", "/policy", "/model"):
         found.supervise(topic, reader_qos(TARGET))
     found.round(1.0)
-    said = [call.args[0].split()[2] for call in node.get_logger().error.call_args_list]
+    said = [call.args[0].split()[2].rstrip(",") for call in node.get_logger().error.call_args_list]
     assert said == ["/target", "/policy", "/model"]
     node.count_publishers.return_value = 2
     node.get_publishers_info_by_topic.return_value = [lone, lone]
@@ -220,7 +222,7 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     assert health.waiting(0.0) == []
     waiting = health.report(2.5)
     assert waiting.level is Level.WARN
-    assert waiting.message.endswith("until there is: episode/start, target")
+    assert waiting.message.endswith("still missing: episode/start, target")
     controller.start(exploration(1))
     controller.target(Frame(0, 0, 0, 0.0, np.zeros(8), 9))
     running = health.report(3.0)
@@ -247,7 +249,7 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     assert health.report(23.0).level is Level.OK
     gone = health.report(28.0)
     assert gone.level is Level.STALE
-    assert gone.message == "no state for 7 s, after step 5 of episode 2, and no plant any more"
+    assert gone.message == "no state for 7 s, after step 5 of episode 2; the plant is gone"
     controller.failure = kept
     failed = health.report(28.0)
     assert failed.level is Level.ERROR

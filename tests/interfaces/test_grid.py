@@ -43,7 +43,8 @@ def test_places_on_two_axes_are_as_far_apart_along_both() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "words"), [(17, "at most the 16 grid points"), (11, "product of numbers of at most")]
+    ("count", "words"),
+    [(17, "at most the 16 grid points"), (11, "product of one number per axis, of at most")],
 )
 def test_places_that_do_not_fit_are_refused(count: int, words: str) -> None:
     with pytest.raises(ValueError, match=words):
@@ -58,9 +59,9 @@ def test_one_axis_or_component_may_be_given_by_itself() -> None:
 def test_what_is_no_grid_is_refused() -> None:
     with pytest.raises(ValueError, match="the axes of a grid must be of the class Axis, got 3"):
         Grid((3,))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="1 or more points"):
+    with pytest.raises(ValueError, match="at least 1 point"):
         Axis("x", 1.0, 0)
-    with pytest.raises(ValueError, match="give one of both"):
+    with pytest.raises(ValueError, match="give one of the two"):
         Grid()
-    with pytest.raises(ValueError, match="one component or more"):
+    with pytest.raises(ValueError, match="at least one component"):
         Grid.interval(1.0, 4, ())

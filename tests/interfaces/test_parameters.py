@@ -35,7 +35,7 @@ SPECS = {spec.name: spec for spec in table()}
         (
             "length",
             "1.0e12",
-            "(m); YAML reads a number with an exponent only",
+            "(m); in YAML a number with an exponent needs",
         ),
         ("actuator_width", 1.5, "'actuator_width' is 1.5; expected a number above 0, at most 1"),
         ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),

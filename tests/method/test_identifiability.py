@@ -219,7 +219,7 @@ def test_a_log_that_is_there_twice_counts_once() -> None:
         study_orders([one, other, one]).one_step, study_orders([one, other]).one_step
     )
     (remark,) = examine([one, other, one], once.U).remarks
-    assert "2 is 0 again" in remark
+    assert "2 repeats 0" in remark
 
 
 def test_a_log_at_rest_says_nothing() -> None:
@@ -245,7 +245,7 @@ def test_the_state_is_told_by_channel() -> None:
     cases = {
         "z3 never moved": states * [1, 1, 0, 1, 1],
         "z5 is always -2 times z1": np.c_[states[:, :4], -2 * states[:, 0]],
-        "choose units in which they are of one size": states * [1, 1, 1e-9, 1, 1e9],
+        "choose units in which they are of similar size": states * [1, 1, 1e-9, 1, 1e9],
     }
     for words, measured in cases.items():
         with pytest.raises(ValueError, match=f"n_s is 5: .*{words}.*; lower n_s"):

@@ -140,7 +140,7 @@ def test_files_in_another_order_are_named_and_read_by_their_times(split):
     change_metadata(split, lambda told: told["relative_file_paths"].reverse())
     report = verify(split)
     (difference,) = report.differences
-    assert "order bag_2.mcap, bag_1.mcap, bag_0.mcap, their messages are from" in difference
+    assert "order bag_2.mcap, bag_1.mcap, bag_0.mcap, but their messages are in the" in difference
     assert not report.incomplete and not report.missing
 
 

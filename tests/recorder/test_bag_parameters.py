@@ -68,7 +68,7 @@ def test_a_plant_that_told_no_parameters_is_not_to_be_looked_for_in_a_file(run, 
     kept = {run: {k: v for k, v in own.items() if k not in plant} for run, own in known.items()}
     path.write_text(json.dumps(kept))
     (note, *_) = verify(run / "bag").notes
-    assert "its plant told no parameters" in note and "--parameters" not in note
+    assert "its plant gave no parameters" in note and "--parameters" not in note
 
 
 @pytest.mark.parametrize("given", ["parameters.yaml", "parameters.json"])

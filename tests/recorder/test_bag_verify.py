@@ -180,7 +180,7 @@ RUN_FILES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], str]] = {
     "parameters of another": (
         "bag/parameters.json",
         lambda c: next(iter(c.values())).update(horizon=31),
-        "parameters.json has other parameters of run",
+        "parameters.json differs from the bag itself in a parameter of run",
     ),
 }
 

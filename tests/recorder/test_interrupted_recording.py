@@ -95,7 +95,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
                 recorded_episode(recording, episode, steps=50)
                 recording.flush()
 
-        with pytest.raises(BagError, match=r"No space left.*; recording stopped"):
+        with pytest.raises(BagError, match=r"No space left.*; recording has stopped"):
             fill()
         episodes = [e for e in Bag(disk / "bag").episodes() if not e.missing]
         assert len(episodes) > 5
@@ -125,7 +125,7 @@ def test_of_a_batch_that_the_disk_refuses_half_way_nothing_is_left(tmp_path, mon
             return written
 
     monkeypatch.setattr(recording._file, "_file", Full())
-    with pytest.raises(BagError, match=r"No space left on device; recording stopped"):
+    with pytest.raises(BagError, match=r"No space left on device; recording has stopped"):
         for episode in range(8, 20):
             recorded_episode(recording, episode, steps=30)
     assert (tmp_path / "bag" / "bag.mcap").stat().st_size == size

@@ -39,7 +39,7 @@ def test_what_is_no_bag_is_a_clear_error(tmp_path):
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1")
     (tmp_path / "x.mcap").write_bytes(b"nonsense")
     with pytest.raises(
-        BagError, match="cannot be read, it is damaged: it is empty or not an MCAP file"
+        BagError, match="cannot be read, as it is damaged: it is empty or not an MCAP file"
     ):
         list(Bag(tmp_path).messages())
 
@@ -131,7 +131,9 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     report = verify(OLD)
     assert (report.incomplete, len(report.notes)) == ([], 2), report.text()
     assert "another fingerprint of the plant" in report.notes[0]
-    assert "the tuner's rollouts not known" in report.notes[1]  # its budget had other parts
+    assert (
+        "the tuner's policies cannot be followed without its rollouts" in report.notes[1]
+    )  # its budget had other parts
     assert report.compared["targets"] == 1
     assert report.compared["costs"] == 1 + 8 + 2 * 2 + 3
     steps, compared = 30 * report.compared["costs"], report.compared["steps"]

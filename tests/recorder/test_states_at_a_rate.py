@@ -72,7 +72,7 @@ def test_what_is_recorded_is_verified_and_nothing_else_is_missed(run: Path) -> N
             assert step % EVERY == 0
             steps += 1
     assert steps == report.episodes * len(range(0, 31, EVERY))
-    assert f"every {EVERY} steps a state" in info_text(describe(run / "bag"))
+    assert f"a state every {EVERY} steps" in info_text(describe(run / "bag"))
 
 
 def test_a_recorded_state_that_is_another_one_is_a_difference(run: Path, tmp_path: Path) -> None:

@@ -141,5 +141,5 @@ def test_a_run_of_another_plant_is_refused(run: Path, monkeypatch: pytest.Monkey
         return "the run had another plant"
 
     monkeypatch.setattr(animation, "another_loop", other)
-    with pytest.raises(ValueError, match="another plant; so it cannot be animated"):
+    with pytest.raises(ValueError, match="another plant, so it cannot be animated"):
         animation.animated(load_run(run))

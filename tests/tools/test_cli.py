@@ -48,7 +48,7 @@ def test_any_parameter_can_be_set_and_is_recorded(tmp_path) -> None:
     [
         (
             ("--set", "viscosity=1"),
-            "one of the equation or plant is given as 'physical.viscosity'",
+            "a constant of the equation or plant is given as 'physical.viscosity'",
         ),
         (("--set", "horizn=20"), "unknown parameter 'horizn'; did you mean 'horizon'?"),
         (("--set", "horizon=many"), "'horizon' is 'many'; expected a whole number"),

@@ -105,7 +105,7 @@ def test_a_flawed_npz_is_refused(tmp_path: Path, changes: dict[str, Any], words:
         ),
         (b"t,z1,a1\ntarget,0,\n0,1,1\nnan,1,1\n", "expected a time t in row 4"),
         (b"t,z1,a1\ntarget,0,\n0,1,\n1,1,1\n", "a1 is missing in row 3: fill the gap"),
-        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got another, row 4"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got a second one, row 4"),
         (b'"' + b"t," * 10**6, "it is not a table: field larger than"),
     ],
 )

@@ -146,7 +146,7 @@ def test_a_gap_is_told_by_its_row_and_column(tmp_path: Path, missing: str) -> No
     [
         ("1.234,5", ";", "no mark of thousands, got '1.234,5' in row 4, column z1"),
         ("1,234,567", ";", "no mark of thousands, got '1,234,567' in row 4, column z1"),
-        ("0,5", ";", r"got '0,5' in row 4, column z1, after '\.' before"),
+        ("0,5", ";", r"got '0,5' in row 4, column z1, after '\.' in an earlier number"),
         ('"0,5"', ",", "expected a decimal point .* got '0,5' in row 4, column z1"),
         ("1 234.5", ",", "expected a number, got '1 234.5' in row 4, column z1"),
         ("12:00", ",", "expected a number, got '12:00' in row 4, column z1"),
@@ -198,7 +198,7 @@ def test_a_row_alone_is_left_out_and_told(tmp_path: Path) -> None:
     lines = [NAMES, ["9", *rows()[0][1:]], *rows()]
     found = read(tmp_path, text(lines))
     assert_the_log(found)
-    assert found.remarks == ("left out row 2: t grows neither before nor after it",)
+    assert found.remarks == ("left out row 2: t increases neither before nor after it",)
 
 
 def test_several_files_are_pooled_if_they_are_of_one_plant(tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_the_commands_options_reach_the_table(
     found = identified(capsys, "--data", str(own), *words)
     assert found["states"] == ["T1", "T2", "T3", "T4"] and found["inputs"] == ["pump", "valve"]
     twice = identified(capsys, "--data", str(own), str(own), *words)
-    assert "1 is 0 again" in twice["warnings"][0] and twice["steps"] == found["steps"] == 60
+    assert "1 repeats 0" in twice["warnings"][0] and twice["steps"] == found["steps"] == 60
     lines = [["clock", "T1", "T2", "T3", "T4", "pump", "valve"], *rows()]
     for line in lines[1:]:
         line[6] = "0"

@@ -275,7 +275,9 @@ def test_without_autoreset_what_has_ended_waits_for_a_reset() -> None:
     for _ in range(GRID["horizon"] - 1):
         *_, truncated, _ = batch.step(np.zeros((2, 6)))
     assert truncated.all()
-    with pytest.raises(ValueError, match="share a horizon, which is reached: reset_mask must"):
+    with pytest.raises(
+        ValueError, match="share a horizon, which has been reached: reset_mask must"
+    ):
         batch.reset(options={"reset_mask": np.array([False, True])})
     for wrong in (np.ones(3, dtype=bool), np.zeros(2, dtype=bool), np.ones(2)):
         with pytest.raises(ValueError, match=r"options\['reset_mask'\] must be an array of 2 bool"):

@@ -94,7 +94,7 @@ def test_another_control_law_is_refused_and_its_node_named(run, capsys, controll
     result["costs_by_field"][controller] = [[value] * 10] * 2
     (run / "result.json").write_text(json.dumps(result))
     said = refused(capsys, run)
-    assert "had another control law than the built-in one (its controller: /lab/mine)" in said
+    assert "the control law of the run was not the built-in one (its controller: /lab/mine)" in said
     assert ("diverged" if value == 1e9 else "0.5") in said
 
 
@@ -102,11 +102,11 @@ def test_another_plant_is_refused(run, capsys):
     result = json.loads((run / "result.json").read_text())
     result["costs_by_field"] = {name: [[0.5] * 10] * 2 for name in COSTS}
     (run / "result.json").write_text(json.dumps(result))
-    assert "had another plant than the built-in one" in refused(capsys, run)
+    assert "the plant of the run was not the built-in one" in refused(capsys, run)
     with np.load(run / "policy.npz") as arrays:
         content = {**arrays, "model": np.ones((2, 57, 4))}
     np.savez(run / "policy.npz", **content)
-    assert "had another plant than the built-in one" in refused(capsys, run)
+    assert "the plant of the run was not the built-in one" in refused(capsys, run)
 
 
 def test_rounding_of_another_machine_is_not_another_plant(run, capsys):
@@ -119,7 +119,7 @@ def test_rounding_of_another_machine_is_not_another_plant(run, capsys):
     assert "adapted" in capsys.readouterr().out
     # A plant with another fingerprint is another one if a single cost differs by more than 1e-6.
     (run / "result.json").write_text(json.dumps(result | {"plant": result["plant"] + 1}))
-    assert "had another plant than the built-in one (with another fingerprint)" in refused(
+    assert "the plant of the run was not the built-in one (with another fingerprint)" in refused(
         capsys, run
     )
 

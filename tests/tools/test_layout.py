@@ -148,7 +148,7 @@ def test_bench_explains_the_options_of_a_program(capsys) -> None:
         benchmarks_parser().parse_args(["optimum", "--help"])
     assert left.value.code == 0
     said = capsys.readouterr().out
-    assert "--seeds SEEDS" in said and "Trainings whose basis U is used. [6]" in said
+    assert "--seeds SEEDS" in said and "Number of trainings whose basis U is used. [6]" in said
     assert "-----" not in said
 
 

@@ -191,7 +191,7 @@ def test_a_law_with_a_model_is_refused_with_an_optimizer_that_does_not_know_it(
 ) -> None:
     """It would change the equation in theta by chance."""
     with pytest.raises(
-        ValueError, match=r"which the optimizer '.*' does not know; choose model_based"
+        ValueError, match=r"which the optimizer '.*' does not support; choose model_based"
     ):
         pdeloop.train(str(SMALL), law="extended_kalman", optimizer=optimizer, **BUDGET)
 

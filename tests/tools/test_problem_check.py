@@ -151,7 +151,7 @@ def test_inputs_without_effect_are_named() -> None:
     assert "actuators" not in findings_of(Around())
     assert findings_of(Deaf())["actuators"] == (
         False,
-        "actuators [1, 3] do not move the state: see what step does with its a",
+        "actuators [1, 3] do not move the state: check how step uses its argument a",
     )
     good, text = findings_of(Numb())["actuators"]
     assert not good and text.startswith("no action moves the state")
@@ -187,7 +187,7 @@ def test_a_law_that_does_next_to_nothing_is_not_a_matter_of_the_order() -> None:
     ("none", "law", "good", "words"),
     [
         (9.0, 1.0, True, ""),
-        (9.0, 8.9, True, "next to nothing"),
+        (9.0, 8.9, True, "almost no effect"),
         (9.0, 99.0, False, "another order"),
     ],
 )
@@ -230,7 +230,7 @@ def test_sensors_and_other_parameters_may_be_given(capsys: pytest.CaptureFixture
     given = ["--sensors", "2", "--set", "horizon=12"]
     assert main(["check", "allen-cahn", *given]) == FAILED
     told = capsys.readouterr().out
-    assert re.search(r"BAD  sensors: .* these are not observed: all of wave number \d", told)
+    assert re.search(r"BAD  sensors: .* the sensors do not observe all of wave number \d", told)
     assert main(["check", str(SMALL), "--sensors", "9999"]) == FAILED
     assert "9999" in capsys.readouterr().err
 
@@ -238,14 +238,20 @@ def test_sensors_and_other_parameters_may_be_given(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (["burgers", "--n-a", "2"], "--n-a: only for the check of a node"),
-        (["burgers", "--patience", "10"], "--patience: only for the check of a node"),
-        (["burgers", "--network"], "--network: only for the check of a node"),
-        (["plant", "--n-z", "8"], "--n-z: only for the check of a node (controller)"),
-        (["plant", "--sensors", "8"], "--sensors: only for the check of a problem's FILE"),
-        (["plant", "--set", "horizon=9"], "--set: only for the check of a problem's FILE"),
-        (["tuner", "--equation", "burgers"], "--equation: only for the check of a problem's FILE"),
-        (["plant", "--picture", "x.png"], "--picture: only for the check of a problem's FILE"),
+        (["burgers", "--n-a", "2"], "--n-a applies only to the check of a node"),
+        (["burgers", "--patience", "10"], "--patience applies only to the check of a node"),
+        (["burgers", "--network"], "--network applies only to the check of a node"),
+        (["plant", "--n-z", "8"], "--n-z applies only to the check of a node (controller)"),
+        (["plant", "--sensors", "8"], "--sensors applies only to the check of a problem's FILE"),
+        (["plant", "--set", "horizon=9"], "--set applies only to the check of a problem's FILE"),
+        (
+            ["tuner", "--equation", "burgers"],
+            "--equation applies only to the check of a problem's FILE",
+        ),
+        (
+            ["plant", "--picture", "x.png"],
+            "--picture applies only to the check of a problem's FILE",
+        ),
     ],
 )
 def test_an_option_of_the_other_check_is_refused(
@@ -254,11 +260,7 @@ def test_an_option_of_the_other_check_is_refused(
     with pytest.raises(SystemExit) as ended:
         main(["check", *words])
     assert ended.value.code == 2
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .startswith(f"pdeloop check: error: leave out {wrong}")
-    )
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"pdeloop check: error: {wrong}")
 
 
 @pytest.mark.parametrize(
@@ -310,7 +312,7 @@ class Forgetful(pdeloop.Dynamics):
 @pytest.mark.parametrize(
     ("how", "told"),
     [
-        ("counts", "another one when it is computed again"),
+        ("counts", "another result when it is computed again"),
         ("shares", "depends on the other states"),
     ],
 )

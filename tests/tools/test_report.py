@@ -306,7 +306,7 @@ def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
     assert main(["report", str(own)]) == 0
     assert "not shown: Behaviour, gains, spectrum" in capsys.readouterr().out
     page = (own / "report" / "index.html").read_text()
-    assert "Not shown." in page and "the run had another" in page
+    assert "Not shown." in page and "of the run was not the built-in one" in page
     assert "<img src=x" not in page and "&lt;img src=x" in page  # shown, not run
     drawn = {path.stem for path in (own / "report").glob("*.png")}
     assert drawn == {"training-curves", "costs", "small-steps"}

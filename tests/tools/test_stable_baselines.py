@@ -171,9 +171,9 @@ def test_attributes_are_those_of_the_batch(kind: Any) -> None:
         batch.get_attr("no_such_thing")
     batch.set_attr("label", "mine")
     assert batch.get_attr("label") == ["mine", "mine"]
-    with pytest.raises(AttributeError, match="'label' can be set for all of them only"):
+    with pytest.raises(AttributeError, match="'label' can only be set for all of them"):
         batch.set_attr("label", "other", indices=[1])
-    with pytest.raises(AttributeError, match="'reset' cannot be called one by one"):
+    with pytest.raises(AttributeError, match="'reset' cannot be called for one of them"):
         batch.env_method("reset")
     assert batch.env_is_wrapped(gymnasium.Wrapper) == [False, False]
     batch.reset()

@@ -116,7 +116,10 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path,
         def kill_the_other(done: int, total: int, status: str) -> None:
             if workers[1].poll() is None:
                 os.kill(workers[1].pid, signal.SIGKILL)
-            if "no worker is left, waiting for one: PYTHONSAFEPATH=1 dask worker tcp" in status:
+            if (
+                "no worker is left; waiting for one to be started: PYTHONSAFEPATH=1 dask worker tcp"
+                in status
+            ):
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):

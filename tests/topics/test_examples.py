@@ -68,7 +68,9 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     result = json.loads((out / "result.json").read_text())
     assert result["controller"] == {"nodes": ["/saturated_controller"], "law": "not seen"}
     refused = loop.wait(loop.pdeloop("evaluate", str(out)), LIMIT, code=1)
-    assert "had another control law than the built-in one (its controller: /saturated" in refused
+    assert (
+        "the control law of the run was not the built-in one (its controller: /saturated" in refused
+    )
     shown = report(loop, out, LIMIT)
     assert "not shown: Behaviour" in shown and "(its controller: /saturated_controller)" in shown
     assert (out / "report" / "training-curves.png").exists()

@@ -157,7 +157,11 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant_from_another_tuner
         tuner.send_signal(signal.SIGKILL)
         tuner.wait()
         tuner = start_tuner(loop, out, iterations=ITERATIONS, resume=True)
-        until(lambda: "paused, as when its process ended" in loop.output(tuner), LIMIT, "restart")
+        until(
+            lambda: "paused, as it was when its previous process ended" in loop.output(tuner),
+            LIMIT,
+            "restart",
+        )
         desk.wait_for_reports("tuner_node", 3)
         assert adapted(out) == done
         # The last report of that name may be the refused one's.
@@ -259,7 +263,7 @@ def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
         desk.call("/pde_sim_node/pause")  # again: no harm
         success, message = desk.ask(call="/pde_sim_node/step")
         assert not success
-        assert message == "no episode is under way; expected one to step in"
+        assert message == "no episode is under way; a step needs one"
         assert desk.call("/pde_sim_node/resume") == "resumed"
 
 

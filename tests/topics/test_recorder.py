@@ -131,7 +131,7 @@ def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp
     hand.recorder.send_signal(signal.SIGTERM)
     loop.wait(hand.recorder, LIMIT)
     text = loop.wait(hand.tuner, LIMIT, code=1)
-    assert "tuner_node: the recorder is gone, and this training is required" in text
+    assert "tuner_node: the recorder has gone, but this training has to be recorded" in text
     assert verify(hand.bag).count == 0
 
 
@@ -148,7 +148,7 @@ def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
         last = text.strip().splitlines()[-1]
         assert last.startswith(f"recorder_node: cannot write to {disk / 'bag'}: ")
         assert "No space left on device" in last
-        assert "recording stopped" in last
+        assert "recording has stopped" in last
         loop.wait(hand.tuner, LIMIT, code=0 if recorder == "start" else 1)
         if recorder == "start":
             assert_same_training(hand.out, in_process(iterations=iterations))

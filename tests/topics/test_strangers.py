@@ -133,7 +133,7 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     assert "several nodes publish /action: /controller_node, /stranger" in loop.output(
         running["plant"]
     )
-    assert "/stranger publishes /policy so that it does not arrive" in loop.output(
+    assert "/stranger publishes /policy, but its messages cannot arrive" in loop.output(
         running["controller"]
     )
     told = json.loads((out / "result.json").read_text())["several_publishers"]

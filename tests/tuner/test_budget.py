@@ -194,4 +194,4 @@ def test_a_run_that_did_not_count_its_rollouts_is_read_but_not_continued(tmp_pat
     (out / "result.json").unlink()
     capsys.readouterr()
     assert main(["train", "--resume", str(out), "--in-process"]) == 1
-    assert "is of an older version, which did not count its rollouts" in capsys.readouterr().err
+    assert "is from an older version, which did not count its rollouts" in capsys.readouterr().err

@@ -49,9 +49,10 @@ def test_one_seed_is_told_event_by_event():
     ]
     assert told(rows, seed=3) == [
         "check",
-        "  seed 3: a rollout costs 5 without control, diverged with LQT; no better, exploring again",
+        "  seed 3: a rollout costs 5 without control, diverged with LQT; "
+        "LQT is no better, exploring again",
         "  seed 3: a rollout costs 5 without control, 9 with LQT; "
-        "no better, and no other exploration is left: a poor warm start",
+        "LQT is no better, and no exploration is left, so the warm start is poor",
         "adapt",
         "  20 rollouts: cost 1.25",
         "evaluate",
@@ -63,7 +64,7 @@ def test_of_several_seeds_mean_and_range_are_told_in_one_line():
     rows += [checked(2, 2.5e8, lost=1, again=True), phase("identify", [9] * 3)]
     assert told(rows, seeds=3)[1] == (
         "  3 seeds: a rollout costs 5 without control, 5.5 (2 to 9) and 1 diverged with LQT; "
-        "no better for 2 of them, exploring again"
+        "LQT is no better for 2 of them, exploring again"
     )
 
 
@@ -91,7 +92,7 @@ def test_a_real_training_with_a_law_that_diverges_never_says_a_billion(capsys):
         pair.follow(training)
         display.row(phase(training.phase, [9, 9]))
     shown = stream.getvalue()
-    assert "and 1 diverged with LQT; no better for 1 of them" in shown
+    assert "and 1 diverged with LQT; LQT is no better for 1 of them" in shown
     assert "e+0" not in shown
 
 
@@ -136,7 +137,9 @@ def test_an_optimiser_that_tells_no_cost_has_not_diverged():
 def test_what_adapted_nothing_is_no_gain():
     lines = closing_lines("kdv", summary(changed=[False, False]), "")
     assert not any("LQT;" in line or "% below" in line for line in lines)
-    assert "  nothing was adapted: the policies are those that the adaptation started from" in lines
+    assert (
+        "  nothing was adapted: the policies are those with which the adaptation started" in lines
+    )
 
 
 def test_averages_of_different_signs_say_which_side_each_is_on():
@@ -172,7 +175,11 @@ def test_a_law_that_saves_next_to_nothing_is_told_with_likely_causes(adapted, sa
     costs = {"none": [4.0], "lqt": [4.0], "adapted": [adapted]}
     lines = closing_lines("kdv", summary(seeds=1, changed=[True], costs=costs), "")
     assert (
-        any("control saves only 2.5 % of the cost without it: actions" in t for t in lines) == said
+        any(
+            "control saves only 2.5 % of the cost without control; likely causes: actions" in t
+            for t in lines
+        )
+        == said
     )
 
 
@@ -207,7 +214,9 @@ def test_how_much_an_adaptation_gained_is_said_with_its_interval() -> None:
     assert said in closing_lines("kdv", alone, "")
     outcome = [own | {"against_lqt": gained}, own | {"against_lqt": chance}]
     lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
-    assert any("costs less than the LQT law for 1 of 2 seeds, more for 0" in line for line in lines)
+    assert any(
+        "costs less than the LQT law for 1 of 2 seeds and more for 0" in line for line in lines
+    )
 
 
 def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_law() -> None:

@@ -69,7 +69,7 @@ def test_a_recorder_that_goes_ends_the_training_only_where_it_is_required():
     company, dispatcher = participants("required")
     company.update(there(recorders=0), 0.0)
     company.update(there(recorders=1), 1.0)
-    with pytest.raises(DispatchError, match=r"the recorder is gone.*resume:=true"):
+    with pytest.raises(DispatchError, match=r"the recorder has gone.*resume:=true"):
         company.update(there(recorders=0), 2.0)
 
 

@@ -171,7 +171,7 @@ def test_a_given_model_of_another_plant_is_refused_with_the_sizes_of_both(tmp_pa
     values = parameters(model=rows_file(path, found), n_z=64)
     with pytest.raises(ValueError, match="of a state of 32 numbers, but the target has"):
         train_here(values)
-    with pytest.raises(ValueError, match="of a state of 32 numbers, the plant's has 64"):
+    with pytest.raises(ValueError, match="for a state of 32 numbers, but the plant's state has 64"):
         train_here({**values, "optimizer": "gauss_newton"})
 
 
@@ -249,7 +249,7 @@ def test_gauss_newton_refuses_actions_that_are_not_those_of_the_law(limit):
     result = pair.run(training.next_batch())
     bent = [replace(t, actions=np.tanh(t.actions)) for t in result.trajectories]
     before = training.budget.by_purpose()
-    words = r"not those of the law .* use one that learns from costs alone"
+    words = r"not those of the law .* choose an optimizer that learns from costs alone"
     with pytest.raises(ValueError, match=words):
         training.finish(replace(result, trajectories=bent))
     assert training.budget.by_purpose() == before

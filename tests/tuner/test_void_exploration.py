@@ -103,7 +103,9 @@ def test_a_plant_that_always_diverges_ends_the_training_with_the_reason(noise):
     assert f"{MOST + 1} times, last at step 0" in told
     weakest = training.settings.exploration_variance / 4**MOST
     assert f"inputs of variance {weakest:.3g}; weaker inputs did not delay it" in told
-    assert told.endswith("else lower exploration_variance by more") and "a horizon of" not in told
+    assert (
+        told.endswith("otherwise lower exploration_variance further") and "a horizon of" not in told
+    )
     assert [row["step"] for row in training.history] == [0] * MOST
 
 
@@ -114,8 +116,11 @@ def test_inputs_that_delay_the_divergence_are_to_be_weaker_still(noise):
     assert "lower exploration_variance" in told and ("measurement_noise" in told) == bool(noise)
     assert "lower exploration_variance" in no_model(settings, [7], paid_up=True)
     told = no_model(settings, [7, 5, 6], paid_up=False)
-    assert "if it diverges without control, which" in told
-    assert "set a horizon of 5 steps or fewer" in told and "else lower exploration_variance" in told
+    assert "if the plant diverges without control" in told
+    assert (
+        "set a horizon of 5 steps or fewer" in told
+        and "otherwise lower exploration_variance" in told
+    )
 
 
 def test_a_budget_without_room_for_another_exploration_ends_the_training():
@@ -148,7 +153,7 @@ def test_a_seed_with_a_model_goes_on_with_it_where_the_plant_diverges_later(seed
     assert training.phase == "adapt" and same_bits(training.models, models)
     assert training.worse == [True] + [False] * (seeds - 1)
     assert not training.starts()[0].any() and training.void[0] == len(rows)
-    assert "going on with the model from before" in Narration(0, 1).lines(rows[-1])[0]
+    assert "continuing with the previous model" in Narration(0, 1).lines(rows[-1])[0]
     pair.follow(training)
     train(training, pair, lambda row: None)
     assert training.phase == "done" and training.budget.paid.max() <= 20

@@ -42,12 +42,12 @@ def test_fields_that_cost_nothing_without_control_are_nothing_to_control():
 def test_one_law_that_costs_otherwise_on_the_same_fields_is_a_plant_that_does_not_repeat():
     costs = {"none": [4.0], "lqt": [2.0], "adapted": [2.1]}
     kept = summary(seeds=1, changed=[False], costs=costs)
-    assert "one law cost otherwise when it ran again" in warnings(kept)[0]
+    assert "the same law had another cost when it ran again" in warnings(kept)[0]
     assert warnings(summary(seeds=1, changed=[True], costs=costs)) == []
     for same in (2.0, 4.0):  # the first law, or no control, from which it started
         costs["adapted"] = [same]
         told = warnings(summary(seeds=1, changed=[False], costs=costs))
-        assert not any("one law cost otherwise" in text for text in told)
+        assert not any("the same law had another cost" in text for text in told)
 
 
 def test_a_law_that_costs_more_than_no_control_has_an_exit_code_of_its_own():
@@ -102,12 +102,12 @@ def test_a_training_whose_laws_all_diverge_ends_with_a_warning_and_a_code(tmp_pa
 @pytest.mark.parametrize(
     ("declared", "found", "said"),
     [
-        (0.0, [0.0498], "noise of about 0.05 was found, and none was declared"),
-        (0.15, [0.05], "noise of about 0.05 was found, and 0.15 was declared"),
+        (0.0, [0.0498], "noise of about 0.05 was found, but none was declared"),
+        (0.15, [0.05], "noise of about 0.05 was found, but 0.15 was declared"),
         (
             0.0,
             [0.05, 0.0, 0.06],
-            "noise of about 0.05 to 0.06 was found for 2 of 3 seeds, and none",
+            "noise of about 0.05 to 0.06 was found for 2 of 3 seeds, but none",
         ),
     ],
 )
@@ -117,7 +117,7 @@ def test_noise_that_was_not_declared_so_is_a_warning(
     noise = {"declared": declared, "found": found}
     (text,) = misjudged_noise({"noise": noise, "seeds": len(found)})
     assert said in text
-    assert ("explored too weakly" in text) == (max(found) > declared)
+    assert ("its exploration was too weak" in text) == (max(found) > declared)
     assert misjudged_noise({"noise": {"declared": declared, "found": [0.0]}, "seeds": 1}) == []
     assert misjudged_noise({"seeds": 1}) == []  # a result of an older version
 
@@ -125,9 +125,9 @@ def test_noise_that_was_not_declared_so_is_a_warning(
 @pytest.mark.parametrize(
     ("declared", "seeming", "said"),
     [
-        (0.0, [0.0498], "noise of about 0.05, and none was declared"),
-        (0.15, [0.05], "noise of at most 0.05, and 0.15 was declared"),
-        (0.01, [0.0, 0.05], "noise of about 0.05 for 1 of 2 seeds, and 0.01 was declared"),
+        (0.0, [0.0498], "noise of about 0.05, but none was declared"),
+        (0.15, [0.05], "noise of at most 0.05, but 0.15 was declared"),
+        (0.01, [0.0, 0.05], "noise of about 0.05 for 1 of 2 seeds, but 0.01 was declared"),
     ],
 )
 def test_readings_that_seem_noisy_are_a_warning_with_a_remedy(

@@ -120,7 +120,7 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
         ):
             said = {"token": server.token, **said} if isinstance(said, dict) else said
             assert (server.take(json.dumps(said)) == "") == done, said
-        assert "may only look" in server.take("[" * 100_000)
+        assert "view-only" in server.take("[" * 100_000)
         # Confirmed at once, whatever the node is doing.
         assert page.requests.get(timeout=600) == Call("/p", "pause")
         assert page.requests.get(timeout=600) == ShowLoop("/lab") and page.requests.empty()
@@ -133,7 +133,9 @@ def test_a_page_without_the_token_may_only_look(token):
         known = {"first": server.token[:-1], "longer": server.token + "="}
         given = {} if token is None else {"token": known.get(str(token), token)}
         for said in ({"node": "/p", "verb": "pause"}, {"namespace": "/lab"}, {"component": 1}):
-            assert "may only look: open the address" in server.take(json.dumps(given | said))
+            assert "view-only: to control the loop, open the address" in server.take(
+                json.dumps(given | said)
+            )
         assert page.requests.empty()
         assert asyncio.run(ask(server, "/"))[0] == 200
 

@@ -200,7 +200,10 @@ class Server:
         except ValueError:
             wanted = None
         if not isinstance(wanted, dict) or not self._knows_token(wanted.pop("token", "")):
-            return "this page may only look: open the address that pdeloop monitor printed"
+            return (
+                "this page is view-only: to control the loop, open the address that pdeloop "
+                "monitor printed"
+            )
         match wanted:
             case {"node": node, "verb": verb}:
                 done = self._page.request_call(node, verb)
