@@ -59,7 +59,7 @@ class LocalPair:
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. NoModelError if exploration gives no model though no rollout diverged."""
-        plant = self.plant
+        plant, batch = self.plant, batch.within(max_batch)
         max_batch = most_environments(max_batch, plant.state_size, plant.horizon)
         most = max(max_batch // batch.together, 1) * batch.together
         parts = [

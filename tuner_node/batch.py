@@ -1,8 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Batches of rollouts and their results, and the definition of a training."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 
 import numpy as np
@@ -55,11 +57,15 @@ class Batch:
     policies: Array | None
     trajectories: bool = False
     together: int = 1
-    """Rows one after the other that one episode has to have."""
+    """Rows one after the other that one episode has to have, if it may have so many."""
 
     @property
     def exploratory(self) -> bool:
         return self.policies is None
+
+    def within(self, max_batch: int) -> Batch:
+        """The batch, whose rows part where a plant has fewer environments: a machine has one."""
+        return self if self.together <= max_batch else replace(self, together=1)
 
 
 @dataclass(frozen=True)

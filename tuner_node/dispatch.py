@@ -97,7 +97,7 @@ class Dispatcher:
     def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
         largest = most_environments(self.max_batch, self.state_size, self.horizon)
-        self._queue = ChunkQueue(batch, largest, len(self._present()))
+        self._queue = ChunkQueue(batch.within(self.max_batch), largest, len(self._present()))
         return self._begin_episodes(now)
 
     def models(self, models: Array, generation: int) -> list[PairPublication]:

@@ -29,15 +29,15 @@ def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Proces
     stranger.kill()
 
 
+@pytest.mark.parametrize("max_batch", [1, 2])
 def test_a_law_from_two_explorations_and_fresh_fields_is_that_of_one_process(
-    loop: Processes, tmp_path
+    loop: Processes, tmp_path, max_batch
 ):
-    """Although at most one environment fits into an episode otherwise."""
     out = tmp_path / "run"
     start_pair(loop)
     options = {"rollouts": 10, "optimizer": "model_based", **FEW_FITS}
-    loop.wait(start_tuner(loop, out, **options, max_batch=1), LIMIT)
-    assert_same_training(out, train_here(parameters(**options)))
+    loop.wait(start_tuner(loop, out, **options, max_batch=max_batch), LIMIT)
+    assert_same_training(out, train_here(parameters(**options), max_batch=max_batch))
 
 
 def test_an_exploration_that_diverges_is_repeated_as_in_one_process(loop: Processes, tmp_path):

@@ -47,6 +47,19 @@ def test_any_number_of_pairs_and_any_order_of_arrival_gives_the_batch_in_order(p
     assert served.result() is None
 
 
+@pytest.mark.parametrize(("most", "sizes"), [(1, [1, 1]), (2, [2]), (4, [2])])
+def test_no_episode_has_more_rows_than_a_plant_has_environments(most, sizes):
+    rows = np.array([[3.0, 4.0, 0.1, 0.0], [5.0, 6.0, 0.1, 0.0]])
+    served = dispatcher(max_batch=most)
+    [(_, frame)] = starts(served.assign(Batch(rows, None, together=2), 0.0))
+    seen = [len(frame.values)]
+    while len(seen) < len(sizes):
+        served.cost(0, costs_of(frame), 0.0)
+        [(_, frame)] = starts(served.model(0, model_of(frame), 0.0))
+        seen.append(len(frame.values))
+    assert seen == sizes
+
+
 def test_the_policy_goes_out_before_the_start_and_with_its_rows():
     served = dispatcher()
     publications = served.assign(batch(2), 0.0)

@@ -327,7 +327,7 @@ def test_model_based_explores_from_two_fields_for_one_model():
     assert batch.rows[:, StartColumn.MODEL].tolist() == [0.0, 0.0, 1.0, 1.0]
     for column in (StartColumn.SEED, StartColumn.EXCITATION):
         assert len(set(batch.rows[:, column])) == 4
-    result = LocalPair(values).run(batch, max_batch=1)
+    result = LocalPair(values).run(batch, max_batch=2)
     assert same_bits(result.models[0], result.models[1]), "they are of both explorations"
     assert not same_bits(result.models[0], result.models[2])
     alone = LocalPair(values).run(Batch(batch.rows[:2], None, True, 2))
@@ -353,6 +353,18 @@ def test_a_controller_that_gives_each_exploration_a_model_of_its_own_goes_on_wor
     together = LocalPair(values).run(batch)
     training.finish(replace(together, models=models))
     assert same_bits(training.models, models[:1])
+
+
+def test_explorations_of_one_plant_part_where_it_has_one_environment():
+    values = parameters(optimizer="model_based", rollouts=10)
+    training = build_training(values)
+    batch = training.next_batch()
+    assert batch.together == 2
+    result = LocalPair(values).run(batch, max_batch=1)
+    first = LocalPair(values).run(Batch(batch.rows[:1], None, True))
+    assert same_bits(result.models[:1], first.models)
+    training.finish(result)
+    assert same_bits(training.models, first.models) and len(training.further[0]) == 1
 
 
 def test_model_based_continues_with_the_same_bits_from_any_batch():
