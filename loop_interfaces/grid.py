@@ -27,7 +27,7 @@ class Axis:
     Attributes
     ----------
     name : str
-        As figures show it.
+        Name, as shown in figures.
     length : float
         L of the domain [0, L] in this direction.
     size : int
@@ -35,10 +35,10 @@ class Axis:
     periodic : bool
         Whether the axis is periodic. Then the points are i L / n.
     walls : bool
-        Of an axis that is not periodic: whether its first and last points lie on the walls, at
-        i L / (n - 1), or the points are centres of cells, at (i + 1/2) L / n.
+        For an axis that is not periodic: whether its first and last points lie on the walls, with
+        points at i L / (n - 1); otherwise the points are centres of cells, at (i + 1/2) L / n.
     unit : str
-        Of the length.
+        Unit of the length.
 
     Raises
     ------
@@ -94,7 +94,7 @@ class Grid:
     components : tuple of str
         Names of the fields, or the one name of a plain vector's numbers.
     unit : str
-        Of the values.
+        Unit of the values.
     numbers : int
         Size of a plain vector.
 
@@ -139,11 +139,11 @@ class Grid:
         Parameters
         ----------
         numbers
-            How many it has.
+            Size of the state.
         name
-            Of all of them, as figures show it.
+            Name of all its numbers, as shown in figures.
         unit
-            Of their values.
+            Unit of their values.
 
         Returns
         -------
@@ -172,7 +172,7 @@ class Grid:
         components
             Names of the fields.
         periodic, walls
-            As of `Axis`.
+            As for `Axis`.
 
         Returns
         -------
@@ -193,7 +193,7 @@ class Grid:
         Parameters
         ----------
         text
-            As of `text`.
+            As in the attribute `text`.
 
         Returns
         -------
@@ -228,7 +228,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Points along each axis, of one component; (n,) of a plain vector."""
+        """Points of one component along each axis; (n,) for a plain vector."""
         return tuple(axis.size for axis in self.axes) or (self.numbers,)
 
     @property
@@ -250,7 +250,7 @@ class Grid:
 
     @property
     def volume(self) -> float:
-        """Product of the lengths; of a plain vector as many as it has numbers."""
+        """Product of the lengths; for a plain vector, the number of its numbers."""
         return math.prod(axis.length for axis in self.axes) if self.axes else float(self.numbers)
 
     @property
@@ -290,13 +290,13 @@ class Grid:
     def equally_spaced(self, count: int) -> NDArray[np.int64]:
         """Indices, within a component, of points that are equally spaced over the grid.
 
-        Along an axis of n points c of them are at int((j + 1/2) n / c). On several axes the counts
-        have `count` as their product and give distances that are as equal as can be.
+        Along an axis of n points, c of them are at int((j + 1/2) n / c). On several axes the counts
+        have `count` as their product and give distances that are as equal as possible.
 
         Parameters
         ----------
         count
-            How many points.
+            Number of points.
 
         Returns
         -------
@@ -325,7 +325,7 @@ class Grid:
         Parameters
         ----------
         count
-            How many sensors.
+            Number of sensors.
 
         Returns
         -------
@@ -335,7 +335,7 @@ class Grid:
         Raises
         ------
         ValueError
-            As from `equally_spaced`.
+            As for `equally_spaced`.
         """
         first = self.points * np.arange(len(self.components), dtype=np.int64)
         found: NDArray[np.int64] = (first[:, None] + self.equally_spaced(count)).ravel()

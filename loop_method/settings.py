@@ -33,7 +33,7 @@ def setting(
     minimum, maximum
         Its range, ends included; None: unbounded.
     unit
-        Of its value.
+        Unit of its value.
     choices
         Admissible values of a text.
 

@@ -112,14 +112,14 @@ class Plant(Protocol):
     ----------
     n_z, n_a, state_size : int
         Size of the state and of the action, and of what `reset` and `step` return: n_z, unless
-        instruments are between.
+        there are instruments in between.
     horizon : int
         Steps of an episode.
     sample_time : float
         Sampling time, over which an action is held.
     state_weight, action_weight : float
-        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a, or
-        numbers of their size where the cost is another one.
+        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a,
+        or numbers of similar size where the cost is another one.
     cost : Cost
         The whole cost.
     divergence_bound : float
@@ -226,9 +226,9 @@ class Plant(Protocol):
         Parameters
         ----------
         environments : (m,) int
-            Which of the M.
+            Indices of the environments to restart.
         seeds : (m,) int, or (m, n_z)
-            Their initial states, as of `reset`.
+            Their initial states, as for `reset`.
 
         Returns
         -------
@@ -254,7 +254,7 @@ class Plant(Protocol):
         ValueError
             The actions have another shape or are not finite. The plant is left as it was.
         RuntimeError
-            No episode was begun, or its horizon is reached.
+            No episode has begun, or its horizon has been reached.
         """
 
     def evaluate(self, states: Array, actions: Array) -> tuple[Array, Array]:

@@ -100,7 +100,7 @@ class Problem:
         Parameters
         ----------
         seed
-            Of the training, from 0 on.
+            Seed of the training, 0 or more.
 
         Returns
         -------
@@ -145,7 +145,8 @@ def problem(
         plant is given.
     plant
         A plant of your own: an object of a class derived from `Dynamics`, or a name
-        ('file.py:Class'), whose code is then run. Without a `source` the rest is as the class has it.
+        ('file.py:Class'), whose code is then run. Without a `source`, the class supplies everything
+        else.
     physical
         The parameters of the equation, like {"viscosity": 1e-3}, or of the named plant.
     cost
@@ -264,7 +265,7 @@ def identify(
     Parameters
     ----------
     trajectories : (states (N + 1, n_z), actions (N, n_a)) each
-        As `Problem.explore` gives them; a_k is held from z_k to z_{k+1}.
+        As returned by `Problem.explore`; a_k is held from z_k to z_{k+1}.
     n_s
         Order of the model; 0: the one that `study_orders` suggests.
     method : {"regression", "dmdc"}
@@ -335,12 +336,12 @@ def train(
     progress
         Stream for progress messages, like sys.stdout; by default there are none.
     parameters
-        As of `problem`: seed, seeds, rollouts, optimizer, optimizer_settings={"fields": 5}, ...
+        As for `problem`: seed, seeds, rollouts, optimizer, optimizer_settings={"fields": 5}, ...
 
     Returns
     -------
     FinishedRun
-        With S seeds: `policies` and `warm` (S, n_a, 2 n_s), or (S, size) of another law than the
+        With S seeds: `policies` and `warm` (S, n_a, 2 n_s), or (S, size) for a law other than the
         affine one, `models`, and `costs` by controller, (S, fields).
 
     Raises

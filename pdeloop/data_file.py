@@ -43,7 +43,7 @@ class Measurements:
     channels : Channels
         Names of the numbers of the state and of the inputs; empty if they have none.
     sources : list of dict
-        Of each trajectory its number in its file, and the file where there are several.
+        For each trajectory, its number in its file, and the file if there are several.
     remarks : tuple of str
         What was left out.
     """
@@ -66,9 +66,9 @@ def read_measurements(
 ) -> Measurements:
     """The measurements of one plant, in one or several files.
 
-    In a .npz file are the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), which may
-    be missing, and `sample_time` (s), with one axis more in front of states and actions where there
-    are several trajectories.
+    A .npz file has the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), which may
+    be missing, and `sample_time` (s); for several trajectories, states and actions have one more
+    axis in front.
 
     A .csv file has a line of names, t, z..., a..., then a line for each instant, t in s or an instant
     like 2026-01-31 12:00:00.5. A time that does not increase starts a new trajectory, and the actions
@@ -86,7 +86,7 @@ def read_measurements(
     sample_time
         Seconds between two states, where the files do not have it.
     target : (n_z,)
-        z_r, instead of that in the files.
+        z_r, instead of the one in the files.
 
     Returns
     -------

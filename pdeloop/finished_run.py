@@ -39,14 +39,14 @@ class FinishedRun:
     Attributes
     ----------
     folder : Path
-        Where it is.
+        Folder of the run.
     values : dict
         Resolved parameters, with the current defaults.
     result : dict
-        result.json.
+        Content of result.json.
     policies, warm : (S, n_a, 2 n_s) array
-        The adapted gains [K_a, K_b], and LQT's; of another law than the affine one its parameters, and
-        where they started, (S, size).
+        The adapted gains [K_a, K_b], and LQT's; for a law other than the affine one, its parameters
+        and their initial values, (S, size).
     models : list of ModelRows
         The reduced model of each seed: A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), gains, and
         U^T z_r (n_s,).
@@ -90,7 +90,7 @@ class FinishedRun:
         )
 
     def index(self, seed: int | None = None) -> int:
-        """Where a training seed stands in the arrays.
+        """The index of a training seed in the arrays.
 
         Parameters
         ----------
@@ -227,7 +227,7 @@ def load_run(folder: str | Path) -> FinishedRun:
     Parameters
     ----------
     folder
-        As `pdeloop train --out` or `pdeloop.train(..., out=...)` leaves it.
+        As written by `pdeloop train --out` or `pdeloop.train(..., out=...)`.
 
     Returns
     -------

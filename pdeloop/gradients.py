@@ -63,7 +63,7 @@ def features(U: Array, target: Array, states: Array) -> Array:
 class Gradients:
     """Costs and gradients on one plant.
 
-    Initial fields are given as to `Plant.reset`: seeds (M,), or the fields themselves (M, n_z).
+    Initial fields are given as for `Plant.reset`: seeds (M,), or the fields themselves (M, n_z).
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ def named_waves(grid: Grid, waves: NDArray[np.int64]) -> str:
     told = sorted({tuple(row) for row in waves.tolist()})
     numbers = ", ".join(str(row[0] if len(row) == 1 else row) for row in told)
     if grid.is_circle:
-        return f"all of wave number {numbers}"
+        return f"the modes of wave number {numbers}"
     names = ", ".join(axis.name for axis in grid.axes)
     counted = "half waves" if not any(axis.periodic for axis in grid.axes) else "waves"
     return f"the {counted} {numbers} along {names}"

@@ -210,14 +210,14 @@ class Optimizer(Protocol):
     Parameters
     ----------
     policy0 : (size,) array
-        Where theta starts, the vector of a law's parameters, whichever law it is. An optimiser that
-        `needs_affine_law` is given the matrix [K_a K_b], (n_a, 2 n_s).
+        The initial theta, the vector of the law's parameters, whichever law it is. An optimiser
+        that `needs_affine_law` is given the matrix [K_a K_b], (n_a, 2 n_s).
     seed : int
         Determines everything random.
     rollouts : int
         The budget.
     settings : Settings
-        Of the class's own type.
+        Settings of the class's own type.
     context : Context, optional
         What is known of the problem, if it needs trajectories.
     """
@@ -305,7 +305,7 @@ class Optimizer(Protocol):
         Parameters
         ----------
         results
-            One for each rollout of `ask`, in its order.
+            One for each rollout of `ask`, in the same order.
 
         Returns
         -------
@@ -315,7 +315,7 @@ class Optimizer(Protocol):
         Raises
         ------
         ValueError
-            There are more or fewer of them.
+            There are more or fewer results.
         """
 
     def state(self) -> State:

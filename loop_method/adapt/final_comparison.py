@@ -135,7 +135,12 @@ class Comparison:
             words = f"{size_of(ADAPTED, self.base, *size)}, on the fields of the steps"
             return Verdict(ADAPTED, *size, words)
         if self.belief is None:
-            return Verdict(ADAPTED, 0.0, 0.0, "too few rollouts are left to compare it on others")
+            return Verdict(
+                ADAPTED,
+                0.0,
+                0.0,
+                "too few rollouts are left to compare the adapted law on other fields",
+            )
         change = self.change.value, self.change.error
         return Verdict(ADAPTED, *change, size_of(ADAPTED, self.base, *change))
 
@@ -185,7 +190,7 @@ class Comparison:
         base = str(checked_array(arrays, "base", "U", ()))
         numbers = checked_array(arrays, "numbers", "i", (len(names),)).tolist()
         if unknown := {base, *names} - {FIRST, ADAPTED, NONE}:
-            raise ValueError(f"it compares laws that there are not: {', '.join(sorted(unknown))}")
+            raise ValueError(f"it compares unknown laws: {', '.join(sorted(unknown))}")
         law = checked_array(arrays, "law", "f", shape).copy()
         fraction, change = fraction_and_change(arrays)
         belief = Belief.of(arrays)

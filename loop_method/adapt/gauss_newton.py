@@ -107,7 +107,7 @@ class GaussNewton(Optimizer):
     ) -> None:
         require_positive(rollouts=rollouts)
         if context is None:
-            raise ValueError("Gauss-Newton needs the context: trajectories were not asked for")
+            raise ValueError("Gauss-Newton needs a context with trajectories, got none")
         self._settings = settings = settings or GaussNewtonSettings()
         self._first = checked_policy(policy0 if context.refused is None else context.refused)
         self._now = SearchState.begin(
@@ -152,7 +152,7 @@ class GaussNewton(Optimizer):
     @property
     def early(self) -> str:
         """Why rollouts are left over at the end."""
-        return self._now.reason or "what is left is too little for a step and its verdict"
+        return self._now.reason or "too few are left for a step and its verdict"
 
     @property
     def next_field(self) -> int:
@@ -327,7 +327,7 @@ class GaussNewton(Optimizer):
         if comparison.names:
             self._comparison = comparison
         elif np.array_equal(now.policy, self._laws[comparison.base]):
-            reason = "no step was better than the law that they began with"
+            reason = "no step improved on the law with which they began"
             self._end(row, Verdict(comparison.base, 0.0, 0.0, reason))
         else:
             now.policy = comparison.law
@@ -373,7 +373,7 @@ class GaussNewton(Optimizer):
             start = now.policy if now.accepted else now.candidate
             now.candidate, now.fall, now.proposed = 0.5 * start, 0.0, bool(start.any())
             if not now.proposed:
-                now.reason = row["reason"] = "no step starts from no control, which diverges"
+                now.reason = row["reason"] = "no control diverges, and no step starts from it"
             return
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         count = self._records.count
@@ -389,7 +389,7 @@ class GaussNewton(Optimizer):
                 first=now.believed if again else None,
             )
         if proposal is None:
-            now.reason = row["reason"] = "no model gives a finite step that gains anything"
+            now.reason = row["reason"] = "no model gives a finite step that lowers the cost"
             return
         if again:
             now.believed, now.tried, now.whole = proposal.believed, count, proposal.whole

@@ -119,7 +119,7 @@ class LocalSearch:
                 self.stage = ENDED if unchanged else CONFIRMING
                 if unchanged:
                     row["early"] = self._search.early
-                    row["reason"] = "no local step was better than the law that they began with"
+                    row["reason"] = "no local step improved on the law with which they began"
                     row["chosen"] = NONE if self._from_none else FIRST
         else:
             self._confirm(costs, row)

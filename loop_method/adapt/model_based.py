@@ -100,7 +100,7 @@ class ModelBased(Optimizer):
     ) -> None:
         require_positive(rollouts=rollouts)
         if context is None:
-            raise ValueError("this optimiser needs the context: trajectories were not asked for")
+            raise ValueError("this optimiser needs a context with trajectories, got none")
         self._settings = settings or ModelBasedSettings()
         self._context, self._seed, self._budget = context, seed, rollouts
         self._declared = context.noise
@@ -253,7 +253,7 @@ class ModelBased(Optimizer):
             self._progress.belief = belief
             self._improve(belief, row, final)
         elif before is not None:
-            row["reason"] = f"{self._unpredicted} any more; the law stays"
+            row["reason"] = f"{self._unpredicted} any more; the law is kept"
         else:
             self._without_model(row, final)
         if final and self._progress.stage == RENEWING:
@@ -281,8 +281,8 @@ class ModelBased(Optimizer):
         unknown = "its cost" if self._context.cost is not None else ""
         unknown = "its law" if isinstance(self._context.law, Observer) else unknown
         if unknown:
-            reason = f"{self._unpredicted}, and local steps do not know {unknown}"
-            self._end(row, f"{reason}: the first law stays")
+            reason = f"{self._unpredicted}, and local steps do not support {unknown}"
+            self._end(row, f"{reason}: the first law is kept")
         else:
             row["reason"] = f"{self._unpredicted}: local steps"
             self._begin_search(row)
@@ -314,7 +314,7 @@ class ModelBased(Optimizer):
                 final=final,
             )
         if found is None:
-            row["reason"] = "no law is finite on the model; the law stays"
+            row["reason"] = "no improved law stays finite on the model; the law is kept"
             return
         self._progress.improved, self._progress.parts = found.improved, found.parts
         self._progress.fraction, self._progress.change = found.fraction, found.change

@@ -58,7 +58,7 @@ class ModelBasedReadings(ModelBased):
         if final:
             super()._without_model(row, final)
         else:
-            row["reason"] = f"{self._unpredicted}; the law stays"
+            row["reason"] = f"{self._unpredicted}; the law is kept"
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """A step from the law that measured best."""
@@ -68,7 +68,7 @@ class ModelBasedReadings(ModelBased):
             self._progress.policy = best.copy()
         found = step(belief.loop(self._context), own, best, self._settings)
         if found is None:
-            row["reason"] = "the law is not finite on the model; it stays"
+            row["reason"] = "the improved law does not stay finite on the model; the law is kept"
         else:
             self._progress.policy, row["steps"] = found
 

@@ -99,7 +99,9 @@ class ModelBasedSensed(ModelBasedReadings):
             self._progress.policy = self._none.copy()
             for name in OF_A_LAW:
                 row.pop(name, None)
-            row["reason"] = "no equation is found, and the law runs away: no control follows"
+            row["reason"] = (
+                "no equation was found, and the law diverges: no control is rolled out next"
+            )
 
     def _attempts_left(self, own: int) -> bool:
         """True if an equation is looked for after so many own rollouts."""
@@ -154,7 +156,7 @@ class ModelBasedSensed(ModelBasedReadings):
                 improved, more = self._improved(plants, law, further, modes, designed_from, fields)
                 laws, steps = [*laws, *improved], steps + more
         if not laws:
-            row["reason"] = "no law is finite on the model; the law stays"
+            row["reason"] = "no improved law stays finite on the model; the law is kept"
             return
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))

@@ -38,7 +38,7 @@ class StepOptimizer(Optimizer):
     Parameters
     ----------
     policy0, seed, rollouts, settings, context
-        As of `Optimizer`.
+        As for `Optimizer`.
 
     Attributes
     ----------
@@ -87,12 +87,12 @@ class StepOptimizer(Optimizer):
         Parameters
         ----------
         results
-            Those of `rollouts`, in their order. One that is not `usable` diverged.
+            The results of `rollouts`, in the same order; one that is not `usable` diverged.
 
         Returns
         -------
         dict
-            What the history says of this step: JSON numbers, booleans and strings by name.
+            What the history records of this step: JSON numbers, booleans and strings by name.
         """
 
     @classmethod
@@ -140,7 +140,7 @@ class StepOptimizer(Optimizer):
         Parameters
         ----------
         results
-            One for each rollout, in their order.
+            One for each rollout, in the same order.
 
         Returns
         -------

@@ -41,7 +41,7 @@ from loop_method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
 NAMES = {FIRST: "the first law", ADAPTED: "the adapted law", NONE: "no control"}
 NO_OTHER = "no other law is better by more than chance"
-ALL_AGREE = "which chance may explain, but every estimate says so"
+ALL_AGREE = "which may be chance, but every estimate agrees"
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,9 +96,9 @@ def track(
     state_weight, action_weight : float
         Positive; Q = state_weight I on the full state and R = action_weight I.
     cost : Cost, optional
-        In place of them, any quadratic cost. K_b is then the least one with which K_b s_r is the best
-        constant part of the law, s_r = U^T z_r with the cost's ``field_target``; of a target over time
-        that is the one for its mean.
+        Any quadratic cost, in place of the weights. K_b is then the smallest one for which K_b s_r
+        is the best constant part of the law, s_r = U^T z_r with the cost's ``field_target``; for a
+        target over time, the best one for its mean.
 
     Returns
     -------

@@ -55,7 +55,7 @@ def track_horizon(
     A, B : (n_s, n_s) and (n_s, n_a)
         The model.
     cost : Cost
-        Of the states z = basis s.
+        Cost of the states z = basis s.
     basis : (n_z, n_s)
         U of a reduced model; the identity for a model of the whole state.
     drift : (n_s,)

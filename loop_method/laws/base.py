@@ -147,9 +147,9 @@ class Law(ABC):
         Parameters
         ----------
         theta, z, memory, k : dict of arrays, (n_z,), (memory_size,), int
-            As of `action`.
+            As for `action`.
         action : (n_a,)
-            What was answered, saturated where there is an action limit.
+            The answered action, saturated where there is an action limit.
 
         Returns
         -------
@@ -171,7 +171,7 @@ class Law(ABC):
         Parameters
         ----------
         theta, z, memory, k : dict of arrays, (n_z,), (memory_size,), int
-            As of `action`.
+            As for `action`.
         y : (n_a,)
             Any vector.
 
@@ -195,7 +195,7 @@ class Law(ABC):
         Parameters
         ----------
         theta, z, memory, action, k : dict of arrays, (n_z,), (memory_size,), (n_a,), int
-            As of `memory_update`.
+            As for `memory_update`.
         y : (memory_size,)
             Any vector.
 
@@ -255,7 +255,7 @@ class Law(ABC):
         Parameters
         ----------
         parts : dict of arrays
-            Of the names and shapes of `start`.
+            With the names and shapes of `start`.
 
         Returns
         -------

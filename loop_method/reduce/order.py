@@ -54,15 +54,15 @@ class OrderStudy:
     Attributes
     ----------
     singular_values : (min(N, n_z),) array
-        Of Z' = [z_1 .. z_N], all trajectories together.
+        Singular values of Z' = [z_1 .. z_N], with all trajectories together.
     orders : (K,) int array
         The orders n_s that were tried, ascending.
     one_step, rollout : (K,) arrays
         Relative errors on held-out data; infinity where a rollout overflows.
     suggested : int
-        The lowest order that reaches a share (`IdentificationSettings.order_share`) of what the best
-        one gains, in digits of the one-step error. Noise lets the error fall less, and has lower orders
-        suggested.
+        The lowest order that reaches a share (`IdentificationSettings.order_share`) of what the
+        best one gains, in digits of the one-step error. With noise the error falls less, so lower
+        orders are suggested.
     """
 
     singular_values: Array

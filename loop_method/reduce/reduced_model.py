@@ -32,7 +32,7 @@ class ReducedModel:
     A : (n_s, n_s) array
         A read-only copy, as are the others.
     B : (n_s, n_a) array
-        Of the actions.
+        Input matrix.
     U : (n_z, n_s) array
         Orthonormal columns; the largest entry of each column is positive, so that U is unique.
 

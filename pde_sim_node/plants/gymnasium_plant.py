@@ -54,7 +54,7 @@ def from_gymnasium(
     state_weight, action_weight
         q and r.
     horizon
-        Steps of an episode; 0: the limit of its specification.
+        Steps of an episode; 0: the limit in the environment's specification.
     sample_time
         Time (s) of a step.
     divergence_bound

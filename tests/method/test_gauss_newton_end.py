@@ -184,7 +184,7 @@ def test_an_end_before_the_budget_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     plant = Plant()
     optimizer = make(plant)
     monkeypatch.setattr(Proposer, "propose", lambda *given, **named: None)
-    why = "no model gives a finite step that gains anything"
+    why = "no model gives a finite step that lowers the cost"
     row = optimizer.tell(measure(plant, optimizer.ask()))
     assert row["reason"] == why and row["rollouts"] == 3
     row = optimizer.tell(measure(plant, optimizer.ask()))

@@ -117,7 +117,7 @@ def test_a_step_that_is_never_found_leaves_the_law_that_was_better(
     monkeypatch.setattr(Proposer, "propose", lambda *_, **__: None)
     judged, row = carried_out(found, costs(5.0, 0.0))
     assert not judged and row["chosen"] == NONE and not found.policy.any()
-    assert row["early"] == "no model gives a finite step that gains anything"
+    assert row["early"] == "no model gives a finite step that lowers the cost"
 
 
 def test_a_first_law_that_diverges_from_fewer_fields_than_no_control_is_the_start(
@@ -140,4 +140,4 @@ def test_no_step_is_tried_from_no_control_under_which_the_plant_diverges(
     found.tell([RolloutResult(10.0, False, trajectory(i)) for i in range(2)])
     row = dict(found.tell([RolloutResult(1e9, True, trajectory(i)) for i in range(3)]))
     assert found.ask() == [] and row["chosen"] == NONE
-    assert row["early"] == "no step starts from no control, which diverges"
+    assert row["early"] == "no control diverges, and no step starts from it"

@@ -271,7 +271,7 @@ def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far
             ]
         )
         runs_away = far > 1.0
-        assert ("no control follows" in str(row.get("reason"))) is runs_away
+        assert ("no control is rolled out next" in str(row.get("reason"))) is runs_away
         assert all(asked.policy.any() is not np.bool_(runs_away) for asked in own.ask())
 
 

@@ -230,7 +230,9 @@ def test_sensors_and_other_parameters_may_be_given(capsys: pytest.CaptureFixture
     given = ["--sensors", "2", "--set", "horizon=12"]
     assert main(["check", "allen-cahn", *given]) == FAILED
     told = capsys.readouterr().out
-    assert re.search(r"BAD  sensors: .* the sensors do not observe all of wave number \d", told)
+    assert re.search(
+        r"BAD  sensors: .* the sensors do not observe the modes of wave number \d", told
+    )
     assert main(["check", str(SMALL), "--sensors", "9999"]) == FAILED
     assert "9999" in capsys.readouterr().err
 

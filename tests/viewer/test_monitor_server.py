@@ -278,7 +278,7 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
         asked = page.requests.get(timeout=600)
         assert asked == Call("/t", "pause")
         view.operation.asked(asked, now)
-        shows("fitting models, 7 s", "Pause training: asked for; takes effect after fitting models")
+        shows("fitting models, 7 s", "Pause training: requested; takes effect after fitting models")
         button = "document.querySelector('#tuner-%s')"
         assert tab.ask(f"{button % 'pause'}.disabled")
         assert tab.ask(f"{button % 'pause'}.textContent.trim()") == "Pausing…"

@@ -19,7 +19,7 @@ const STATES = {
 const BUTTONS = { plant: ["pause", "resume", "step"], tuner: ["pause", "resume", "stop"] };
 const VERBS = {
   pause: ["Pause", "Pausing…", "hold it where it is"],
-  resume: ["Resume", "Resuming…", "go on"],
+  resume: ["Resume", "Resuming…", "continue"],
   step: ["Step", "Stepping…", "one step, then pause again"],
   stop: ["Stop", "Stopping…", "end after this iteration"],
 };
@@ -145,7 +145,7 @@ function Notice({ status, notice }) {
     const asked = `${VERBS[verb][0]} ${ROLES[role]}`;
     if (failure) return `${asked}: ${failure}`;
     const when = activity?.role === role ? `; takes effect after ${activity.what}` : "";
-    return `${asked}: asked for${seconds > 1 ? ` ${duration(seconds)} ago` : ""}${when}`;
+    return `${asked}: requested${seconds > 1 ? ` ${duration(seconds)} ago` : ""}${when}`;
   });
   if (stopping && state !== "ended") words.push("The training ends after the rollouts under way.");
   const all = [notice, STATES[state]?.[2], ...words].filter(Boolean).join(" · ");
