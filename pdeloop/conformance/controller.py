@@ -221,7 +221,7 @@ class ControllerCheck(Check):
             other = self.explore(seed, steps=4).actions[:, 0]
             require((other != drawn[:5]).any(), f"other actions for seed {seed}", "those of seed 5")
         first = np.abs(drawn[:, 0])
-        require(np.ptp(drawn, axis=0).any(), "others in each step", "the same in all")
+        require(np.ptp(drawn, axis=0).any(), "different ones in each step", "the same in all steps")
         if (first == first.max()).sum() > 1:
             raise NoteError("they saturate, so their variance cannot be measured")
         covariance = drawn.T @ drawn / len(drawn)
@@ -261,7 +261,10 @@ class ControllerCheck(Check):
             and np.allclose(m.U @ B, plant.B, atol=ROUNDED)
         ]
         if not fits:
-            raise NoteError("no A and B of that plant: right for an approximate model, or your own")
+            raise NoteError(
+                "A and B are not those of that plant: right for an approximate model, or one of "
+                "your own"
+            )
         require("A and B" in fits, "A and B", fits)
         radius, other = (
             np.abs(np.linalg.eigvals(plant.A + plant.B @ K @ m.U.T)).max() for K in (m.K_a, m.K_b)
@@ -344,8 +347,8 @@ class ControllerCheck(Check):
             error = np.abs(found - expected).max() / np.abs(expected).max()
             if error > ROUNDED:
                 raise NoteError(
-                    f"another one, with model {i} by {error:.2g} of it: right for a law of your own, "
-                    "or if actions of 1e-4 saturate"
+                    f"another law, whose action with model {i} differs by a share of {error:.2g}: "
+                    "right for a law of your own, or if actions of 1e-4 saturate"
                 )
 
     def two_policies(self) -> None:

@@ -160,7 +160,7 @@ class PlantCheck(Check):
             act = partial(self.transport.send, ACTION, replace(state, values=actions[-1]))
             topic, state = self.reply(step + 1, act, answers=state)
         what = f"the cost, of step {state.step}, after state {state.step}"
-        require(state.step == step > 0, what, f"it after state {step}")
+        require(state.step == step > 0, what, f"the cost after state {step}")
         for i, row in enumerate(state.values):
             _check_cost(step, *row.tolist())
             if i < len(like):
@@ -267,8 +267,8 @@ class PlantCheck(Check):
         likely = min(misses, key=lambda what: misses[what])
         require(misses[likely] > EXACT, "q and r that give the totals", f"totals with {likely}")
         raise NoteError(
-            f"no q and r give {len(traces)} totals from the published states and actions (they miss "
-            f"{right:.1g} of them): right if noise, sensors or limits are between"
+            f"no q and r give {len(traces)} totals from the published states and actions (they "
+            f"miss {right:.1g} of them): right if there are noise, sensors or limits in between"
         )
 
     def start_columns(self) -> None:
@@ -281,7 +281,9 @@ class PlantCheck(Check):
         require_same(self.begin((-1, 1)).values, states[-1], "state 0 for seed -1")
         equal = [seed for seed in states if seed != 1 and np.array_equal(states[seed], states[1])]
         if len(equal) == len(states) - 1:
-            raise NoteError("all give one state: right for an initial distribution of one value")
+            raise NoteError(
+                "all seeds give the same state: right for an initial distribution of one value"
+            )
         require(not equal, "other states than that of seed 1", f"the same for the seeds {equal}")
 
     def two_rows(self) -> None:
@@ -307,9 +309,11 @@ class PlantCheck(Check):
         if ended == COMPLETED and moved[step]:
             raise NoteError(f"actions of {HUGE:g} did not make it diverge")
         if ended != COMPLETED and moved[ended:].any():
-            raise NoteError(f"diverged at step {ended}, and moved on: right with noise or delays")
+            raise NoteError(
+                f"diverged at step {ended}, but kept moving: right with noise or delays"
+            )
         good = ended >= 0 and moved[:ended].all()
-        require(good, f"{moved.argmin()} as `ended`, where it is frozen", ended)
+        require(good, f"`ended` {moved.argmin()}, the step from which it is frozen", ended)
 
     def release_of_the_run(self) -> None:
         """After a start without rows another run is served at once."""

@@ -150,7 +150,7 @@ class Check(ABC):
                 ask()
             others[self.described(*found)] += 1
         if end == self._end:
-            raise NoAnswerError(f"--limit {self._limit:g} s is over; it waited for {what}")
+            raise NoAnswerError(f"--limit {self._limit:g} s was reached while waiting for {what}")
         got = " and ".join(f"{what} ({n} times)" for what, n in others.most_common(2)) or "nothing"
         if not self.transport.received_any:
             got += "; is it in this ROS_DOMAIN_ID and --namespace?"

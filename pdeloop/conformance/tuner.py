@@ -196,7 +196,9 @@ class TunerCheck(Check):
             self.answer()
             self.advance()
         if self.rollouts and not self.knows_gains:
-            raise NoteError("no policy was [K_a K_b] of the model: right if it begins with others")
+            raise NoteError(
+                "no policy was [K_a K_b] of the model: right if it begins with other laws"
+            )
 
     def another_run(self) -> None:
         """Started once more, the tuner has another run id."""

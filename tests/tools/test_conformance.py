@@ -105,7 +105,7 @@ def test_the_limit_ends_a_check_that_gets_on():
     check = plant({"horizon": 1000})
     check._end = check.transport.now() + 0.05
     *_, last, _ = findings(check)
-    assert "--limit 600 s is over; it waited for state" in last.text
+    assert "--limit 600 s was reached while waiting for state" in last.text
 
 
 def test_a_check_that_is_left_leaves_the_node_free():
