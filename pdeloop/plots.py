@@ -170,8 +170,8 @@ def _require_gains(run: FinishedRun) -> None:
     """ValueError if the run's law has other parameters than gains."""
     if run.values["law"] != Affine.name:
         raise ValueError(
-            f"the run has the law '{run.values['law']}', and this figure shows the gains of the law "
-            f"'{Affine.name}'"
+            f"the run has the law '{run.values['law']}', but this figure shows the gains of the "
+            f"law '{Affine.name}'"
         )
 
 

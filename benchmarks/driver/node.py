@@ -132,7 +132,7 @@ class DriverNode:
             tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping
         )
         if self._cost is None:
-            raise ConfigurationError(f"no cost of an episode came ({reason})")
+            raise ConfigurationError(f"no cost of an episode arrived ({reason})")
         if (self._cost.values[:, CostColumn.ENDED] != -1).any():
             raise ConfigurationError("an episode of the measurement did not complete")
         self._loop.resume()

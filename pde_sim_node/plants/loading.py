@@ -165,7 +165,10 @@ def as_plant(plant: object) -> Plant:
     if isinstance(plant, Dynamics):
         return DynamicsPlant(plant)
     if not isinstance(plant, Plant):
-        raise ValueError(f"plant is {shown(plant)}; expected a Plant, or an object of a Dynamics")
+        raise ValueError(
+            f"plant is {shown(plant)}; expected a Plant, or an object of a class derived from "
+            "Dynamics"
+        )
     require_complete(plant)
     return plant
 

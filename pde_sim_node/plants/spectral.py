@@ -146,8 +146,8 @@ class SpectralPlant(BatchPlant):
         for name in ("n_z", "n_a", "horizon"):
             if getattr(cost, name) != getattr(self, name):
                 raise ValueError(
-                    f"the cost is one for {name} {getattr(cost, name)}, and this plant's is "
-                    f"{getattr(self, name)}: make it for that"
+                    f"the cost is for {name} {getattr(cost, name)}, but this plant has {name} "
+                    f"{getattr(self, name)}: make the cost for that"
                 )
 
     def _make_step(self) -> ParallelStep:

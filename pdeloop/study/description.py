@@ -121,7 +121,7 @@ class Study:
         """
         for name in settings:
             if name in ("seed", "seeds"):
-                raise StudyError(f"'{name}' of a study is in its 'seeds', not a setting")
+                raise StudyError(f"'{name}' is not a setting of a study; give its 'seeds' instead")
             if other := [variant for variant, own in self.variants.items() if name in own]:
                 raise StudyError(f"'{name}' is set by variant '{other[0]}' itself; change it there")
         return replace(self, settings={**self.settings, **settings})

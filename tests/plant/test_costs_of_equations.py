@@ -184,7 +184,9 @@ def test_states_that_run_away_cost_what_a_divergence_costs() -> None:
 
 def test_a_cost_of_other_sizes_is_refused_in_a_sentence() -> None:
     texts = Cost(N_Z, 6, T, terminal_weight=1.0).texts
-    with pytest.raises(ValueError, match="the cost is one for horizon 12, and this plant's is 13"):
+    with pytest.raises(
+        ValueError, match="the cost is for horizon 12, but this plant has horizon 13"
+    ):
         pdeloop.problem("burgers", n_z=N_Z, horizon=13, cost=texts)
     with pytest.raises(ValueError, match="a cost has no 'weights'; it has state_weight"):
         pdeloop.problem("burgers", cost={"weights": 1.0})

@@ -147,7 +147,7 @@ def test_evaluate_report_and_export_know_it(
         assert same_bits(arrays["U"], run.models[0].U)
     capsys.readouterr()
     assert main(["export", str(finished), "--out", str(tmp_path / "law.c")]) == 1
-    assert "has no gains, so it cannot be written in C" in capsys.readouterr().err
+    assert "cannot be written in C; write its parameters as .npz" in capsys.readouterr().err
     assert not (tmp_path / "law.c").exists()
     with pytest.raises(ValueError, match="this figure shows the gains"):
         pdeloop.plot_gains(run)

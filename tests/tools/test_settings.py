@@ -130,7 +130,7 @@ def test_study_and_reproduce_set_a_parameter_of_all_trainings(
     fresh = str(tmp_path / "other")
     for words, told in (
         (("--set", "iterations=2"), "set by variant 'one' itself"),
-        (("--set", "seed=2"), "in its 'seeds'"),
+        (("--set", "seed=2"), "give its 'seeds' instead"),
     ):
         refused(capsys, told, "study", str(file), "--out", fresh, *words)
     refused(capsys, "with its own parameters", "study", "--out", str(out), "--set", "horizon=9")
