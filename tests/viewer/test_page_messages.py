@@ -63,7 +63,7 @@ def test_of_many_components_one_is_shown_at_a_time():
 def test_a_field_on_two_axes_is_sent_as_it_is_now_and_was_at_first():
     axes = (Axis("y", 1.0, 2, periodic=False), Axis("x", 1.0, 200))
     grid, page, sent = Grid(axes, ("u", "v")), Page(), {}
-    page.take_parameters({"grid": grid.text, "equation": "burgers"})
+    page.take_parameters({"grid": grid.text, "actuators": "[]"})
     view, z = page.view, np.arange(800.0)
     view.components = ["u", "v"]
     view.target(frame(-z), 0.0)
@@ -89,6 +89,14 @@ def test_the_target_is_there_before_the_first_state():
     parts = dict(map(part, page.updates(sent, 0.0)))
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4] * 2)
     assert "episode" not in parts
+
+
+def test_of_a_plant_that_tells_no_parameters_no_other_node_says_where_and_how_long():
+    page = Page()
+    page.take_parameters({"problem": "arm", "n_a": 1, "length": 1.0, "grid": "", "horizon": 300})
+    assert page.parameters == {"problem": "arm", "n_a": 1} and page.view.horizon == 0
+    page.take_parameters({"actuators": "[]", "length": 2.0, "grid": "", "horizon": 50})
+    assert page.parameters["axes"][0]["length"] == 2.0 and page.view.horizon == 50
 
 
 def test_axes_and_places_are_those_that_the_plant_says():

@@ -36,8 +36,10 @@ RATE_WINDOW = 3.0
 """Seconds over which rates are taken."""
 COLOUR_PERIOD = 0.5
 """Seconds between two computations of the range of the colours."""
-PARAMETERS = ("problem", "n_a", "horizon", "sample_time")
-"""Parameters that the page needs, with what `axes_of` and `places_of` read."""
+PARAMETERS = ("problem", "n_a", "sample_time")
+"""Parameters that the page takes from any node."""
+OF_PLANT = ("grid", "length", "sensors", "actuators", "horizon")
+"""Those that it takes from a plant alone: of a plant that tells none, another node has mere defaults."""
 MOST_PANELS = 4
 """Components shown side by side; of more, one is chosen."""
 Axes = list[dict[str, Any]]
@@ -157,13 +159,14 @@ class Page:
     def take_parameters(self, values: Mapping[str, Any]) -> None:
         """Take parameters of a node."""
         self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
-        names = ("grid", "length", "sensors", "actuators")
-        self._of_plant |= {name: values[name] for name in names if values.get(name)}
+        if "actuators" not in values:  # which a plant declares, and no other node
+            return
+        self._of_plant |= {name: values[name] for name in OF_PLANT if values.get(name)}
         with contextlib.suppress(TypeError, ValueError):
             self.parameters["axes"] = axes_of(self._of_plant)
             self.parameters["places"] = places_of(self._of_plant)
             self.view.grid = Grid.parse(str(self._of_plant.get("grid")))
-        self.view.horizon = int(self.parameters.get("horizon", 0))
+        self.parameters["horizon"] = self.view.horizon = int(self._of_plant.get("horizon", 0))
 
     def request_call(self, node: object, verb: object) -> bool:
         """Ask for a call of the service `verb` of `node`; False if the loop has none."""
