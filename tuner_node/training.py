@@ -375,9 +375,8 @@ class Training:
             report = calls.tell(optimizer, own)
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
-            rows.append(
-                {"event": "adapted", "seed": self.settings.all_seeds[m], **report, "rollouts": paid}
-            )
+            whose = {"event": "adapted", "seed": self.settings.all_seeds[m]}
+            rows.append({**whose, **report, **whose, "rollouts": paid})
         self.history += rows
         self._leave_adapt_if_done()
         return rows

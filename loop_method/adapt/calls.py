@@ -6,6 +6,7 @@ Errors that an optimiser of this package raises are passed on unchanged.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,9 @@ import numpy as np
 from loop_interfaces.arrays import float_array
 from loop_interfaces.own_code import OwnCodeError, called
 from loop_method.adapt.base import Optimizer, Rollout, RolloutResult, Row, State
+
+_COUNTED = ("cost", "rollouts", "diverged")
+"""Keys of a report that others read as numbers."""
 
 
 def ask(optimizer: Optimizer, size: int) -> list[Rollout]:
@@ -35,13 +39,26 @@ def ask(optimizer: Optimizer, size: int) -> list[Rollout]:
 
 
 def tell(optimizer: Optimizer, results: list[RolloutResult]) -> Row:
-    """Tell it the results of its rollouts, and return its report; OwnCodeError."""
-    row = _called(optimizer, "tell", results)
+    """Tell it the results of its rollouts, and return its report as JSON takes it; OwnCodeError.
+
+    JSON has neither NaN nor infinity, so a user's are left out.
+    """
+    name, row = type(optimizer).__name__, _called(optimizer, "tell", results)
     if not isinstance(row, Mapping):
-        raise OwnCodeError(
-            f"{type(optimizer).__name__}.tell returned {type(row).__name__}; expected a dict"
-        )
-    return dict(row)
+        raise OwnCodeError(f"{name}.tell returned {type(row).__name__}; expected a dict")
+    told: Row = {}
+    for key, given in row.items():
+        value = given.tolist() if isinstance(given, np.generic | np.ndarray) else given
+        if isinstance(value, float) and not np.isfinite(value) and not _shipped(optimizer):
+            continue
+        number = key in _COUNTED
+        if not (isinstance(key, str) and (_is_number(value) if number else _is_json(value))):
+            expected = "a number" if number else "a text as key, and numbers, texts or lists"
+            raise OwnCodeError(
+                f"{name}.tell returned {type(given).__name__} as {key!r}; expected {expected}"
+            )
+        told[key] = value
+    return told
 
 
 def state(optimizer: Optimizer) -> State:
@@ -57,10 +74,26 @@ def restore(optimizer: Optimizer, kept: State) -> None:
 
 def _called(optimizer: Optimizer, method: str, *given: Any) -> Any:
     function: Callable[..., Any] = getattr(optimizer, method)
-    if type(optimizer).__module__.startswith("loop_method."):
+    if _shipped(optimizer):
         return function(*given)
     kind = type(optimizer)
     return called(f"{kind.__name__}.{method}", function, *given, module=kind.__module__)
+
+
+def _shipped(optimizer: Optimizer) -> bool:
+    return type(optimizer).__module__.startswith("loop_method.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def _kinds(asked: Any) -> str:

@@ -131,8 +131,19 @@ class StepOptimizer(Optimizer):
         Returns
         -------
         list of Rollout
+
+        Raises
+        ------
+        ValueError
+            `rollouts` returned more or fewer than `step_rollouts`.
         """
-        return [] if self.done else self.rollouts()
+        asked = [] if self.done else self.rollouts()
+        if asked and isinstance(asked, Sequence) and len(asked) != self.step_rollouts:
+            raise ValueError(
+                f"{type(self).__name__}.rollouts returned {len(asked)}; expected step_rollouts, "
+                f"which is {self.step_rollouts}"
+            )
+        return asked
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the results of this step; see `Optimizer.tell`.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from typing import Any
 
@@ -86,11 +87,43 @@ def test_what_it_asks_for_is_checked(optimizer: Own, words: str) -> None:
             r"Own.tell fails: .*test_optimizer_calls.py, line \d+: SystemExit: 0",
         ),
         (lambda: 7, "Own.update returned int; expected a dict"),
+        (lambda: {"own": object()}, "Own.tell returned object as 'own'; expected a text as key"),
+        (lambda: {"own": [object()]}, "Own.tell returned list as 'own'"),
+        (lambda: {3: 1.0}, "Own.tell returned float as 3"),
+        (lambda: {"cost": "low"}, "Own.tell returned str as 'cost'; expected a number"),
+        (lambda: {"diverged": {}}, "Own.tell returned dict as 'diverged'; expected a number"),
     ],
 )
 def test_what_it_reports_is_checked(update: Any, words: str) -> None:
     with pytest.raises(OwnCodeError, match=words):
         calls.tell(Own(update=update), [RolloutResult(1.0)])
+
+
+def test_a_report_may_hold_what_numpy_computes_and_is_kept_as_json() -> None:
+    def report() -> dict[str, Any]:
+        best = np.array([2.0, 1.0])
+        return {
+            "updated": best[1] < best[0],
+            "index": best.argmin(),
+            "best": best,
+            "cost": best.min(),
+            "lost": np.inf,
+        }
+
+    row = calls.tell(Own(update=report), [RolloutResult(1.0)])
+    assert json.loads(json.dumps(row)) == row
+    expected = {"updated": True, "index": 1, "best": [2.0, 1.0], "cost": 1.0}
+    assert row == {"rollouts": 1, "diverged": 0} | expected
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_step_that_asks_for_other_than_its_rollouts_is_told_so(count: int) -> None:
+    class Two(Own):
+        step_rollouts = 2
+
+    asking = Two(rollouts=lambda: [Rollout(POLICY, 1)] * count)
+    with pytest.raises(OwnCodeError, match=f"Two.rollouts returned {count}; .* which is 2"):
+        calls.ask(asking, SIZE)
 
 
 def test_a_shipped_optimizer_says_itself_what_is_wrong() -> None:
