@@ -39,7 +39,7 @@ COLOUR_PERIOD = 0.5
 PARAMETERS = ("problem", "n_a", "sample_time")
 """Parameters that the page takes from any node."""
 OF_PLANT = ("grid", "length", "sensors", "actuators", "horizon")
-"""Those that it takes from a plant alone: of a plant that tells none, another node has mere defaults."""
+"""Those that it takes from a plant alone: other nodes have mere defaults of one that tells none."""
 MOST_PANELS = 4
 """Components shown side by side; of more, one is chosen."""
 Axes = list[dict[str, Any]]
