@@ -368,6 +368,7 @@ class ModelBased(Optimizer):
         self._progress.policy = self._local.policy.copy()
         if self._local.stage == LOCAL_ENDED:
             self._progress.stage = ENDED
+            row["reason"] = f"{row['reason']}; steps were local, as {self._unpredicted}"
         return row
 
     def state(self) -> State:
