@@ -270,7 +270,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         told = f"reduced_order {settings.reduced_order}; 0: the best one for held-out readings"
     else:
         try:
-            suggested = study_orders([first]).suggested
+            suggested = study_orders([first], settings=settings.method).suggested
         except ValueError as error:
             yield Finding("order", False, str(error))
             return

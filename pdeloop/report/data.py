@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch
 from loop_interfaces.array_files import checked_array, read_arrays
 from loop_interfaces.arrays import Array
@@ -227,7 +228,7 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
-    """The orders that the exploratory episodes support from which a seed's model was identified."""
+    """The orders that the exploration supports from which a seed's model was identified."""
     if run.values["model"] or not run.rollouts:
         return None
     training = build_training({**run.values, "seed": run.seeds[shown], "seeds": 1})
@@ -238,9 +239,12 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
     batch = training.next_batch()
     assert batch is not None
     episode = LocalPair(run.values, plant).roll_out(batch)
-    pairs = zip(episode.states.swapaxes(0, 1), episode.actions.swapaxes(0, 1), strict=True)
+    pairs = list(zip(episode.states.swapaxes(0, 1), episode.actions.swapaxes(0, 1), strict=True))
+    design = DesignSettings.of(run.values)
+    if design.identification != "subspace":
+        pairs = pairs[:1]  # the others are for models of the whole field
     try:
-        return study_orders(list(pairs))
+        return study_orders(pairs, settings=design.method)
     except ValueError:  # too few steps to hold some out
         return None
 

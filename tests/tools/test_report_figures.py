@@ -74,16 +74,20 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
     assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2
 
 
-def test_the_orders_shown_are_those_of_the_explorations_that_the_model_is_from(tmp_path):
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_the_orders_shown_are_those_of_the_exploration_that_the_model_is_from(tmp_path, share):
     from pdeloop.cli import main
 
     words = ["train", str(SMALL), "--in-process", "--rollouts", "10", "--optimizer", "model_based"]
+    words += ["--reduced-order", "0", "--set", f"identification_settings.order_share={share}"]
     assert main([*words, "--out", str(tmp_path / "run")]) == 0
     values = parameters(rollouts=10, optimizer="model_based")
     batch = build_training(values).next_batch()
     explored = LocalPair(values).run(replace(batch, trajectories=True)).trajectories
     assert len(explored) == 2
-    expected = study_orders([(one.states, one.actions) for one in explored])
-    found = gather(tmp_path / "run").problems[0].orders
+    expected = study_orders([(explored[0].states, explored[0].actions)])
+    data = gather(tmp_path / "run").problems[0]
+    found = data.orders
+    assert found.suggested == len(data.models[0].A), "the order that the training took"
     np.testing.assert_array_equal(found.singular_values, expected.singular_values)
     np.testing.assert_array_equal(found.rollout, expected.rollout)
