@@ -283,7 +283,8 @@ class GaussNewtonSettings(ImprovementSettings):
     )
     chaotic_share: int = setting(
         3,
-        "interval of the measured states of a chaotic plant that make a law; the others judge it",
+        "of the measured states of a chaotic plant, one in this many makes a law; the others "
+        "judge it",
         2,
         100,
     )

@@ -22,7 +22,10 @@ class FieldModelSettings(Settings):
         0.05, "the same with measurement noise, which leaves initial states uncertain", 0, 1
     )
     better: float = setting(
-        3.0, "how many times smaller the E of a kind with more unknowns must be", 1, 100
+        3.0,
+        "how many times smaller the E of a kind with more unknowns must be for it to be selected",
+        1,
+        100,
     )
     folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
     hopeless: float = setting(
@@ -102,11 +105,14 @@ class FieldModelSettings(Settings):
         40, "largest state for models of few products of any of its numbers", 1, 64
     )
     sparse_products: int = setting(
-        2500, "products above which those of three different numbers are not tried", 1, 100_000
+        2500,
+        "number of products above which products of three different numbers are not tried",
+        1,
+        100_000,
     )
     sparse_terms: int = setting(8, "maximum number of products for each number", 1, 100)
     sparse_left: float = setting(
-        0.5, "share of the squared change left over that another product may leave", 0, 1
+        0.5, "share of the remaining squared change that another product may leave", 0, 1
     )
     coarse_points: int = setting(
         256,
@@ -134,7 +140,7 @@ class FieldModelSettings(Settings):
     fewest_modes: int = setting(
         4, "wavenumbers that are always compared, whatever their power", 1, 65536
     )
-    largest_window: int = setting(16, "maximum number of sampling times of a window", 1, 16)
+    largest_window: int = setting(16, "maximum number of sampling times in a window", 1, 16)
     growth: float = setting(
         1.5, "largest growth of the linear part within a window, as an exponent of e", 0.1, 10
     )
@@ -142,7 +148,7 @@ class FieldModelSettings(Settings):
         0.02, "model error of a window as a share of the change within it", 0, 1
     )
     significance: float = setting(
-        3.0, "standard errors that a coefficient must have to be kept", 0, 100
+        3.0, "multiple of its standard error that a coefficient must reach to be kept", 0, 100
     )
     least_correction: float = setting(
         0.02, "minimum share of an innovation that corrects a filtered state", 0, 1
@@ -195,7 +201,7 @@ class FieldModelSettings(Settings):
         12,
     )
     sensed_further_fall: float = setting(
-        0.01, "share of the error that a further term must promise to take away", 0, 1
+        0.01, "share by which a further term must promise to reduce the error", 0, 1
     )
     sensed_further_chi: float = setting(
         12.0, "the same relative to the variance that noise alone gives", 0, 1000
@@ -245,7 +251,7 @@ class FieldModelSettings(Settings):
     )
     sensed_last_iterations: int = setting(60, "the same over whole rollouts", 1, 1000)
     sensed_least_gain: float = setting(
-        1e-3, "share of the error that an iteration must gain for the fit to continue", 0, 1
+        1e-3, "share by which an iteration must reduce the error for the fit to continue", 0, 1
     )
     sensed_damping: float = setting(
         1e-2, "initial damping of the Levenberg-Marquardt method", 1e-9, 1e4
@@ -256,7 +262,7 @@ class FieldModelSettings(Settings):
     )
     sensed_distance: float = setting(
         0.1,
-        "weight of the relative error of the distance from the target, which follows from a cost",
+        "weight of the relative error of the distance from the target, which is known from a cost",
         0,
         10,
     )
