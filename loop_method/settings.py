@@ -108,6 +108,6 @@ def with_defaults(
 
 
 def settings_from(prefix: str, kind: type[_Own], values: Mapping[str, Any], method: str) -> _Own:
-    """The settings that parameters give; arguments as of `with_defaults`."""
+    """The settings that parameters give; arguments as for `with_defaults`."""
     found = with_defaults(prefix, kind, values, method)
     return kind(**{name.removeprefix(prefix): value for name, value in found.items()})

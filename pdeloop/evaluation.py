@@ -146,7 +146,7 @@ def mean_costs(
 
 
 def _costs(run: FinishedRun, pair: LocalPair, seeds: int, **fields: Any) -> dict[str, Array]:
-    """Costs (seeds, fields) of the first training seeds; fields: as of `mean_costs`."""
+    """Costs (seeds, fields) of the first training seeds; fields: as for `mean_costs`."""
     warm, adapted = run.warm[:seeds], run.policies[:seeds]
     laws = dict(zip(EVALUATED, (np.zeros_like(warm), warm, adapted), strict=True))
     policies, models = np.concatenate([*laws.values()]), np.tile(np.arange(seeds), len(laws))

@@ -221,7 +221,7 @@ class Adjoint:
     Parameters
     ----------
     step
-        As of `kernel.etdrk4_step`; it is not changed.
+        As for `kernel.etdrk4_step`; it is not changed.
     nonlinearity
         Its g.
 

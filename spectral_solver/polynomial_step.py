@@ -191,7 +191,7 @@ class PolynomialSteps:
             self._plans[i : i + 1] = step._plans
 
     def advance(self, spectra: Array, inputs: Array) -> None:
-        """As of `PolynomialStep`: the first rows with the first equation, as many with the next."""
+        """As for `PolynomialStep`: the first rows with the first equation, as many with the next."""
         advance(spectra, inputs, self._plans)
 
 

@@ -63,7 +63,7 @@ def propose(
     shares : sequence of float
         How much each of them counts.
     incumbents, compared, damping, accepted
-        As of `Proposer.propose`.
+        As for `Proposer.propose`.
     settings : GaussNewtonSettings
         Constants.
     """

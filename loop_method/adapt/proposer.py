@@ -208,7 +208,7 @@ class Proposer:
     ) -> Comparison | None:
         """The last rollouts on a model (`on_model`), or None if no model predicts rollouts as a whole.
 
-        records : as of `propose`; believed : kind of the model to try first.
+        records : as for `propose`; believed : kind of the model to try first.
         """
         measured = self._measurements(records)
         belief, whole = self._field_model(measured, believed)

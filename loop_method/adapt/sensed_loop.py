@@ -123,8 +123,8 @@ def fit_rollouts(
 ) -> tuple[Array, Array, float] | None:
     """The fit that reproduces the readings of rollouts, from an earlier equation or from nothing.
 
-    The shared unknowns, the initial fields and the error, as of `fit_sensed`; None if neither does.
-    spread: as of `fit_sensed` as well.
+    The shared unknowns, the initial fields and the error, as for `fit_sensed`; None if neither does.
+    spread: as for `fit_sensed` as well.
     """
     readings, actions, distances = of_rollouts(problem, rollouts)
     for first in (None,) if start is None else (start, None):

@@ -209,7 +209,7 @@ def evidence_against_none(
 ) -> dict[str, Evidence]:
     """The evidence of rollouts alone against no control: differences of means, of all its rollouts.
 
-    costs: as of `evidence_of_pairs`, and after those of the other laws' fields further ones of no
+    costs: as for `evidence_of_pairs`, and after those of the other laws' fields further ones of no
     control; others: its costs from before; known: what else is known of the change by a law.
     """
     none = np.concatenate([costs[NONE], others])

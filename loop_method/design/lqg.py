@@ -201,7 +201,7 @@ def with_filter(
     sigma: float | None = None,
     settings: IdentificationSettings = DEFAULTS,
 ) -> ModelRows:
-    """A reduced model with the gain of its Kalman filter; parameters as of `noise_of`."""
+    """A reduced model with the gain of its Kalman filter; parameters as for `noise_of`."""
     with one_thread():
         noise = noise_of(rows, trajectories, sigma, settings)
     found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)

@@ -55,7 +55,7 @@ class ExtendedKalman(Observer):
     def start(self) -> Parts:
         """The parts of `Observer`, and of the filter:
 
-        K_e (n_a, n); equation (44 + n_a,), centres (n_a,) and widths (n_a,), as of `SensedModel`;
+        K_e (n_a, n); equation (44 + n_a,), centres (n_a,) and widths (n_a,), as for `SensedModel`;
         integration (4,), its largest field, internal steps, their reach and its fastest growth; mean
         (33,) and factor (33, 33) of initial fields; noise (2,), sigma and kappa.
         """

@@ -127,7 +127,7 @@ def fit_coarse(
 ) -> CoarseModel | FiniteDifferenceModel | None:
     """The equation on as fine a grid as the settings allow, or None where there is none.
 
-    shape: points of each axis; kind, ridge, degree: as of `fit_finite_difference`.
+    shape: points of each axis; kind, ridge, degree: as for `fit_finite_difference`.
     """
     n_z = samples.before.shape[1]
     components = n_z // math.prod(shape)

@@ -75,7 +75,7 @@ def cleaned_states(
     trajectories : sequence of (T, n_z) arrays
         None of them empty.
     noise, components
-        As of `smoothed`.
+        As for `smoothed`.
     line : bool
         Whether the states are fields on one axis.
     """

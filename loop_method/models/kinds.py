@@ -150,7 +150,7 @@ def _several_fields(
 def _neighbours(
     n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
 ) -> list[Kind]:
-    """Products of neighbours, for states that are no fields; arguments: as of `_several_fields`."""
+    """Products of neighbours, for states that are no fields; arguments: as for `_several_fields`."""
     count = components * len(neighbour_features(components))
     if n_z % components or n_z // components < 5 or n_z > settings.dense:
         return []
@@ -186,7 +186,7 @@ def _sparse(n_z: int, settings: FieldModelSettings) -> list[Kind]:
 def _finite_difference(
     components: int, settings: FieldModelSettings, prefix: str, shape: tuple[int, ...] = ()
 ) -> list[Kind]:
-    """Equations whose coefficients depend on the place; shape: as of `kinds_of`."""
+    """Equations whose coefficients depend on the place; shape: as for `kinds_of`."""
     kinds: list[Kind] = []
     for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
         if degree > settings.largest_degree:

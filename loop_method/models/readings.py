@@ -38,7 +38,7 @@ class ReadingsModel:
     Attributes
     ----------
     A, B, C, G, U : arrays
-        As of `InnovationModel`.
+        As for `InnovationModel`.
     innovations : (r, r) array
         Covariance of e.
     """

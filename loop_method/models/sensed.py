@@ -209,7 +209,7 @@ def sensed_model(
     settings : FieldModelSettings
         How they do.
     noise : float
-        As of `SensedModel`.
+        As for `SensedModel`.
     """
     n = grid_points(sensors)
     equation = SensedEquation(shared, n, actuators, settings)

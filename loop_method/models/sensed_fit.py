@@ -285,7 +285,7 @@ def with_coefficients_of_x(
 def foretold(problem: SensedProblem, shared: Array, most: float) -> float:
     """The error of this equation in these rollouts, from their likeliest fields.
 
-    most: as of `SensedProblem.fit`.
+    most: as for `SensedProblem.fit`.
     """
     return problem.fit(shared, problem.interpolated(), known=True, most=most)[0] - problem.noise
 

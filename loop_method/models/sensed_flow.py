@@ -39,7 +39,7 @@ class SensedFlow:
     settings : FieldModelSettings
         How they do.
     clip : float
-        As of `SensedEquation.compiled`.
+        As for `SensedEquation.compiled`.
     varied : sequence of int
         Which unknowns, in their order.
     difference : float

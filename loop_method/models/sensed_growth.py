@@ -64,7 +64,7 @@ def grown(
 ) -> Found:
     """The fit with the least error on adding terms to the first one, which ended after some steps.
 
-    proposed: the first of them, as of `SensedProblem.missing`. The error of the first fit is infinite
+    proposed: the first of them, as for `SensedProblem.missing`. The error of the first fit is infinite
     if it was abandoned.
     """
     best = now = first

@@ -53,7 +53,7 @@ class Smoothing:
     settings: FieldModelSettings = DEFAULTS
 
     def field(self, readings: Array, actions: Array, distance: float) -> tuple[Array, float]:
-        """The initial field (n,) and its error, as of `fit_sensed`; infinite where nothing is finite.
+        """The initial field (n,) and its error, as for `fit_sensed`; infinite where nothing is finite.
 
         readings, actions (T, n_y) and (T, n_a); distance: d, NaN where it is not known.
         """

@@ -18,8 +18,8 @@ resets without a seed draw the seeds of further fields. `gymnasium.make_vec(...,
 M environments in one call of the compiled step, and so does
 `pdeloop.environments.stable_baselines.VecEnvironment` for stable-baselines3.
 
-A process that has not imported this module, as the workers of a `SubprocVecEnv`, makes an environment
-by `pdeloop.environments:pdeloop/Burgers-v0`.
+A process that has not imported this module, such as the workers of a `SubprocVecEnv`, makes an
+environment by `pdeloop.environments:pdeloop/Burgers-v0`.
 """
 
 from __future__ import annotations

@@ -28,14 +28,14 @@ class Environment(gymnasium.Env[Array, Array]):
     Parameters
     ----------
     problem
-        Name or YAML file, as of `pdeloop.problem`; or a `Problem`, a `Plant`, which is then the
+        Name or YAML file, as for `pdeloop.problem`; or a `Problem`, a `Plant`, which is then the
         environment's own, or a `Dynamics`.
     divergence_penalty
         Subtracted from the reward of the step that diverges.
     render_mode : {"rgb_array"}, optional
         How `render` draws the field, which needs Matplotlib (the extra `report`); None: not drawn.
     parameters
-        As of `pdeloop.problem`, those of the plant: n_z, horizon, measurement_noise, action_limit,
+        As for `pdeloop.problem`, those of the plant: n_z, horizon, measurement_noise, action_limit,
         sensors, physical={"viscosity": 1e-3}, ...
 
     Raises
@@ -81,7 +81,7 @@ class Environment(gymnasium.Env[Array, Array]):
         observation : (state_size,) array
             z_0, as it is measured.
         info : dict
-            As of `step`, with a cost of 0.
+            As for `step`, with a cost of 0.
 
         Raises
         ------

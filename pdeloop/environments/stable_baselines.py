@@ -38,7 +38,7 @@ class VecEnvironment(VecEnv):  # type: ignore[misc, unused-ignore]  # untyped wh
     Parameters
     ----------
     problem, num_envs, divergence_penalty, render_mode, parameters
-        As of `pdeloop.environments.VectorEnvironment`.
+        As for `pdeloop.environments.VectorEnvironment`.
 
     Attributes
     ----------
@@ -98,11 +98,11 @@ class VecEnvironment(VecEnv):  # type: ignore[misc, unused-ignore]  # untyped wh
         states : (M, state_size) array
             As they are measured; of an environment that has ended, those of its next episode.
         rewards : (M,) array
-            As of `Environment.step`.
+            As for `Environment.step`.
         dones : (M,) bool array
             Whether an environment diverged or the horizon is reached.
         infos : list of M dict
-            cost, distance and target as of `Environment.step`, and TimeLimit.truncated; at the end of
+            cost, distance and target as for `Environment.step`, and TimeLimit.truncated; at the end of
             an episode its last state as terminal_observation.
         """
         states, rewards, terminated, truncated, info = self.environments.step(self._actions)

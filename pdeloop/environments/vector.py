@@ -32,7 +32,7 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
     Parameters
     ----------
     problem, divergence_penalty, render_mode, parameters
-        As of `Environment`.
+        As for `Environment`.
     num_envs
         M.
     autoreset_mode : {"NextStep", "SameStep", "Disabled"}
@@ -99,12 +99,12 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         observations : (M, state_size) array
             The states z_0, as they are measured.
         info : dict
-            As of `step`, with costs of 0.
+            As for `step`, with costs of 0.
 
         Raises
         ------
         ValueError
-            A list of other than M seeds, no such option, or one that does not fit.
+            There are not M seeds, or an option does not exist or does not fit.
         """
         options = dict(options or {})
         mask = reset_mask(options.pop("reset_mask", None), self.num_envs)
@@ -132,11 +132,11 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         observations : (M, state_size) array
             The states z_{k+1}, as they are measured.
         rewards : (M,) array
-            As of `Environment.step`.
+            As for `Environment.step`.
         terminated, truncated : (M,) bool arrays
             Whether an environment diverged, and whether the horizon is reached.
         info : dict
-            cost, distance (M,) and target (M, state_size) as of `Environment.step`, each with a mask.
+            cost, distance (M,) and target (M, state_size) as for `Environment.step`, each with a mask.
             final_obs and final_info of environments that begin again in the step that ended them.
 
         Raises
