@@ -19,12 +19,12 @@ from pdeloop.finished_run import (
     field_means,
     interval,
     load_run,
-    merged,
     reduction,
 )
 from pdeloop.output import aligned
 from pdeloop.study.description import Study
 from pdeloop.study.training import differences, environment
+from tuner_node.rollouts import EVALUATED
 
 CAVEAT = (
     f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
@@ -49,27 +49,28 @@ def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
             places = [folder / problem / variant / str(seed) for seed in study.seeds]
             runs = [load_run(place) for place in places if (place / "result.json").exists()]
             if runs:
-                own = figures(merged(runs))
+                own = figures(runs)
                 others = {differences(run.result.get("environment", {}), here) for run in runs}
                 own["other_environments"] = sorted(others - {""})
                 found.append({"problem": problem, "variant": variant, **own})
     return found
 
 
-def figures(run: FinishedRun) -> dict[str, Any]:
-    """The figures of a run over its seeds.
+def figures(runs: Sequence[FinishedRun]) -> dict[str, Any]:
+    """The figures of runs of one seed each, whose models may have different orders.
 
     Means are over the seeds without those in which a rollout of the closing evaluation diverged,
     which `diverged` counts; `interval` is the percentile bootstrap over the seeds, and
     `below_lqt_percent` the `pdeloop.finished_run.Reduction`.
     """
-    means = {name: field_means(costs) for name, costs in run.costs.items()}
+    measured = {name: np.concatenate([run.costs[name] for run in runs]) for name in EVALUATED}
+    means = {name: field_means(costs) for name, costs in measured.items()}
     adapted = means["adapted"]
     good = adapted[np.isfinite(adapted)]
-    below = reduction(run.costs["adapted"], run.costs["lqt"])
+    below = reduction(measured["adapted"], measured["lqt"])
     return {
         "seeds": len(adapted),
-        "rollouts": float(np.mean([own["total"] for own in run.rollouts])),
+        "rollouts": float(np.mean([own["total"] for run in runs for own in run.rollouts])),
         "cost_by_seed": [float(cost) if np.isfinite(cost) else None for cost in adapted],
         "none": _mean(means["none"]),
         "lqt": _mean(means["lqt"]),

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from pdeloop.cli import main
+from pdeloop.finished_run import load_run
 from pdeloop.study import Failure, Study, StudyError, rows, run
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
@@ -53,6 +54,18 @@ def test_the_table_is_that_of_the_runs(reference: Path):
     assert min(costs) <= low <= np.mean(costs) <= high <= max(costs)
     assert table[1]["worst"] == max(table[1]["cost_by_seed"])
     assert sum("two-point" in line for line in text(table).splitlines()) == 2
+
+
+def test_the_models_of_a_study_may_have_different_orders(tmp_path: Path):
+    """As with `reduced_order: 0`, which a training of several seeds refuses."""
+    orders, study = (2, 3), Study.of({**CONTENT, "variants": {"own": {}}})
+    for order, (name, values) in zip(orders, study.trainings().items(), strict=True):
+        (tmp_path / name).mkdir(parents=True)
+        for file, content in train_one({**values, "reduced_order": order}).items():
+            (tmp_path / name / file).write_bytes(content)
+        assert len(load_run(tmp_path / name).models[0].A) == order
+    [row] = rows(study, tmp_path)
+    assert row["seeds"] == len(row["cost_by_seed"]) == 2 and row["rollouts"] == 9.0
 
 
 def test_the_result_is_a_function_of_the_parameters_alone():
