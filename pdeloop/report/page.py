@@ -304,7 +304,7 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
 def _figures(problem: ProblemData) -> dict[str, dict[str, Any]]:
     """The row of each adapted controller, as in the table of a study."""
     return {
-        name: {"problem": problem.name, "variant": name, **figures_of(run)}
+        name: {"problem": problem.name, "variant": name, **figures_of([run])}
         for name, run in problem.runs.items()
     }
 

@@ -57,7 +57,7 @@ def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
 
 
 def figures(runs: Sequence[FinishedRun]) -> dict[str, Any]:
-    """The figures of runs of one seed each, whose models may have different orders.
+    """The figures of runs over all their seeds, whose models may have different orders.
 
     Means are over the seeds without those in which a rollout of the closing evaluation diverged,
     which `diverged` counts; `interval` is the percentile bootstrap over the seeds, and
