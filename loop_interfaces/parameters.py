@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from loop_interfaces.grid import Grid
 from loop_interfaces.spec import Spec, check
 
 MAX_SEED = 2**53 - 1
@@ -347,8 +348,14 @@ def flags(group: str | None = None) -> tuple[Spec, ...]:
 
 
 def measured_size(values: Mapping[str, Any]) -> int:
-    """Numbers of a message `state`: those of the state, or of the last readings of sensors."""
-    return int(values["sensors"] * values["sensor_delays"] or values["n_z"])
+    """Numbers of a message `state`: those of the state, or of the last readings of sensors.
+
+    Each sensor measures all components at its point.
+    """
+    if not values["sensors"]:
+        return int(values["n_z"])
+    components = len(Grid.parse(values["grid"]).components) if values["grid"] else 1
+    return int(values["sensors"] * values["sensor_delays"] * components)
 
 
 def noisy(values: Mapping[str, Any]) -> bool:

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pdeloop
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.grid import Grid
+from loop_interfaces.parameters import measured_size
 from loop_interfaces.topics import StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import Equation
@@ -356,6 +358,23 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
     alone = train_here(parameters(seed=1, **options))
     assert same_bits(alone.policies()[0], both.policies()[1])
     assert same_bits(alone.evaluation[0], both.evaluation[1])
+
+
+@pytest.mark.parametrize("named", [{"plant": "fitzhugh-nagumo"}, {"source": "wave"}, {}])
+@pytest.mark.parametrize(("sensors", "delays"), [(0, 1), (10, 1), (5, 2)])
+def test_the_tuner_expects_as_many_readings_with_as_much_noise_as_the_plant_publishes(
+    named: dict[str, Any], sensors: int, delays: int
+) -> None:
+    options: dict[str, Any] = {"sensors": sensors, "sensor_delays": delays, "law": "affine"}
+    values = pdeloop.problem(**named, **options, measurement_noise=0.1).values
+    seeds = np.arange(100)
+    noisy, exact = (
+        build_plant({**values, "measurement_noise": noise}).reset(seeds, seeds).copy()
+        for noise in (0.1, 0.0)
+    )
+    assert measured_size(values) == noisy.shape[1]
+    expected = build_training(values).settings.measurement_noise
+    assert np.std(noisy - exact) == pytest.approx(expected, rel=0.1)
 
 
 def test_an_instrument_is_only_ideal_without_any() -> None:
