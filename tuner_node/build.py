@@ -185,7 +185,8 @@ def remarks_on(values: Mapping[str, Any]) -> list[str]:
 
 def few_sensors(values: Mapping[str, Any]) -> int:
     """The number of sensors; 0 where the whole state is measured, as by one at every point."""
-    return int(values["sensors"]) if values["sensors"] < values["n_z"] else 0
+    newest = measured_size({**values, "sensor_delays": 1})
+    return int(values["sensors"]) if newest < values["n_z"] else 0
 
 
 def kind_used(values: Mapping[str, Any]) -> type[Optimizer]:

@@ -56,10 +56,19 @@ def test_a_training_has_the_bits_of_the_command_line(run, tmp_path: Path) -> Non
         pdeloop.train(str(SMALL), out=tmp_path / "kept")
 
 
-@pytest.mark.parametrize("given", [{}, {"sensors": 8, "law": "observer", "measurement_noise": 0.1}])
-def test_a_law_of_a_run_acts_as_in_its_evaluation(given: dict[str, object]) -> None:
-    problem = pdeloop.problem(SMALL, **given)
+@pytest.mark.parametrize(
+    ("source", "given"),
+    [
+        (SMALL, {}),
+        (SMALL, {"sensors": 8, "law": "observer", "measurement_noise": 0.1}),
+        # Of two components, both of which a sensor measures.
+        ("wave", {"n_z": 32, "horizon": 40, "sensors": 4, "law": "observer", "reduced_order": 4}),
+    ],
+)
+def test_a_law_of_a_run_acts_as_in_its_evaluation(source: str, given: dict[str, object]) -> None:
+    problem = pdeloop.problem(source, **given)
     run = pdeloop.train(problem, **TWO_POINT)
+    assert run.models[0].U.shape == (problem.plant().state_size, len(run.models[0].A))
     plant = problem.plant()
     seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(3)]
     noise = np.array([derive(0, Purpose.EVALUATION_NOISE, i) for i in range(3)])

@@ -1,0 +1,28 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Sensors of a plant of two components, both of which each of them measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_interfaces.parameters import measured_size
+from pde_sim_node.build import build_plant
+from pdeloop.training_run import resolve
+from tuner_node.build import build_training, few_sensors
+
+
+def test_numbers_and_noise_of_a_message_are_those_of_all_components() -> None:
+    given = {"n_z": 32, "sensors": 4, "horizon": 20, "reduced_order": 4, "measurement_noise": 0.1}
+    values = resolve("wave", given)
+    plant = build_plant(values)
+    assert measured_size(values) == plant.state_size == 8
+    rest = np.zeros((4000, plant.n_z))
+    noisy = plant.reset(rest, np.arange(len(rest)))
+    assert noisy.std() == pytest.approx(build_training(values).settings.measurement_noise, rel=0.02)
+
+
+def test_sensors_at_every_point_measure_the_whole_state() -> None:
+    given = {"n_z": 32, "horizon": 20, "reduced_order": 4}
+    assert few_sensors(resolve("wave", {**given, "sensors": 15})) == 15
+    assert few_sensors(resolve("wave", {**given, "sensors": 16})) == 0
