@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from loop_interfaces.problem import read_problem, shipped_problems
@@ -222,3 +223,5 @@ def test_a_plant_that_new_writes_runs_and_passes_its_own_tests(
         len([name for name in found if name.startswith("test_")]) == 2
     )  # the other one is a check
     found["test_a_small_wave_grows_at_its_rate_and_the_error_falls_with_the_grid_and_the_step"]()
+    plant = found["MyRod"]()
+    assert np.allclose(plant.x, plant.grid.axes[0].points), "it is where its grid says"

@@ -158,7 +158,12 @@ export class FieldChart {
       c.restore();
       const target = episode.ofTarget(p);
       if (target.length) {
+        c.save();
+        c.beginPath();
+        c.rect(area.x + w + 6, area.y, STRIP, h);
+        c.clip();
         c.drawImage(paint(rows, 1, [low, high], (r) => target[r]), area.x + w + 6, place[0], STRIP, place[1]);
+        c.restore();
         c.fillStyle = colour("muted");
         c.textAlign = "center";
         c.textBaseline = "top";
