@@ -31,6 +31,8 @@ _GRID = (
 _FIXED = ("n_z", "n_a", "sample_time")
 """Parameters that a user's own plant supplies and a problem cannot change."""
 EXTENTS = "actuator_extents"
+SUPPLIED = (*_FIXED, "grid", "length", "cost", EXTENTS)
+"""Those and the other parameters that such a plant fills in."""
 
 
 def build_equation(values: Mapping[str, Any]) -> Equation:

@@ -16,7 +16,7 @@ from loop_interfaces.parameters import EVALUATION, noisy
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive, evaluation_noise
-from pde_sim_node.build import build_plant
+from pde_sim_node.build import SUPPLIED, build_plant, complete
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
@@ -68,7 +68,11 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
                 "the plant or the cost, such as horizon, state_weight or physical.*"
             )
     values = {**run.values, **changes}
-    plant = build_plant(values, compiled=False)
+    if values["plant"]:  # which supplies the rest itself, from its changed arguments
+        values = {n: v for n, v in values.items() if n in changes or n not in SUPPLIED}
+        plant, values = complete(values, compiled=False)
+    else:
+        plant = build_plant(values, compiled=False)
     size, n_a = len(run.models[0].U), run.models[0].B.shape[1]
     if (plant.state_size, plant.n_a) != (size, n_a):
         raise ParameterError(

@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pdeloop
+from loop_interfaces.spec import ParameterError
+from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.cli import main
-from pdeloop.evaluation import outcome
+from pdeloop.evaluation import changed, outcome
 from tests.support.small import SMALL
 from tuner_node.narration import failed, warnings
 
@@ -147,3 +150,37 @@ def test_policies_that_diverge_are_no_success(run, capsys):
 def test_an_unfinished_run_says_how_to_go_on(run, capsys):
     (run / "result.json").unlink()
     assert "pdeloop train --resume" in refused(capsys, run)
+
+
+class Tracked(pdeloop.Dynamics):
+    """Its argument changes its cost, of a target for each step, and the time of a step."""
+
+    n_z, n_a, horizon = 4, 1, 20
+
+    def __init__(self, goal: float = 0.5, dt: float = 0.1, n_z: int = 4) -> None:
+        self.n_z, self.sample_time = n_z, dt
+        self.target = np.tile(np.linspace(0.0, goal, 21)[:, None], (1, n_z))
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(self.n_z)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        z = 0.9 * np.roll(z, 1)
+        z[0] += a[0]
+        return z
+
+
+def test_a_plant_whose_arguments_change_what_it_supplies_is_evaluated(tmp_path):
+    out = tmp_path / "run"
+    pdeloop.train(plant=Tracked(), rollouts=8, optimizer="two_point", out=out)
+    run = pdeloop.load_run(out)
+    found = changed(run, {"physical.goal": 0.7, "physical.dt": 0.2})
+    assert found.values["sample_time"] == 0.2
+    assert (
+        build_plant(found.values).cost.texts
+        == pdeloop.problem(plant=Tracked(0.7, 0.2)).plant().cost.texts
+    )
+    with pytest.raises(ParameterError, match=r"a state of 4 numbers .* the changed plant has 6"):
+        changed(run, {"physical.n_z": 6})
+    with pytest.raises(ParameterError, match="leave it out"):
+        changed(run, {"sample_time": 0.3})
