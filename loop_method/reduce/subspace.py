@@ -35,7 +35,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
@@ -47,8 +47,12 @@ from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 PASTS = (1, 2, 3, 4, 6, 8)
 """Steps p of the vector ARX that are tried."""
-ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48)
+LONGER = (12, 16)
+"""Those that are tried as well for more than `MANY` states, or where no order is given."""
+ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 """Orders that are tried where none is given."""
+MANY = 48
+"""Waves that do not decay want many states, and a long past to tell them from noise."""
 FOLDS = 4
 """Parts of the trajectories, each held out once."""
 RESOLVED = 1e-10
@@ -121,7 +125,8 @@ def subspace_model(
         if number not in copies
     ]
     with one_thread():
-        pasts = (past,) if past else PASTS
+        few = 0 < order <= MANY
+        pasts = (past,) if past else PASTS if few else PASTS + LONGER
         # The data may not determine as many states as were asked for.
         asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)] or [ORDERS]
         for asked in asked_for:
@@ -159,21 +164,28 @@ def _choose(
 ) -> tuple[int, int, float]:
     """p and n with the least error on parts that were held out, and that error."""
     parts = _parts(known)
-    errors = np.full(len(tried), np.inf)
-    for i, (p, n) in enumerate(tried):
-        total = change = 0.0
-        for fold in range(FOLDS):
-            others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
-            own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
+    totals, changes = np.zeros(len(tried)), np.zeros(len(tried))
+    for fold in range(FOLDS):
+        others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
+        own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
+        made: dict[tuple[int, int], _Predictor] = {}
+        for i, (p, n) in enumerate(tried):
+            if not np.isfinite(totals[i]):
+                continue
+            # More states than there are readings have one predictor in common.
+            size = p, min(n, parts[0][0].shape[1])
             try:
-                model = _fitted(others, p, n, NUMBERED, np.nan, check=False)
+                if size not in made:
+                    made[size] = _predictor(others, *size, NUMBERED)
+                model = _fitted(others, p, n, NUMBERED, np.nan, check=False, predictor=made[size])
             except (linalg.LinAlgError, ValueError):
-                total = np.inf
-                break
+                totals[i] = np.inf
+                continue
             for z, a in own:
                 wrong, moved = _missed(model, z, a)
-                total, change = total + wrong, change + moved
-        errors[i] = np.sqrt(total / change) if change > 0.0 else np.inf
+                totals[i], changes[i] = totals[i] + wrong, changes[i] + moved
+    with np.errstate(invalid="ignore"):
+        errors = np.where(changes > 0.0, np.sqrt(totals / np.maximum(changes, 1e-300)), np.inf)
     if not np.isfinite(errors).any():
         return (*tried[0], np.nan)
     good = [i for i in range(len(tried)) if errors[i] <= tolerance * errors.min()]
@@ -213,20 +225,37 @@ def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
 
 
-def _fitted(
-    known: Sequence[Trajectory],
-    p: int,
-    n: int,
-    channels: Channels,
-    error: float,
-    *,
-    check: bool = True,
-) -> InnovationModel:
-    """The model of given sizes. Call it with one LAPACK thread."""
+@dataclass(frozen=True, eq=False)
+class _Predictor:
+    """The vector ARX of p steps of trajectories, and the states that its past gives.
+
+    U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last ones of each trajectory; last
+    (N,), which are the last of a trajectory; future (N, p r), the next p measurements that the past
+    predicts, and their directions over the data with their singular values.
+    """
+
+    U: Array
+    y: Array
+    inputs: Array
+    last: NDArray[np.bool_]
+    future: Array
+    directions: Array
+    values: Array
+
+    def states(self, n: int) -> Array:
+        """The leading n states, of second moment I; at least r, and no more than are determined."""
+        known = int(np.count_nonzero(self.values > RESOLVED * self.values[0]))
+        kept = max(self.U.shape[1], min(n, known))
+        found: Array = self.future @ (self.directions[:, :kept] / self.values[:kept])
+        return found
+
+
+def _predictor(known: Sequence[Trajectory], p: int, r: int, channels: Channels) -> _Predictor:
+    """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread."""
     after = np.concatenate([z[1:] for z, _ in known])
     values = linalg.svdvals(after)
     floor = max(after.shape) * np.finfo(np.float64).eps * values[0]
-    r = min(n, int(np.count_nonzero(values > floor)))
+    r = min(r, int(np.count_nonzero(values > floor)))
     U, _ = leading_modes(after, max(r, 1), channels)
     regressors, targets, firsts = [], [], []
     for z, a in known:
@@ -240,18 +269,38 @@ def _fitted(
     if not regressors:
         raise ValueError(f"no trajectory has {p} steps")
     past, y = np.concatenate(regressors), np.concatenate(targets)
-    if len(past) <= n:
-        raise ValueError(f"{len(past)} samples do not determine {n} states")
     unit = np.sqrt(np.mean(past**2, axis=0))
     unit[unit == 0.0] = 1.0
     markov = _ridge(past / unit, y).T / unit
-    states, kept = _states(past, markov, p, r, n)
-    C, e = _regressed(states, y)
-    ends = np.cumsum([len(rows) for rows in regressors])
     last = np.zeros(len(past), dtype=bool)
-    last[ends - 1] = True
+    last[np.cumsum([len(rows) for rows in regressors]) - 1] = True
+    return _Predictor(U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
+
+
+def _fitted(
+    known: Sequence[Trajectory],
+    p: int,
+    n: int,
+    channels: Channels,
+    error: float,
+    *,
+    check: bool = True,
+    predictor: _Predictor | None = None,
+) -> InnovationModel:
+    """The model of given sizes. Call it with one LAPACK thread.
+
+    predictor: that of these trajectories, p and r, if it is known.
+    """
+    if predictor is None:
+        predictor = _predictor(known, p, n, channels)
+    y, last = predictor.y, predictor.last
+    if len(y) <= n:
+        raise ValueError(f"{len(y)} samples do not determine {n} states")
+    states, r = predictor.states(n), y.shape[1]
+    kept = states.shape[1]
+    C, e = _regressed(states, y)
     before, next_ = states[~last], states[1:][~last[:-1]]
-    inputs = np.concatenate(firsts)
+    inputs = predictor.inputs
     if check:
         examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
     joint, w = _regressed(np.hstack([before, inputs]), next_)
@@ -271,7 +320,7 @@ def _fitted(
         ) from failed
     innovations = C @ P @ C.T + V
     G = linalg.solve(innovations, (A @ P @ C.T + S).T, assume_a="pos").T
-    return InnovationModel(A, B, C, G, U, innovations, p, error)
+    return InnovationModel(A, B, C, G, predictor.U, innovations, p, error)
 
 
 def _ridge(X: Array, y: Array) -> Array:
@@ -292,16 +341,14 @@ def _ridge(X: Array, y: Array) -> Array:
     return found
 
 
-def _states(past: Array, markov: Array, p: int, r: int, n: int) -> tuple[Array, int]:
-    """The states (N, n) that the past gives, of second moment I, and how many there are."""
+def _future(past: Array, markov: Array, p: int, r: int) -> tuple[Array, Array, Array]:
+    """The next p measurements that the past predicts (N, p r), their directions and singular values."""
     block = past.shape[1] // p
     rows = np.zeros((p * r, past.shape[1]))
     for j in range(p):
         rows[j * r : (j + 1) * r, j * block :] = markov[:, : (p - j) * block]
     left, s, _ = linalg.svd(rows @ past.T / np.sqrt(len(past)), full_matrices=False)
-    kept = max(r, min(n, int(np.count_nonzero(s > RESOLVED * s[0]))))
-    states: Array = past @ rows.T @ (left[:, :kept] / s[:kept])
-    return states, kept
+    return past @ rows.T, left, s
 
 
 def _regressed(X: Array, y: Array) -> tuple[Array, Array]:
