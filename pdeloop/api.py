@@ -39,6 +39,7 @@ from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
+from pdeloop.problem_values import problem_values
 from pdeloop.training_run import begin, carry_out, continuing
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
@@ -181,7 +182,7 @@ def problem(
     """
     name = "burgers" if source is None and plant is None else str(source or "")
     given = named(name, {**parameters, "physical": physical, "plant": plant, "cost": cost})
-    _, values = complete(training_parameters(name, given), compiled=False)
+    _, values = problem_values(name, given)
     return Problem(name, given, values)
 
 

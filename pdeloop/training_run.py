@@ -24,7 +24,7 @@ from loop_interfaces.frames import MAX_VALUES
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameters import model_order
 from loop_interfaces.spec import ParameterError
-from pde_sim_node.build import build_plant, complete
+from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
@@ -33,13 +33,14 @@ from pdeloop.interruption import Interruption, interruptible
 from pdeloop.live import announced
 from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
+from pdeloop.problem_values import problem_values
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from pdeloop.unused import refuse_unused
 from spectral_solver import polynomial_step
 from tuner_node import narration
 from tuner_node.build import build_training, remarks_on
 from tuner_node.errors import NoModelError
-from tuner_node.optimizer_parameters import kind_of, training_parameters
+from tuner_node.optimizer_parameters import kind_of
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
 from tuner_node.training import Training
@@ -60,7 +61,7 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
     Nothing is compiled.
     """
-    plant, values = complete(training_parameters(problem, options), compiled=False)
+    plant, values = problem_values(problem, options)
     kind = kind_of(values)
     if kind.needs_trajectories and not plant.quadratic:
         raise ParameterError(

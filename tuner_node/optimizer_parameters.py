@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from loop_interfaces.parameters import LAW, OPTIMIZER, POINTS
@@ -59,13 +60,15 @@ def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]
 
     options: by dotted names, or nested, as optimizer_settings={"fields": 5}.
     """
-    return with_settings(load_parameters(name, flatten(options), _preferred))
+    own = flatten(options)
+    return with_settings(load_parameters(name, own, partial(_preferred, options=own)))
 
 
-def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
+def _preferred(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """The given parameters with the defaults that the optimiser prefers, and of few sensors the law.
 
-    The optimiser's name may be written as the command line writes words: gauss-newton.
+    A model of the whole field that a problem's file asks for, and the options do not, gives way to one
+    of few readings. The optimiser's name may be written as the command line writes words: gauss-newton.
     """
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")
@@ -80,6 +83,8 @@ def _preferred(given: Mapping[str, Any]) -> dict[str, Any]:
     readings = law_of({**preferences, **given}).from_readings
     if few and readings:
         preferences["identification"] = readings
+        if given.get("identification") == "field" and "identification" not in options:
+            given = {**given, "identification": readings}
     return {**preferences, **given, "optimizer": name}
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
 from loop_method.adapt.registry import offered, optimizer_kind
 from loop_method.adapt.settings import GaussNewtonSettings
 from loop_method.settings import Settings, setting
+from pdeloop.problem_values import problem_values
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import settings_of, training_parameters
@@ -131,6 +133,31 @@ def test_an_observer_of_few_sensors_is_identified_from_readings() -> None:
         training_parameters("burgers", {**few, "identification": "dmdc"})["identification"]
         == "dmdc"
     )
+
+
+def test_a_model_of_few_readings_is_not_that_of_the_file_for_the_whole_state() -> None:
+    few = {"sensors": 16}
+    wave = problem_values("wave", few)[1]
+    assert (wave["identification"], wave["reduced_order"]) == ("subspace", 0)
+    for given, order in (
+        ({"sensors": 0}, 30),
+        ({**few, "reduced_order": 12}, 12),
+        ({**few, "law": "affine"}, 30),
+        ({**few, "identification": "field"}, 30),
+    ):
+        values = problem_values("wave", given)[1]
+        assert values["reduced_order"] == order
+        assert values["identification"] == ("subspace" if order == 12 else "field")
+    # Where a model of the field between the sensors may follow, as of few sensors on a circle.
+    for sensors, order in ((16, 8), (48, 0)):
+        assert problem_values("burgers", {"sensors": sensors})[1]["reduced_order"] == order
+
+
+def test_a_file_that_identifies_from_readings_names_their_order(tmp_path: Path) -> None:
+    shipped = shipped_problems()["wave"].read_text()
+    own = tmp_path / "own.yaml"
+    own.write_text(shipped.replace("identification: field", "identification: subspace"))
+    assert problem_values(str(own), {"sensors": 16})[1]["reduced_order"] == 30
 
 
 def test_settings_are_parameters_of_the_training() -> None:

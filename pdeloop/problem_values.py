@@ -1,0 +1,45 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The parameters of a problem with those of its plant, and the order of a model of few readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from loop_interfaces.problem import find_problem, read_problem
+from loop_interfaces.spec import flatten
+from loop_method.method_settings import field_model_settings
+from pde_sim_node.build import complete
+from pde_sim_node.plant import Plant
+from tuner_node.build import few_sensors
+from tuner_node.optimizer_parameters import training_parameters
+
+
+def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[str, Any]]:
+    """The plant of a problem and its resolved parameters; nothing is compiled.
+
+    ValueError if the plant cannot be built from them.
+    """
+    given = flatten(options)
+    plant, values = complete(training_parameters(name, given), compiled=False)
+    if _is_order_sought(name, given, plant, values):
+        values["reduced_order"] = 0
+    return plant, values
+
+
+def _is_order_sought(
+    name: str, given: Mapping[str, Any], plant: Plant, values: Mapping[str, Any]
+) -> bool:
+    """Whether held-out readings choose the order of a model of the readings.
+
+    The order in a problem's file is that of a model of the whole state, unless the file identifies from
+    readings. Where a model of the field between the sensors may follow, it suffices for the first law.
+    """
+    if values["identification"] != "subspace" or "reduced_order" in given:
+        return False
+    file = read_problem(find_problem(name)) if name else {}
+    if not few_sensors(values) or file.get("identification") == "subspace":
+        return False
+    grid, most = plant.grid, field_model_settings(values).sensed_most
+    between = grid.is_circle and len(grid.components) == 1
+    return not (between and values["sensors"] <= most and values["sensor_delays"] == 1)
