@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.problem import find_problem, read_problem
+from loop_interfaces.loop_parameters import read_problem
+from loop_interfaces.problem import find_problem
 from loop_interfaces.spec import flatten
 from loop_method.method_settings import field_model_settings
 from pde_sim_node.build import complete

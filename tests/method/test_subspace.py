@@ -98,6 +98,25 @@ def test_the_order_and_the_past_are_those_of_the_least_error_on_held_out_measure
     assert len(few.A) == N and few.U.shape == (1, 1) and few.past >= N
 
 
+def test_waves_that_hardly_decay_get_as_many_states_and_a_long_past() -> None:
+    """Thirty oscillators, which no model of 48 states predicts."""
+    rng, angles = np.random.default_rng(3), np.linspace(0.1, 3.0, 30)
+    turns = [[[np.cos(t), -np.sin(t)], [np.sin(t), np.cos(t)]] for t in angles]
+    own = 0.999 * linalg.block_diag(*turns)
+    moved, seen = rng.standard_normal((60, 3)), rng.standard_normal((4, 60)) / 8
+    data = []
+    for _ in range(2):
+        x, a, y = rng.standard_normal(60), rng.standard_normal((600, 3)), []
+        for k in range(601):
+            y.append(seen @ x + 0.02 * rng.standard_normal(4))
+            x = own @ x + moved @ a[min(k, 599)]
+        data.append((np.array(y), a))
+    model = subspace_model(data)
+    assert len(model.A) == 64 and model.past == 16
+    found = np.abs(linalg.eigvals(model.A)).max()
+    assert found == pytest.approx(0.999, abs=2e-3)
+
+
 def test_data_that_do_not_determine_it_are_refused_by_name() -> None:
     z, a = measured()[0]
     with pytest.raises(
