@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller_node.law_batch import LawBatch
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.parameters import noisy
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
 from loop_method.laws.registry import law_kind
+from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
@@ -182,6 +185,18 @@ class FinishedRun:
             return batch.actions(k, states)
 
         return act
+
+    @property
+    def evaluation(self) -> tuple[list[int], NDArray[np.int64] | None]:
+        """Seeds of the initial fields of the closing evaluation, and of the noise if there is any.
+
+        In the order of `costs`: `pdeloop.rollout(plant, law, *run.evaluation)` runs a controller of
+        your own from the same fields.
+        """
+        seed, count = int(self.values["evaluation_seed"]), self.costs["none"].shape[1]
+        fields = [derive(seed, Purpose.EVALUATION_FIELD, i) for i in range(count)]
+        noise = np.array(evaluation_noise(seed, count)) if noisy(self.values) else None
+        return fields, noise
 
     @property
     def before(self) -> list[int]:

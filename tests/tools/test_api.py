@@ -70,12 +70,10 @@ def test_a_law_of_a_run_acts_as_in_its_evaluation(source: str, given: dict[str, 
     run = pdeloop.train(problem, **TWO_POINT)
     assert run.models[0].U.shape == (problem.plant().state_size, len(run.models[0].A))
     plant = problem.plant()
-    seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(3)]
-    noise = np.array([derive(0, Purpose.EVALUATION_NOISE, i) for i in range(3)])
     for which, costs in ((["adapted"], "adapted"), (["lqt", 5], "lqt")):
         law = run.law(*which)
         for _ in range(2):  # its memory begins anew
-            episode = pdeloop.rollout(plant, law, seeds, noise)
+            episode = pdeloop.rollout(plant, law, *run.evaluation)
             assert same_bits(episode.costs.mean, run.costs[costs][0])
     for which, seed, told in (("none", None, "one of adapted, lqt"), ("lqt", 6, "no seed 6")):
         with pytest.raises(ValueError, match=told):
