@@ -77,7 +77,7 @@ class LocalPair:
             models = []
         return BatchResult(
             np.concatenate([part.costs for part in parts]),
-            np.concatenate(models) if models else None,
+            batch.joined(models),
             self.fingerprint,
             [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
             self.plant.target,

@@ -58,6 +58,8 @@ class Batch:
     trajectories: bool = False
     together: int = 1
     """Rows one after the other that one episode has to have, if it may have so many."""
+    parted: int = 1
+    """The same of rows that may not: the model of the first one is that of all."""
 
     @property
     def exploratory(self) -> bool:
@@ -65,7 +67,17 @@ class Batch:
 
     def within(self, max_batch: int) -> Batch:
         """The batch, whose rows part where a plant has fewer environments: a machine has one."""
-        return self if self.together <= max_batch else replace(self, together=1)
+        if self.together <= max_batch:
+            return self
+        return replace(self, together=1, parted=self.together)
+
+    def joined(self, models: Sequence[Array]) -> Array | None:
+        """The models of all rows from those of its episodes; None if there are none.
+
+        Rows that were parted may have models of different orders.
+        """
+        rows = [model for part in models for model in part]
+        return np.stack([rows[i - i % self.parted] for i in range(len(rows))]) if rows else None
 
 
 @dataclass(frozen=True)

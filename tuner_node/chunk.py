@@ -64,7 +64,7 @@ def gathered(
     seen = [t for chunk in chunks for t in chunk.trajectories or ()]
     return BatchResult(
         np.concatenate([chunk.costs for chunk in chunks if chunk.costs is not None]),
-        np.concatenate(models) if models else None,
+        batch.joined(models),
         plant,
         seen if batch.trajectories else None,
         target,

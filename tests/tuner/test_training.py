@@ -17,6 +17,7 @@ from tests.support.small import FEW_FITS, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
+from tuner_node.chunk import Chunk, gathered
 from tuner_node.errors import ContradictionError
 from tuner_node.narration import Narration
 
@@ -365,6 +366,25 @@ def test_explorations_of_one_plant_part_where_it_has_one_environment():
     assert same_bits(result.models[:1], first.models)
     training.finish(result)
     assert same_bits(training.models, first.models) and len(training.further[0]) == 1
+
+
+def test_explorations_that_part_may_suggest_different_orders():
+    values = parameters(optimizer="model_based", rollouts=10, reduced_order=0, seed=1)
+    training = build_training(values)
+    batch = training.next_batch()
+    own = [LocalPair(values).run(Batch(row[None], None, True)).models for row in batch.rows]
+    assert own[0].shape != own[1].shape
+    result = LocalPair(values).run(batch, max_batch=1)
+    training.finish(result)
+    assert same_bits(training.models, own[0]) and len(result.models) == 2
+    # Over topics the chunks are joined likewise, also those of several seeds.
+    parted = replace(batch, rows=np.tile(batch.rows, (2, 1))).within(1)
+    same = [*own, own[0], own[1]]
+    chunks = [
+        Chunk(slice(i, i + 1), costs=result.costs[:1], models=models, trajectories=[])
+        for i, models in enumerate(same)
+    ]
+    assert same_bits(gathered(chunks, parted, 1, None).models, np.concatenate(4 * [own[0]]))
 
 
 def test_model_based_continues_with_the_same_bits_from_any_batch():
