@@ -18,6 +18,7 @@ from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import SUPPLIED, build_plant, complete
 from pde_sim_node.plant import DIVERGED_COST
+from pde_sim_node.plants.dynamics_plant import SETTABLE
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
 from pdeloop.output import aligned
@@ -69,7 +70,10 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
             )
     values = {**run.values, **changes}
     if values["plant"]:  # which supplies the rest itself, from its changed arguments
-        values = {n: v for n, v in values.items() if n in changes or n not in SUPPLIED}
+        own = {n: v for n, v in run.values.items() if n not in (*SUPPLIED, *SETTABLE)}
+        before, _ = complete(own, compiled=False)
+        supplied = {n for n in SETTABLE if run.values[n] == getattr(before, n)}.union(SUPPLIED)
+        values = {n: v for n, v in values.items() if n in changes or n not in supplied}
         plant, values = complete(values, compiled=False)
     else:
         plant = build_plant(values, compiled=False)

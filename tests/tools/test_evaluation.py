@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -157,8 +158,10 @@ class Tracked(pdeloop.Dynamics):
 
     n_z, n_a, horizon = 4, 1, 20
 
-    def __init__(self, goal: float = 0.5, dt: float = 0.1, n_z: int = 4) -> None:
-        self.n_z, self.sample_time = n_z, dt
+    def __init__(
+        self, goal: float = 0.5, dt: float = 0.1, n_z: int = 4, r: float = 1.0, bound: float = 1e6
+    ) -> None:
+        self.n_z, self.sample_time, self.action_weight, self.divergence_bound = n_z, dt, r, bound
         self.target = np.tile(np.linspace(0.0, goal, 21)[:, None], (1, n_z))
 
     def initial_state(self, rng: np.random.Generator) -> np.ndarray:
@@ -180,6 +183,14 @@ def test_a_plant_whose_arguments_change_what_it_supplies_is_evaluated(tmp_path):
         build_plant(found.values).cost.texts
         == pdeloop.problem(plant=Tracked(0.7, 0.2)).plant().cost.texts
     )
+    found = changed(run, {"physical.r": 3.0, "physical.bound": 50.0})
+    assert build_plant(found.values).action_weight == found.values["action_weight"] == 3.0
+    assert found.values["divergence_bound"] == 50.0
+    # What was given in its place is kept, and so is what changes.
+    own = replace(run, values={**run.values, "divergence_bound": 1e5})
+    assert changed(own, {"physical.bound": 50.0}).values["divergence_bound"] == 1e5
+    given = {"physical.bound": 50.0, "divergence_bound": 60.0}
+    assert changed(run, given).values["divergence_bound"] == 60.0
     with pytest.raises(ParameterError, match=r"a state of 4 numbers .* the changed plant has 6"):
         changed(run, {"physical.n_z": 6})
     with pytest.raises(ParameterError, match="leave it out"):
