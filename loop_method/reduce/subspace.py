@@ -168,16 +168,16 @@ def _choose(
     for fold in range(FOLDS):
         others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
         own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
-        made: dict[tuple[int, int], _Predictor] = {}
+        made, predictor = (0, 0), None
         for i, (p, n) in enumerate(tried):
             if not np.isfinite(totals[i]):
                 continue
-            # More states than there are readings have one predictor in common.
+            # More states than there are readings have one predictor in common, one after the other.
             size = p, min(n, parts[0][0].shape[1])
             try:
-                if size not in made:
-                    made[size] = _predictor(others, *size, NUMBERED)
-                model = _fitted(others, p, n, NUMBERED, np.nan, check=False, predictor=made[size])
+                if size != made or predictor is None:
+                    made, predictor = size, _predictor(others, *size, NUMBERED)
+                model = _fitted(others, p, n, NUMBERED, np.nan, check=False, predictor=predictor)
             except (linalg.LinAlgError, ValueError):
                 totals[i] = np.inf
                 continue
