@@ -173,11 +173,7 @@ class FinishedRun:
         """
         theta, m = self.theta(which, seed), self.index(seed)
         law, model = self.laws[m], self.models[m]
-        try:
-            target = build_plant(self.values, compiled=False).target
-        except ValueError:  # a plant of another program: what U shows of its target
-            target = np.linalg.pinv(model.U.T) @ model.s_r
-        batch = LawBatch([law], target, float(self.values["action_limit"]))
+        batch = LawBatch([law], self._target(model), float(self.values["action_limit"]))
 
         def act(k: int, states: Array) -> Array:
             if k == 0:
@@ -185,6 +181,19 @@ class FinishedRun:
             return batch.actions(k, states)
 
         return act
+
+    def _target(self, model: ModelRows) -> Array:
+        """z_r of the run's plant; of one that is not the built-in one, what U shows of it."""
+        shown: Array = np.linalg.pinv(model.U.T) @ model.s_r
+        try:
+            plant = build_plant(self.values, compiled=False)
+        except ValueError:
+            return shown
+        own = np.asarray(plant.target)
+        if self.result.get("plant") == plant.definition.fingerprint:
+            return own
+        same = own.shape == shown.shape and np.allclose(model.U.T @ own, model.s_r)
+        return own if same else shown
 
     @property
     def evaluation(self) -> tuple[list[int], NDArray[np.int64] | None]:

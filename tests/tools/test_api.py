@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,13 @@ def test_a_law_of_a_run_acts_as_in_its_evaluation(source: str, given: dict[str, 
     for which, seed, told in (("none", None, "one of adapted, lqt"), ("lqt", 6, "no seed 6")):
         with pytest.raises(ValueError, match=told):
             run.law(which, seed)
+    # A machine that was trained with the parameters of a problem may have another target.
+    model = replace(run.models[0], s_r=run.models[0].s_r + 1.0)
+    machine = replace(run, result={**run.result, "plant": 7}, models=[model])
+    z = np.ones((1, len(model.U)))
+    a = model.K_a @ model.U.T @ z[0] + model.K_b @ model.s_r
+    if run.values["law"] == "affine":
+        np.testing.assert_allclose(machine.law("lqt")(0, z)[0], a, rtol=1e-9)
 
 
 def test_its_parts_make_what_the_training_made(run, small) -> None:
