@@ -174,9 +174,12 @@ class FinishedRun:
         theta, m = self.theta(which, seed), self.index(seed)
         law, model = self.laws[m], self.models[m]
         batch = LawBatch([law], self._target(model), float(self.values["action_limit"]))
+        plants = 0
 
         def act(k: int, states: Array) -> Array:
-            if k == 0:
+            nonlocal plants
+            if k == 0 or (len(states) != plants and not batch.remembers):
+                plants = len(states)
                 batch.set(np.repeat(theta[None], len(states), axis=0))
             return batch.actions(k, states)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pdeloop
+from controller_node.law_batch import MemoryUnknownError
 from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
 from pdeloop.interruption import Interruption
@@ -79,6 +80,13 @@ def test_a_law_of_a_run_acts_as_in_its_evaluation(source: str, given: dict[str, 
     for which, seed, told in (("none", None, "one of adapted, lqt"), ("lqt", 6, "no seed 6")):
         with pytest.raises(ValueError, match=told):
             run.law(which, seed)
+    begun, z = run.law("lqt"), np.ones((2, len(run.models[0].U)))
+    if run.values["law"] == "affine":  # which needs no step before
+        assert same_bits(run.law("lqt")(3, z), begun(0, z))
+        assert same_bits(begun(4, z[:1]), begun(0, z)[:1])
+    else:
+        with pytest.raises(MemoryUnknownError, match="before step 3 are unknown"):
+            begun(3, z)
     # A machine that was trained with the parameters of a problem may have another target.
     model = replace(run.models[0], s_r=run.models[0].s_r + 1.0)
     machine = replace(run, result={**run.result, "plant": 7}, models=[model])
