@@ -55,6 +55,7 @@ from loop_interfaces.parameters import (
 )
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
+from loop_method.laws.registry import OWN_LAWS
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
@@ -384,6 +385,10 @@ def timestamp() -> str:
 
 def model_of(rows: NDArray[np.float64], values: Mapping[str, Any]) -> model_rows.ModelRows:
     """The model in rows of a run's policy.npz. ValueError where there is no room for it."""
-    n_a = values["n_a"]
-    filtered = model_rows.has_filter(rows, n_a, measured_size(values))
+    n_a, n_z = values["n_a"], measured_size(values)
+    filtered = model_rows.has_filter(rows, n_a, n_z)
+    # A tuner that was not told the components of the state counts one; then the law shows it.
+    law = OWN_LAWS.shipped.get(values["law"])
+    if law and not filtered and len(rows) != n_z + rows.shape[1] + 3 * n_a + 1:
+        filtered = law.filtered
     return model_rows.unpack(rows, n_a, filtered)
