@@ -29,12 +29,13 @@ install = { $(UV) pip install --python $(BIN)/python --require-hashes -r require
 		|| { echo "pdeloop needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
 	@test -d .venv || echo "setting up .venv, once: Python packages and ROS 2"
 	@test -d .venv || $(PYTHON) -m venv .venv
-	@$(PIP) install --quiet --no-compile --require-hashes -r requirements/uv.txt
+	@$(PIP) install --quiet --no-compile --require-hashes -r requirements/uv.txt || echo "there is no uv" >&2
 	@touch $@
 
 .venv/runs: .venv/uv pyproject.toml requirements/run.txt
 	@$(call install,run)
-	@$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
+	@own="--quiet --no-deps --no-build-isolation -e ."; \
+		$(UV) pip install --python $(BIN)/python $$own 2>/dev/null || $(PIP) install $$own
 	@touch $@
 
 .venv/ready: .venv/runs requirements/test.txt

@@ -36,7 +36,7 @@ def _is_order_sought(
     The order in a problem's file is that of a model of the whole state, unless the file identifies from
     readings. Where a model of the field between the sensors may follow, it suffices for the first law.
     """
-    if values["identification"] != "subspace" or "reduced_order" in given:
+    if values["identification"] != "subspace" or values["model"] or "reduced_order" in given:
         return False
     file = read_problem(find_problem(name)) if name else {}
     if not few_sensors(values) or file.get("identification") == "subspace":

@@ -208,7 +208,7 @@ def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
 def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     """Sums of squares of the filter's one-step errors, and of the changes in a step.
 
-    The first steps, p at most, are the filter's to find the state.
+    The first steps, eight at most, are the filter's to find the state.
     """
     begin = min(max(PASTS), len(a) // 2)
     y = z @ model.U
