@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from loop_interfaces.grid import Grid
 from loop_interfaces.spec import Spec, check
 
 MAX_SEED = 2**53 - 1
@@ -354,6 +353,9 @@ def measured_size(values: Mapping[str, Any]) -> int:
     """
     if not values["sensors"]:
         return int(values["n_z"])
+    # Not at the top: the help of a command waits for no NumPy.
+    from loop_interfaces.grid import Grid
+
     components = len(Grid.parse(values["grid"]).components) if values["grid"] else 1
     return int(values["sensors"] * values["sensor_delays"] * components)
 
