@@ -48,11 +48,13 @@ from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 PASTS = (1, 2, 3, 4, 6, 8)
 """Steps p of the vector ARX that are tried."""
 LONGER = (12, 16)
-"""Those that are tried as well for more than `MANY` states, or where no order is given."""
+"""Those that are tried as well for more than `MANY` states, or where no order is given.
+
+Waves that hardly decay need many states, and a long past to tell them from noise."""
 ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 """Orders that are tried where none is given."""
 MANY = 48
-"""Waves that do not decay want many states, and a long past to tell them from noise."""
+"""The order above which `LONGER` pasts are tried."""
 FOLDS = 4
 """Parts of the trajectories, each held out once."""
 RESOLVED = 1e-10
@@ -184,8 +186,8 @@ def _choose(
             for z, a in own:
                 wrong, moved = _missed(model, z, a)
                 totals[i], changes[i] = totals[i] + wrong, changes[i] + moved
-    with np.errstate(invalid="ignore"):
-        errors = np.where(changes > 0.0, np.sqrt(totals / np.maximum(changes, 1e-300)), np.inf)
+    ratios = np.divide(totals, changes, out=np.full(len(tried), np.inf), where=changes > 0.0)
+    errors = np.sqrt(ratios)
     if not np.isfinite(errors).any():
         return (*tried[0], np.nan)
     good = [i for i in range(len(tried)) if errors[i] <= tolerance * errors.min()]
