@@ -254,24 +254,10 @@ class RunFolder:
             raise RunFolderError(f"{self.path}/parameters.yaml cannot be used: {error}") from error
 
     def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-        """RunFolderError showing every difference that would change the results.
-
-        A parameter that a run of an older version does not know has its default there: a new one's is
-        always what was done before.
-        """
-        defaults = {spec.name: spec.default for spec in table()}
-        known = as_recorded(known)
-        there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
-        changes = [
-            f"{shown(name)[1:-1]}: {shown(there[name])} there, {shown(now.get(name))} now"
-            for name in sorted(set(there) - set(TRANSIENT))
-            if there[name] != now.get(name)
-        ]
-        if changes:
-            more = f"; and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
+        """RunFolderError showing every difference that would change the results."""
+        if changes := parameter_changes(known, now):
             raise RunFolderError(
-                f"the run in {self.path} has other parameters "
-                f"({'; '.join(changes[:SHOWN])}{more}); "
+                f"the run in {self.path} has other parameters ({changes}); "
                 "continue it with its own, or start a new run in another folder"
             )
 
@@ -376,6 +362,24 @@ def _contradicted(known: Mapping[str, Any]) -> str:
         "it cannot be continued, because it used results that were contradicted later "
         f"({known['contradiction']})"
     )
+
+
+def parameter_changes(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """The parameters of two trainings that differ and change the results, in words; empty if none.
+
+    A parameter that a run of an older version does not know has its default there: a new one's is
+    always what was done before.
+    """
+    defaults = {spec.name: spec.default for spec in table()}
+    known = as_recorded(known)
+    there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
+    changes = [
+        f"{shown(name)[1:-1]}: {shown(there[name])} there, {shown(now.get(name))} now"
+        for name in sorted(set(there) - set(TRANSIENT))
+        if there[name] != now.get(name)
+    ]
+    more = f"; and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
+    return "; ".join(changes[:SHOWN]) + more
 
 
 def timestamp() -> str:

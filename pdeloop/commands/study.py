@@ -74,6 +74,11 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
         help="also accept results of workers with other versions or another processor, which may "
         "differ in the last bits",
     )
+    add(
+        "--again",
+        action="store_true",
+        help="train anew what was made with other parameters or another plant than the study has now",
+    )
     add_json(parser, "print the table as JSON; progress goes to stderr")
 
 
@@ -119,6 +124,7 @@ def carry_out(
                 folder,
                 executor,
                 any_environment=options.any_environment,
+                again=options.again,
                 tell=progress.tell,
             )
     finally:

@@ -27,10 +27,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from loop_interfaces.files import make_folder, read_json, write_atomically
+from pde_sim_node.build import fingerprint
 from pdeloop.study.description import Study, StudyError
 from pdeloop.study.executors import no_worker
 from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
 from pdeloop.training_run import load_compiled
+from tuner_node.run_folder import RunFolder, parameter_changes
 
 STUDY_FILE = "study.json"
 ATTEMPTS = 3
@@ -84,6 +86,7 @@ def run(
     *,
     tasks: Mapping[str, Task] = _NO_TASKS,
     any_environment: bool = False,
+    again: bool = False,
     tell: Progress = lambda done, total, status: None,
 ) -> list[Failure]:
     """Train what is not finished yet.
@@ -103,6 +106,9 @@ def run(
     any_environment : bool
         Take results of workers with other versions or another processor, which may differ in the
         last bits; each result.json says which.
+    again : bool
+        Train anew where a finished training was made with other parameters or another plant than the
+        study has now, which is refused otherwise.
     tell : callable
         Called with the number of trainings that are done, that of all, and what was done last.
 
@@ -114,12 +120,19 @@ def run(
     Raises
     ------
     StudyError
-        The executor broke `ATTEMPTS` times, a worker has another environment, or the folder cannot
-        be written.
+        The executor broke `ATTEMPTS` times, a worker has another environment, a finished training
+        was made with something else than the study has now, or the folder cannot be written.
     """
     trainings = study.trainings()  # refuses before there is a folder
     expected = None if any_environment else environment()
     finished = {name for name in trainings if (folder / name / "result.json").exists()}
+    known = {n: v for n, v in trainings.items() if n in finished and n.split("/")[1] not in tasks}
+    if other := made_otherwise(folder, known):
+        if not again:
+            raise StudyError(_refusal(folder, other))
+        finished -= set(other)
+        for name in other:
+            (folder / name / "result.json").unlink()
     if expected is not None:
         _check_finished(folder, finished, expected)
     train = partial(train_one, curves=study.curves)
@@ -192,6 +205,35 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
             write_atomically(folder / name, content)
     except OSError as error:
         raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def made_otherwise(folder: Path, trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """What finished trainings in `folder` were made with, where that is not what is asked for.
+
+    trainings: the resolved parameters that each is asked to have. Returns the differences in words.
+    """
+    plants: dict[str, int] = {}
+    found = {}
+    for name, values in trainings.items():
+        whose = name.rpartition("/")[0]
+        if whose not in plants:  # one for all seeds
+            plants[whose] = fingerprint(values)
+        run = RunFolder(folder / name)
+        changes = parameter_changes(run.parameters(), values)
+        if not changes and run.result().get("plant") != plants[whose]:
+            changes = "another plant: its code or its data have changed"
+        if changes:
+            found[name] = changes
+    return found
+
+
+def _refusal(folder: Path, other: Mapping[str, str]) -> str:
+    name, changes = next(iter(other.items()))
+    more = f", and {len(other) - 1} more trainings differ" if len(other) > 1 else ""
+    return (
+        f"{folder / name} was not made with what the study has now ({changes}){more}; choose another "
+        "folder, or train anew what differs with --again"
+    )
 
 
 def _check_finished(folder: Path, names: set[str], expected: Mapping[str, str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -291,3 +292,83 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     assert "Traceback" not in told, told
     assert not list(out.rglob("result.json"))
     assert not [*temporary.iterdir()]
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_a_continued_study_never_mixes_two_problems(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out, file = tmp_path / "out", tmp_path / "small.yaml"
+    file.write_text(SMALL.read_text())
+    study = Study.of({**CONTENT, "problems": [str(file)]})
+
+    def stop_after_one(done: int, total: int, status: str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(study, out, here, tell=stop_after_one)
+    before = contents(out)
+    file.write_text(SMALL.read_text() + "    reduced_order: 3\n")
+    assert main(["study", "--out", str(out)]) == 1
+    told = capsys.readouterr().err
+    assert "reduced_order: 4 there, 3 now" in told and "--again" in told and len(told) < 500
+    assert contents(out) == before
+    assert main(["study", "--out", str(out), "--again", "--processes", "1"]) == 0
+    capsys.readouterr()
+    assert {row["seeds"] for row in rows(study, out)} == {2}
+    assert all("reduced_order: 3" in path.read_text() for path in out.rglob("parameters.yaml"))
+
+
+def test_exchanged_and_copied_results_are_refused(reference: Path, tmp_path: Path):
+    study = Study.of(CONTENT)
+    one, two = tmp_path / "exchanged", tmp_path / "copied"
+    for place in (one, two):
+        shutil.copytree(reference, place)
+    a, b = (one / f"small/two-point/{seed}" for seed in range(2))
+    a.rename(one / "c")
+    b.rename(a)
+    (one / "c").rename(b)
+    with pytest.raises(StudyError, match=r"small/two-point/0 .*seed: 1 there, 0 now.*and 1 more"):
+        run(study, one, here)
+    shutil.rmtree(two / "small/gauss-newton/1")
+    shutil.copytree(two / "small/gauss-newton/0", two / "small/gauss-newton/1")
+    with pytest.raises(StudyError, match=r"small/gauss-newton/1 .*seed: 0 there, 1 now"):
+        run(study, two, here)
+
+
+PLANT = """
+import numpy as np
+import pdeloop
+
+class Rod(pdeloop.Dynamics):
+    n_z, n_a, horizon, sample_time = 5, 2, 6, 0.5
+    radius = 0.9
+
+    def initial_state(self, rng):
+        return rng.standard_normal(5)
+
+    def step(self, z, a):
+        return self.radius * z + np.repeat(a, [2, 3])
+"""
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_an_edited_plant_is_another_plant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("PDELOOP_PLANTS", "")  # to be as it was after the test
+    code, file, out = tmp_path / "rod.py", tmp_path / "study.yaml", str(tmp_path / "out")
+    (tmp_path / "rod.yaml").write_text(
+        f"/**: {{ros__parameters: {{problem: rod, plant: {code}:Rod}}}}"
+    )
+    settings = {"rollouts": 7, "evaluation_fields": 2, "reduced_order": 2, "optimizer": "two_point"}
+    file.write_text(json.dumps({"problems": ["rod.yaml"], "seeds": 1, "settings": settings}))
+    words = ["--out", out, "--plant", f"{code}:Rod", "--processes", "1"]
+    code.write_text(PLANT)
+    assert main(["study", str(file), *words]) == main(["study", *words]) == 0
+    code.write_text(PLANT.replace("0.9", "0.99"))
+    capsys.readouterr()
+    assert main(["study", *words]) == 1
+    assert "another plant: its code or its data have changed" in capsys.readouterr().err
+    assert main(["study", *words, "--again"]) == main(["study", *words]) == 0
