@@ -233,8 +233,8 @@ TUNER = _section(
         "initial policy: the LQT gains of the reduced model, or zero"
     ),
     Spec("model", "").means(
-        "file from 'pdeloop identify --out' with the reduced model and warm start of every seed; "
-        "empty: identify one"
+        "file from 'pdeloop identify --out' with the reduced model and warm start of every seed, or, "
+        "for 'pdeloop train', with A and B alone; empty: identify one"
     ),
     Spec("identification_attempts", 3, 1, 1000).means(
         "exploratory episodes that a seed may use until its LQT law beats no control on a sampled "

@@ -314,6 +314,7 @@ def train(
     *,
     plant: Dynamics | Plant | str | None = None,
     law: type[Law] | str | None = None,
+    model: ReducedModel | str | Path | Any = None,
     out: str | Path | None = None,
     over_topics: bool = False,
     progress: TextIO | None = None,
@@ -329,6 +330,9 @@ def train(
         A plant of your own, as for `problem`.
     law
         The control law: a class derived from `Law`, or a name; the problem's if not given.
+    model
+        Start from this model instead of identifying one: a `ReducedModel`, a state-space system as
+        `ReducedModel.of` takes it, or a file of either `ReducedModel.save` or `pdeloop identify --out`.
     out
         Folder of the results, in the command line's layout; by default nothing is kept.
     over_topics
@@ -375,9 +379,10 @@ def train(
         parameters |= {} if plant is None else {"plant": plant}
         parameters |= {} if law is None else {"law": law}
         where = Path(temporary) / "run" if out is None else Path(out)
-        folder, values = begin(
-            source, {**given, **named(source, parameters, given)}, where, transport
-        )
+        given = {**given, **named(source, parameters, given)}
+        if model is not None:
+            given["model"] = str(model) if isinstance(model, str | Path) else model
+        folder, values = begin(source, given, where, transport)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
             carry_out(folder, values, transport, display, lambda: None)

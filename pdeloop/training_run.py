@@ -15,11 +15,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
-from loop_interfaces.files import FileError, make_own_folder
+from loop_interfaces.files import FileError, make_own_folder, write_atomically
 from loop_interfaces.frames import MAX_VALUES
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameters import model_order
@@ -28,6 +29,8 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
+from pdeloop.given_model import FILE as GIVEN
+from pdeloop.given_model import file_of_gains, with_gains
 from pdeloop.in_process import LocalPair, train
 from pdeloop.interruption import Interruption, interruptible
 from pdeloop.live import announced
@@ -113,19 +116,38 @@ def begin(
 ) -> tuple[Path, dict[str, Any]]:
     """Folder and parameters of a new training, of which nothing has been done yet.
 
+    The option `model` may be the matrices of a model (`ReducedModel`), or a file of them: the folder
+    then gets the model with the gains for the plant's target.
+
     Mistakes that show without a compiler are refused before anything is compiled, as are options that
     change nothing. transport: over topics, if not given.
     """
+    matrices = options.get("model", "")
+    if not isinstance(matrices, str) or (matrices and not file_of_gains(matrices)):
+        options = {**options, "model": GIVEN}
+    else:
+        matrices = ""
     values = resolve(problem, options)
     transport = transport or Transport()
     refuse_unused(options, values, in_process=transport.in_process, viewed=transport.view)
-    training = build_training(values)
+    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
+    content = b""
+    if matrices != "":
+        content = with_gains(matrices, build_plant(values, compiled=False), values)
+        values["model"] = str((folder / GIVEN).absolute())
+    with TemporaryDirectory() as temporary:
+        # The run's folder is made after everything was looked at.
+        own = {"model": str(Path(temporary) / GIVEN)} if content else {}
+        if content:
+            Path(own["model"]).write_bytes(content)
+        training = build_training({**values, **own})
     if not transport.in_process:
         check_messages(values, training)
-    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).refuse_another()
     load_compiled(values, fits=True)
     RunFolder(folder).create(values)
+    if content:
+        write_atomically(folder / GIVEN, content)
     return folder, values
 
 

@@ -36,7 +36,10 @@ def read_model(path: Path, n_a: int, law: type[Law] = Affine) -> NDArray[np.floa
     try:
         arrays = read_arrays(path)
         if "model" not in arrays and "A" in arrays:
-            raise ValueError("it has a model without gains; identify with a target")
+            raise ValueError(
+                "it has a model without gains, which 'pdeloop train --model' designs; or identify with "
+                "a target"
+            )
         rows = arrays["model"].astype(np.float64)
         actuators = len(arrays["B"].T) if "B" in arrays else n_a
         filtered = "L" in arrays

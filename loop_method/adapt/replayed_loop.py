@@ -19,7 +19,6 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.design.lqt import DesignError, track_outputs
 from loop_method.models.readings import ReadingsModel
-from loop_method.reduce.reduced_model import ReducedModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class ReplayedLoop(ObservedLoop):
             action_weight=self.action_weight,
         )
         try:
-            P = track_outputs(ReducedModel(model.A, model.B, model.C), cost).P
+            P = track_outputs(model.A, model.B, model.C, cost).P
             own = self.action_weight * np.eye(model.n_a) + model.B.T @ P @ model.B
         except DesignError:
             pass

@@ -35,7 +35,7 @@ from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.one_thread import one_thread
 from loop_method.design.lqt import DesignError, track_outputs
-from loop_method.reduce.reduced_model import ReducedModel, Steps, repeated, steps_of
+from loop_method.reduce.reduced_model import Steps, repeated, steps_of
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 from loop_method.reduce.subspace import InnovationModel
 
@@ -266,10 +266,10 @@ def law_of_innovations(
         )
     with one_thread():
         require_detectable(A, C)
-        seen = ReducedModel(A, B, model.U @ C)
+        seen = model.U @ C
         try:
-            gains = track_outputs(seen, cost)
-            K_a, b = gains.K_a, gains.K_b @ (seen.U.T @ cost.field_target)
+            gains = track_outputs(A, B, seen, cost)
+            K_a, b = gains.K_a, gains.K_b @ (seen.T @ cost.field_target)
         except DesignError:
             if not or_no_control:
                 raise

@@ -1,14 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic tracking gains of a reduced model.
 
-For s_{k+1} = A s_k + B a_k and the stage cost (s - s_r)^T Q (s - s_r) + a^T R a with a constant
+For s_{k+1} = A s_k + B a_k + d and the stage cost (s - s_r)^T Q (s - s_r) + a^T R a with a constant
 target s_r, let P be the stabilising solution of the discrete algebraic Riccati equation
 
     P = Q + A^T P A - A^T P B (R + B^T P B)^{-1} B^T P A,        S = R + B^T P B.
 
-The law a = K_a s + K_b s_r with
+The law a = K_a s + K_b s_r + b with
 
-    K_a = -S^{-1} B^T P A,        K_b = S^{-1} B^T (I - (A + B K_a)^T)^{-1} Q
+    K_a = -S^{-1} B^T P A,        K_b = S^{-1} B^T (I - (A + B K_a)^T)^{-1} Q,
+    b = -S^{-1} B^T (I - (A + B K_a)^T)^{-1} P d
 
 is optimal over an infinite horizon. The weights are multiples of the identity on the full state and
 the actions, so Q = U^T (state_weight I) U = state_weight I, as U has orthonormal columns, and R =
@@ -25,7 +26,7 @@ from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
@@ -50,7 +51,7 @@ class DesignError(ValueError):
 
 
 class Gains(NamedTuple):
-    """The gains of a = K_a s + K_b s_r, and the quantities they follow from.
+    """The gains of a = K_a s + K_b s_r + b, and the quantities they follow from.
 
     Attributes
     ----------
@@ -62,12 +63,15 @@ class Gains(NamedTuple):
         Solution of the Riccati equation: s^T P s is the cost of regulating s to 0.
     poles : (n_s,) complex array
         Eigenvalues of the closed loop A + B K_a, all inside of the unit circle.
+    b : (n_a,) array
+        What K_b s_r does not have of the constant part: against the model's drift d.
     """
 
     K_a: Array
     K_b: Array
     P: Array
     poles: NDArray[np.complex128]
+    b: Array
 
     def __repr__(self) -> str:
         n_a, n_s = self.K_a.shape
@@ -132,7 +136,7 @@ def track(
     if not isinstance(model, ReducedModel):
         raise ValueError(f"model is {model!r}; expected a ReducedModel")
     if cost is not None and not cost.plain:
-        return track_outputs(model, cost)
+        return track_outputs(model.A, model.B, model.U, cost, model.d)
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
@@ -142,38 +146,42 @@ def track(
         B = model.B * unit
         Q = state_weight / level * np.eye(model.n_s)
         R = action_weight / level * unit**2 * np.eye(model.n_a)
-        P, S, K_a, poles = _feedback(model, B, Q, R)
+        P, S, K_a, poles = _feedback(model.A, model.B, B, Q, R)
         closed_loop = model.A + B @ K_a
-        K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
-    return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles)
+        ahead = _steady_state_map(closed_loop)
+        K_b = linalg.solve(S, B.T @ ahead @ Q, assume_a="pos")
+        b = -linalg.solve(S, B.T @ (ahead @ (P @ model.d)), assume_a="pos")
+    return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles, b=unit * b)
 
 
-def track_outputs(model: ReducedModel, cost: Cost) -> Gains:
+def track_outputs(A: Array, B: Array, U: Array, cost: Cost, d: ArrayLike = 0.0) -> Gains:
     """The gains of any quadratic cost; see `loop_method.design.tracking` for its terms.
 
-    The columns of U need not be orthonormal: it is what the state looks like, z = U s.
+    U is what the state looks like, z = U s, and its columns need not be orthonormal.
     """
     with one_thread():
-        E, R = cost.residual(model.U), cost.action_matrix
-        P, S, K_a, poles = _feedback(model, model.B, E.T @ E, R)
+        E, R = cost.residual(U), cost.action_matrix
+        P, S, K_a, poles = _feedback(A, B, B, E.T @ E, R)
         # The steady state of p and b of the tracking over a horizon.
-        pushed = P @ (model.B @ cost.action_target)
-        closed_loop = model.A + model.B @ K_a
+        pushed = P @ (B @ cost.action_target + np.asarray(d, dtype=np.float64))
+        closed_loop = A + B @ K_a
         w = cost.residual_target().mean(axis=0)
         p = _steady_state_map(closed_loop) @ (E.T @ w - closed_loop.T @ pushed)
-        b = cost.action_target + linalg.solve(S, model.B.T @ (p - pushed), assume_a="pos")
-        s_r = model.U.T @ cost.field_target
+        b = cost.action_target + linalg.solve(S, B.T @ (p - pushed), assume_a="pos")
+        s_r = U.T @ cost.field_target
         size = float(s_r @ s_r)
         K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
-    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if size > 0.0 else b)
 
 
 def _feedback(
-    model: ReducedModel, B: Array, Q: Array, R: Array
+    A: Array, inputs: Array, B: Array, Q: Array, R: Array
 ) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
-    """P, S, K_a and the poles; DesignError where there is no stabilising feedback."""
-    A = model.A
-    _require_stabilisable(A, model.B)
+    """P, S, K_a and the poles; DesignError where there is no stabilising feedback.
+
+    B: the matrix `inputs`, in the units of R.
+    """
+    _require_stabilisable(A, inputs)
     try:
         P = linalg.solve_discrete_are(A, B, Q, R)
     except (linalg.LinAlgError, ValueError) as error:

@@ -1,76 +1,289 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A reduced linear model of the plant, and what every way to identify one begins with.
 
-    z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k
+    z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k + d
 
 Trajectories of the plant give the columns of Z = [z_0 .. z_{N-1}], Z' = [z_1 .. z_N] and
 Y = [a_0 .. a_{N-1}]; U holds the leading left singular vectors of Z'.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from io import BytesIO
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
+from loop_interfaces.array_files import read_arrays
 from loop_interfaces.arrays import Array, float_array
-from loop_method.reduce.channels import NUMBERED, Channels, state_faults
+from loop_interfaces.files import write_atomically
+from loop_method.reduce.channels import NUMBERED, Channels, scaled, state_faults
 
 Trajectory = tuple[Array, Array]
 """States (N + 1, n_z) and actions (N, n_a)."""
+ORTHONORMAL = 1e-9
+"""Largest difference of U^T U to the identity with which U counts as orthonormal."""
+INDEPENDENT = 1e-10
+"""Least singular value of independent columns of norm 1."""
+SAME_TIME = 1e-6
+"""Relative tolerance between two sampling times."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedModel:
-    """The linear model s_{k+1} = A s_k + B a_k of the projected state s = U^T z.
+    """A linear model of the plant: s_{k+1} = A s_k + B a_k + d, z_k = U s_k, y_k = C s_k.
+
+    Where the columns of U are not orthonormal, U = Q T with Q orthonormal: the model is kept in the
+    coordinates T s, so that U becomes Q, A becomes T A T^-1, B and d become T B and T d, and C becomes
+    C T^-1. A model that is projected obliquely, s = W^T z with z = V s, is given with U = V.
 
     Attributes
     ----------
     A : (n_s, n_s) array
-        A read-only copy, as are the others.
+        One step of the state without inputs. A read-only copy, as are the others.
     B : (n_s, n_a) array
-        Input matrix.
+        Input matrix; the inputs are held during the step.
     U : (n_z, n_s) array
-        Orthonormal columns; the largest entry of each column is positive, so that U is unique.
+        Orthonormal basis of the plant's state, so that s = U^T z. By default that of C if its columns
+        are independent, with z = y, and otherwise the identity, with z = s.
+    d : (n_s,) array
+        Drift, the constant term about an operating point; 0 by default.
+    C : (n_y, n_s) array or None
+        Of the outputs y; None: all of z is measured.
 
     Raises
     ------
     ValueError
-        Names the array whose shape or values do not fit.
+        Names the array whose kind, shape or values do not fit, such as complex numbers, or columns of U
+        that depend on each other.
+
+    Examples
+    --------
+    A mode that is measured in another unit, z = 10 s:
+
+    >>> model = ReducedModel([[0.9]], [[1.0]], U=[[10.0]])
+    >>> np.abs(model.U), np.abs(model.B), model.poles.real
+    (array([[1.]]), array([[10.]]), array([0.9]))
+    >>> states, outputs = model.simulate([0.0], [[1.0], [0.0]])
+    >>> states.ravel().round(12)
+    array([ 0., 10.,  9.])
     """
 
     A: Array
     B: Array
-    U: Array
+    U: Array = None  # type: ignore[assignment]  # an array from __post_init__ on
+    d: Array = None  # type: ignore[assignment]
+    C: Array | None = None
 
     def __post_init__(self) -> None:
-        for name in ("A", "B", "U"):
-            array = np.array(getattr(self, name), dtype=np.float64, order="C")
-            if array.ndim != 2 or 0 in array.shape:
-                raise ValueError(
-                    f"{name} of a reduced model must be a non-empty matrix, but its shape is "
-                    f"{array.shape}."
-                )
-            if not np.isfinite(array).all():
-                raise ValueError(
-                    f"{name} of a reduced model must be finite, but it has NaN or infinity."
-                )
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
-        n_s = self.U.shape[1]
-        if self.A.shape != (n_s, n_s) or self.B.shape[0] != n_s:
+        A, B = _real("A", self.A), _real("B", self.B)
+        n_s = len(A)
+        if A.shape != (n_s, n_s):
+            raise ValueError(f"A of a reduced model must be square, but its shape is {A.shape}.")
+        if len(B) != n_s:
             raise ValueError(
-                f"a reduced model with U of shape {self.U.shape} needs A of shape ({n_s}, {n_s}) "
-                f"and B with {n_s} rows, but A is {self.A.shape} and B is {self.B.shape}."
+                f"a reduced model with A of shape {A.shape} needs B with {n_s} rows, but its shape is "
+                f"{B.shape}."
             )
+        C, U = (None if own is None else _real(n, own) for n, own in (("C", self.C), ("U", self.U)))
+        for name, array in (("U", U), ("C", C)):
+            if array is not None and array.shape[1] != n_s:
+                raise ValueError(
+                    f"a reduced model with A of shape {A.shape} needs {name} with {n_s} columns, but "
+                    f"{name} is {array.shape}."
+                )
+        if U is None:
+            U = C if C is not None and _independent(C) else np.eye(n_s)
+        if not _independent(U):
+            raise ValueError(
+                f"the columns of U of a reduced model must be independent, but those of its {U.shape} "
+                "are not: leave out modes that are combinations of others."
+            )
+        d = np.zeros(n_s) if self.d is None else float_array("d of a reduced model", self.d)
+        if d.shape != (n_s,) or not np.isfinite(d).all():
+            raise ValueError(
+                f"d of a reduced model must be {n_s} finite numbers, one for each row of A, got shape "
+                f"{d.shape}{'' if np.isfinite(d).all() else ' with NaN or infinity'}."
+            )
+        if np.abs(U.T @ U - np.eye(n_s)).max() > ORTHONORMAL:
+            U, T = linalg.qr(U, mode="economic")
+            signs = np.where(np.diag(T) < 0.0, -1.0, 1.0)  # U with columns near 1 keeps their signs
+            U, T = U * signs, signs[:, None] * T
+            into = linalg.solve_triangular(T.T, np.eye(n_s), lower=True).T
+            A, B, d = T @ A @ into, T @ B, T @ d
+            C = None if C is None else C @ into
+        for name, array in (("A", A), ("B", B), ("U", U), ("d", d), ("C", C)):
+            if array is not None:
+                array = np.array(array, dtype=np.float64, order="C")
+                array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def of(cls, system: Any, sample_time: float | None = None) -> ReducedModel:
+        """The model of a state-space system of python-control, SciPy, or with the same attributes.
+
+        Parameters
+        ----------
+        system
+            With A, B, C, D and `dt`, like `control.ss(A, B, C, 0, dt)` or `scipy.signal.StateSpace`;
+            its outputs are y = C s, and D must be 0.
+        sample_time
+            Seconds of a step. A system in continuous time is sampled with inputs that are held; that of
+            a system in discrete time must agree. Without it, the system must be in discrete time.
+
+        Returns
+        -------
+        ReducedModel
+
+        Raises
+        ------
+        ValueError
+            The system has D, another sampling time, or none where one is needed.
+        """
+        if isinstance(system, cls):
+            return system
+        if missing := [name for name in "AB" if not hasattr(system, name)]:
+            raise ValueError(
+                f"model is {system!r}; expected a ReducedModel, a state-space system, or a file"
+                + f" (it has no {missing[0]})" * (len(missing) == 1)
+            )
+        if not hasattr(system, "D"):  # a model of a run or of another program
+            return cls(
+                system.A, system.B, system.U if hasattr(system, "U") else np.eye(len(system.A))
+            )
+        A, B, C, D = (
+            float_array(f"{name} of the system", getattr(system, name)) for name in "ABCD"
+        )
+        if D.any():
+            raise ValueError(
+                "D of the system is not 0; expected outputs y = C s without the inputs"
+            )
+        dt = getattr(system, "dt", None)
+        if dt is None and hasattr(system, "isctime"):
+            raise ValueError(
+                "dt of the system is None, which does not say whether it is in continuous time: make "
+                "it 0, or the sampling time"
+            )
+        if dt is None or (dt == 0 and dt is not False):
+            if sample_time is None:
+                raise ValueError("the system is in continuous time: give the sample_time of a step")
+            whole = linalg.expm(
+                sample_time * np.block([[A, B], [np.zeros((B.shape[1], len(A) + B.shape[1]))]])
+            )
+            A, B = whole[: len(A), : len(A)], whole[: len(A), len(A) :]
+        elif sample_time is not None and dt is not True and abs(dt / sample_time - 1.0) > SAME_TIME:
+            raise ValueError(
+                f"the system has a sampling time of {dt:g} s; expected {sample_time:g} s"
+            )
+        return cls(A, B, C=C)
+
+    @classmethod
+    def load(cls, path: str | Path) -> ReducedModel:
+        """The model in a .npz file with the arrays A and B, and U, d and C if it has them.
+
+        Parameters
+        ----------
+        path
+            Written by `save`, by `pdeloop identify --out`, or by `numpy.savez`.
+
+        Returns
+        -------
+        ReducedModel
+
+        Raises
+        ------
+        ValueError
+            The file cannot be read, or its arrays are not those of a model.
+        """
+        arrays = read_arrays(Path(path))
+        if missing := [name for name in ("A", "B") if name not in arrays]:
+            raise ValueError(
+                f"{path} has no array {' and no '.join(missing)}; expected A and B, and U, d and C "
+                f"where a model has them, got {', '.join(arrays) or 'none'}"
+            )
+        try:
+            return cls(**{name: arrays[name] for name in "ABUdC" if name in arrays})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def save(self, path: str | Path) -> None:
+        """Write A, B, U, d, and C if it has one, as .npz, which `pdeloop train --model` takes.
+
+        Parameters
+        ----------
+        path
+            Where; an existing file is replaced.
+
+        Raises
+        ------
+        ValueError
+            It cannot be written.
+        """
+        content = BytesIO()
+        arrays = {name: getattr(self, name) for name in "ABUdC"}
+        np.savez(content, **{name: array for name, array in arrays.items() if array is not None})
+        try:
+            write_atomically(Path(path), content.getvalue())
+        except OSError as error:
+            raise ValueError(f"cannot write {path}: {error.strerror}") from error
+
+    def simulate(self, start: ArrayLike, actions: ArrayLike) -> tuple[Array, Array]:
+        """The model's states and outputs under given actions.
+
+        Parameters
+        ----------
+        start : (n_z,)
+            z_0, of which U U^T z_0 is simulated.
+        actions : (N, n_a)
+            a_0 .. a_{N-1}.
+
+        Returns
+        -------
+        states : (N + 1, n_z) array
+            z_0 .. z_N.
+        outputs : (N + 1, n_y) array
+            y_0 .. y_N; the states if the model has no C.
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit.
+        """
+        z, a = float_array("start", start), float_array("actions", actions)
+        if z.shape != (self.n_z,) or a.ndim != 2 or a.shape[1] != self.n_a:
+            raise ValueError(
+                f"expected start of shape ({self.n_z},) and actions (N, {self.n_a}), got {z.shape} and "
+                f"{a.shape}"
+            )
+        s = np.empty((len(a) + 1, self.n_s))
+        s[0] = self.U.T @ z
+        for k in range(len(a)):
+            s[k + 1] = self.A @ s[k] + self.B @ a[k] + self.d
+        states = s @ self.U.T
+        return states, states if self.C is None else s @ self.C.T
 
     def __repr__(self) -> str:
-        return (
-            f"ReducedModel(order {self.n_s}: A, B with {self.n_a} inputs, U with {self.n_z} rows)"
+        drift, outputs = (
+            ", d" * bool(self.d.any()),
+            "" if self.C is None else f", C of {len(self.C)}",
         )
+        return (
+            f"ReducedModel(order {self.n_s}: A, B with {self.n_a} inputs, U with {self.n_z} rows"
+            f"{drift}{outputs})"
+        )
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """The eigenvalues of A, (n_s,)."""
+        found: NDArray[np.complex128] = np.linalg.eigvals(self.A).astype(np.complex128)
+        return found
 
     @property
     def n_z(self) -> int:
@@ -86,6 +299,26 @@ class ReducedModel:
     def n_a(self) -> int:
         """Number of actuators."""
         return int(self.B.shape[1])
+
+
+def _real(name: str, values: ArrayLike) -> Array:
+    """A matrix of finite real numbers."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} of a reduced model has masked values; expected finite numbers.")
+    array = float_array(f"{name} of a reduced model", values)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"{name} of a reduced model must be a non-empty matrix, but its shape is {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} of a reduced model must be finite, but it has NaN or infinity.")
+    return array
+
+
+def _independent(columns: Array) -> bool:
+    """Whether no column is a combination of the others, whatever their units."""
+    unit = scaled(columns)[0]
+    return unit.shape[0] >= unit.shape[1] and bool(linalg.svdvals(unit)[-1] > INDEPENDENT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,8 @@ def add(commands: Commands) -> None:
         "--model",
         type=a_path,
         metavar="FILE",
-        help="start from this model of `pdeloop identify --out` instead of identifying one",
+        help="start from this model instead of identifying one: of `pdeloop identify --out`, or an "
+        ".npz with the arrays A and B, and U, d and C where it has them",
     )
     add_set(method)
     run = train.add_argument_group("run")

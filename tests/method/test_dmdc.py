@@ -97,9 +97,11 @@ def test_reduced_model_checks_itself_and_is_read_only() -> None:
     assert model.A[0, 0] == 1.0
     with pytest.raises(ValueError, match="read-only"):
         model.A[0, 0] = 2.0
-    with pytest.raises(ValueError, match=r"needs A of shape \(2, 2\)"):
+    with pytest.raises(ValueError, match="needs B with 3 rows"):
         ReducedModel(A=np.eye(3), B=B, U=U)
-    with pytest.raises(ValueError, match="B with 2 rows"):
+    with pytest.raises(ValueError, match="needs U with 3 columns"):
+        ReducedModel(A=np.eye(3), B=np.ones((3, 1)), U=U)
+    with pytest.raises(ValueError, match="needs B with 2 rows"):
         ReducedModel(A=np.eye(2), B=np.ones((3, 1)), U=U)
     with pytest.raises(ValueError, match="B of a reduced model must be finite"):
         ReducedModel(A=np.eye(2), B=B * np.nan, U=U)

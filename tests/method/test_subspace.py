@@ -15,7 +15,6 @@ from loop_method.design.lqt import DesignError, track_outputs
 from loop_method.laws import Observer
 from loop_method.reduce.channels import Channels
 from loop_method.reduce.identifiability import NotIdentifiableError
-from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.reduce.subspace import InnovationModel, subspace_model
 
 N, N_A, N_Y = 4, 2, 3
@@ -81,7 +80,7 @@ def test_its_law_costs_what_lqg_with_the_true_plant_costs() -> None:
     law = law_of_innovations(identified(), np.zeros(N_Y), state_weight=Q, action_weight=R)
     found, true = cost_of(Observer(law, 10)), kalman_filter(A, C, W, V)
     cost = Cost(N_Y, N_A, 1, state_weight=Q, action_weight=R)
-    gains = track_outputs(ReducedModel(A, B, C), cost)
+    gains = track_outputs(A, B, C, cost)
     error = (np.eye(N) - true.M @ C) @ true.P
     S = R * np.eye(N_A) + B.T @ gains.P @ B
     optimum = np.trace(gains.P @ W) + np.trace(gains.K_a.T @ S @ gains.K_a @ error)

@@ -262,7 +262,7 @@ def test_without_a_target_there_is_a_model_and_no_law(
         (["identify", *words, "--state-weight", "2"], "--state-weight are weights of a law"),
         (["identify", *words, "--identification", "field"], "designs a law for a target"),
         (["identify", *words, "--target", "1,2"], "expected a target of 4 finite numbers"),
-        (train, "it has a model without gains"),
+        (train, "the model is of a state of 4 numbers and 2 inputs, but the plant has 128 and 6"),
     ):
         assert main(refusal) == FAILED
         error = capsys.readouterr().err
