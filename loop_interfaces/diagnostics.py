@@ -60,6 +60,11 @@ class ConditionTimer:
             self._since = now
         return now - self._since if self._since is not None else 0.0
 
+    @property
+    def holds(self) -> bool:
+        """True if it was at the last check."""
+        return self._since is not None
+
 
 class Rate:
     """Measures the rate of a counter, from one check to the next."""

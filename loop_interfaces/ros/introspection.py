@@ -62,6 +62,12 @@ def matched_processes(node: Node, publisher: Publisher) -> set[bytes]:
     return {process_of(endpoint) for endpoint in there}
 
 
+def incompatible(offered: QoSProfile, asked: QoSProfile) -> str:
+    """Why messages of a publisher cannot arrive at a subscriber; empty if they can."""
+    verdict, reason = qos_check_compatible(offered, asked)
+    return reason.removeprefix("ERROR: ").rstrip(";") if verdict == QoSCompatibility.ERROR else ""
+
+
 class Introspection:
     """Publishes a node's diagnostics, and warns of other nodes that should not be there."""
 
@@ -81,6 +87,8 @@ class Introspection:
         self._publishing = threading.Lock()
         self.several_publishers: dict[str, list[str]] = {}
         """The nodes that published a topic which one node should publish."""
+        self.unreachable: dict[str, str] = {}
+        """Of a topic: which publisher's messages cannot arrive, and why."""
         self._known: dict[str, int] = {}
         """Publishers of a topic that were looked at."""
         self._doubled: dict[str, ConditionTimer] = {}
@@ -209,12 +217,11 @@ class Introspection:
             self._known[topic] = len(there)
             all_named &= len(there) == count
             for name, offered in there:
-                verdict, reason = qos_check_compatible(offered, asked)
-                if verdict == QoSCompatibility.ERROR:
-                    reason = reason.removeprefix("ERROR: ").rstrip(";")
+                if reason := incompatible(offered, asked):
                     text = (
                         f"{name} publishes {topic}, but its messages cannot arrive (QoS: {reason})"
                     )
+                    self.unreachable[topic] = text
                     if self._is_due(text, now):
                         self._node.get_logger().error(
                             f"{text}; expected a publisher as in docs/protocol.md"
@@ -229,6 +236,12 @@ class Introspection:
                         f"{text}; only messages of this run, episode, step and plant count"
                     )
         return all_named
+
+    @property
+    def undecided(self) -> bool:
+        """True while a topic has two publishers of one name, of which one may have just ended."""
+        known = self.several_publishers
+        return any(timer.holds for topic, timer in self._doubled.items() if topic not in known)
 
     def _several(self, topic: str, names: Counter[str], now: float) -> list[str]:
         """The publishers of a topic by the names of their nodes, if they are several nodes."""

@@ -131,12 +131,13 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
     )
     low = spec.minimum if spec.minimum is not None else (0.0 if spec.positive else -_LARGEST)
     high = spec.maximum if spec.maximum is not None else _LARGEST
-    if spec.type is float:
-        result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=high)]
-    elif spec.type is int:
-        result.integer_range = [
-            IntegerRange(from_value=int(low), to_value=min(int(high), 2**63 - 1), step=1)
+    if spec.type is float:  # an int in its place would be written as other bits
+        result.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high))
         ]
+    elif spec.type is int:
+        least, most = max(int(low), -(2**63)), min(int(high), 2**63 - 1)
+        result.integer_range = [IntegerRange(from_value=least, to_value=most, step=1)]
     return result
 
 

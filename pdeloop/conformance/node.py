@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 import secrets
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64MultiArray, String
@@ -20,7 +18,9 @@ from loop_interfaces.frames import MAX_ID
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped, writer_qos
+from loop_interfaces.ros.introspection import PERIOD, full_name, incompatible
 from loop_interfaces.ros.node_main import ros_node
+from loop_interfaces.ros.observer import WAIT, EventLoop
 from loop_interfaces.topics import ARRAYS, Topic
 from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
@@ -36,20 +36,25 @@ CHECKS: dict[str, type[Check]] = {
 }
 KEPT = 200
 """Frames that wait to be looked at."""
-WAIT = 0.1
-"""Seconds of one wait at most: a wait does not end by a signal."""
+DRAINING = 0.2
+"""Seconds at most in which what has arrived is taken, without a wait."""
 
 
-class RosTransport:
+class RosTransport(EventLoop):
     """The topics of a namespace in this ROS domain; `published` are those of the checked node."""
 
     def __init__(self, published: tuple[Topic, ...], namespace: str, node: Node) -> None:
-        self._stopped, self.received_any, self.refused = "", False, ""
+        super().__init__(node)
+        self.received_any, self.refused = False, ""
         self._inbox: deque[tuple[Topic, Message]] = deque(maxlen=KEPT)
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
+        self._looked = 0.0
+        self._checked_topics: list[str] = []
         self._send: dict[Topic, Callable[[Any], None]] = {}
         self._publishers: list[Publisher] = []
+        for topic in (*ARRAYS, FAILED):
+            name = node.resolve_topic_name(scoped(namespace, topic.name))
+            self.introspection.supervise(name, reader_qos(topic))
+            self._checked_topics += [name] if topic in published else []
         for topic in ARRAYS:
             if topic in published:
                 take = partial(self._take, topic, topic.codec().decode)
@@ -65,35 +70,70 @@ class RosTransport:
             node.create_subscription(String, failed, take, reader_qos(FAILED))
         else:
             failures = node.create_publisher(String, failed, writer_qos(FAILED))
+            self._publishers.append(failures)
             self._send[FAILED] = lambda told: failures.publish(String(data=told.to_json()))
-
-    def now(self) -> float:
-        return time.monotonic()
 
     def send(self, topic: Topic, message: Message) -> None:
         self._send[topic](message)
 
     def next(self, *topics: Topic, seconds: float) -> tuple[Topic, Message] | None:
         end = self.now() + seconds
+        idle = 0
         while True:
-            if self._stopped:
-                raise Interruption(self._stopped)
+            if self.stop_reason:
+                raise Interruption(self.stop_reason)
             for found in self._inbox:
                 if found[0] in topics:
                     self._inbox.remove(found)
                     return found
-            left = end - self.now()
-            if left < 0.0:
+            now = self.now()
+            # An executor that has just served something says at first that nothing is ready.
+            if (now >= end and idle >= 2) or now >= end + DRAINING:
                 return None
-            self._executor.spin_once(timeout_sec=min(left, WAIT))
+            if now >= self._looked + PERIOD:
+                self._looked = now
+                self.introspection.look_at_publishers(now)
+            served = self.serve_next(min(max(0.0, end - now), WAIT))
+            idle = 0 if served else idle + 1
+
+    def disturbance(self) -> str:
+        while True:
+            self.introspection.look_at_publishers(self.now())
+            for topic, names in self.introspection.several_publishers.items():
+                return (
+                    f"several nodes publish {topic}: {', '.join(names)}; stop all but the one to be "
+                    "checked, or give it a ROS_DOMAIN_ID or --namespace of its own"
+                )
+            for text in self.introspection.unreachable.values():
+                return f"{text}; expected a publisher as in docs/protocol.md"
+            if deaf := self._deaf():
+                return deaf
+            if not self.introspection.undecided:
+                return ""
+            if self.stop_reason:
+                raise Interruption(self.stop_reason)
+            self.serve_next(WAIT)
 
     def wait_delivered(self) -> None:
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=1))
 
-    def stop(self, reason: str) -> None:
-        """End the check; called by a signal."""
-        self._stopped = reason
+    def _deaf(self) -> str:
+        """Which topic of the check the checked node cannot receive, and why; or empty."""
+        topics, graph = [publisher.topic_name for publisher in self._publishers], self.node
+        publishing = [graph.get_publishers_info_by_topic(name) for name in self._checked_topics]
+        checked = {full_name(endpoint) for endpoints in publishing for endpoint in endpoints}
+        for name in topics:
+            offered = [e.qos_profile for e in graph.get_publishers_info_by_topic(name)]
+            for reader in graph.get_subscriptions_info_by_topic(name):
+                if full_name(reader) not in checked or not offered:
+                    continue
+                if why := incompatible(offered[0], reader.qos_profile):
+                    return (
+                        f"{full_name(reader)} subscribes {name}, but its messages cannot arrive "
+                        f"(QoS: {why}); expected a subscriber as in docs/protocol.md"
+                    )
+        return ""
 
     def _take(self, topic: Topic, decode: Callable[[Any], Message], raw: Any) -> None:
         self.received_any = True

@@ -63,6 +63,9 @@ class Transport(Protocol):
     def wait_delivered(self) -> None:
         """Wait until sent messages have arrived, for at most a second."""
 
+    def disturbance(self) -> str:
+        """Why no node can be checked here: others beside it, or a QoS that does not fit; or empty."""
+
 
 class Check(ABC):
     """Plays the other two nodes to one.
@@ -98,11 +101,16 @@ class Check(ABC):
                     yield Finding(name, True, promise)
                 except NoteError as note:
                     yield Finding(name, True, str(note), note=True)
-                except NoAnswerError as error:
-                    yield Finding(name, False, f"{promise}: {error}; the rest is not checked")
-                    break
                 except UnexpectedError as error:
-                    yield Finding(name, False, f"{promise}: {error}")
+                    if self.transport.disturbance():  # said below, and the cause
+                        break
+                    ends = isinstance(error, NoAnswerError)
+                    rest = "; the rest is not checked" if ends else ""
+                    yield Finding(name, False, f"{promise}: {error}{rest}")
+                    if ends:
+                        break
+            if disturbance := self.transport.disturbance():
+                yield Finding("topics", False, disturbance)
             if self.transport.received_any:
                 refused = self.transport.refused
                 yield Finding("messages", not refused, refused or "all of them are well formed")

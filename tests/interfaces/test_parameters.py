@@ -11,14 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.serialization import deserialize_message, serialize_message
 
 from loop_interfaces.parameters import NODES, table, taken_by, with_names
 from loop_interfaces.problem import completed, find_problem, load_parameters, shipped_problems
+from loop_interfaces.ros.parameters import descriptor
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
+from loop_method.adapt.registry import offered
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import EQUATIONS, load_equation
+from pde_sim_node.node import physical_specs
 from tests.support.small import parameters
+from tuner_node.optimizer_parameters import setting_specs
 
 SPECS = {spec.name: spec for spec in table()}
 
@@ -347,3 +353,22 @@ def test_code_of_a_relative_file_is_the_same_for_a_command_and_a_node(
         assert node[name] == command[name] == f"{folder}/{own}"
     # What the command line of a node says is relative to where that is.
     assert taken(law="k.py:L")["law"] == "k.py:L"
+
+
+def every_spec() -> list[Spec]:
+    """Parameters of all nodes, of all equations, and the settings of all methods."""
+    of_methods = [spec for name in offered() for spec in setting_specs(parameters(optimizer=name))]
+    of_equations = [spec for name in EQUATIONS for spec in physical_specs(name)]
+    return [*table(), *of_methods, *of_equations]
+
+
+def test_other_nodes_read_the_ranges_of_all_parameters():
+    """What the descriptor of a parameter holds once it has been a message."""
+    for spec in every_spec():
+        told = deserialize_message(serialize_message(descriptor(spec)), ParameterDescriptor)
+        ranges = [*told.floating_point_range, *told.integer_range]
+        assert len(ranges) == (spec.type in (int, float)), spec
+        for found in ranges:
+            assert found.from_value == (found.from_value if spec.minimum is None else spec.minimum)
+            assert found.to_value == (found.to_value if spec.maximum is None else spec.maximum)
+            assert found.from_value <= spec.default <= found.to_value, spec

@@ -97,6 +97,9 @@ class PureTransport:
     def wait_delivered(self) -> None:
         """Nothing is on its way."""
 
+    def disturbance(self) -> str:
+        return ""
+
 
 def _each(messages: Any) -> list[Message]:
     if messages is None:

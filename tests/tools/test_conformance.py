@@ -83,6 +83,9 @@ class Flood:
     def wait_delivered(self) -> None:
         self.closed = True
 
+    def disturbance(self) -> str:
+        return ""
+
 
 @pytest.mark.parametrize(
     ("make", "topic", "values"),
