@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
+from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.own_code import OwnCodeError, called
 from loop_interfaces.text import shown
 from pde_sim_node.definition import Definition, described, source_of
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from gymnasium import Env
 
 _OUTCOMES = ("reward", "terminated", "truncated")
+_TERMINATIONS = ("success", "failure")
+_SUCCESS = ("is_success", "success")
+"""Names by which environments say in a step's info whether their goal is reached."""
 _STEP = f"observation, {', '.join(_OUTCOMES)}, info"
 """Names of a step's results."""
 
@@ -37,13 +41,14 @@ def from_gymnasium(
     horizon: int = 0,
     sample_time: float = 1.0,
     divergence_bound: float = 1e6,
+    termination: str | None = None,
 ) -> GymnasiumPlant:
     """A plant from a Gymnasium environment with box spaces.
 
     Its state is the observation, and its actions saturate at the bounds of the action space. With a
     target the stage cost is that of every plant, q |o - o_r|^2 + r |a|^2. Without one it is minus the
-    reward, from which only optimisers that need costs alone can learn, such as two_point. An
-    environment that terminates has diverged. The mean field is the initial state of seed 0.
+    reward, from which only optimisers that need costs alone can learn, such as two_point. The mean
+    field is the initial state of seed 0.
 
     Parameters
     ----------
@@ -54,11 +59,17 @@ def from_gymnasium(
     state_weight, action_weight
         q and r.
     horizon
-        Steps of an episode; 0: the limit in the environment's specification.
+        Steps of an episode; 0: the limit in the environment's specification, or of its TimeLimit.
     sample_time
         Time (s) of a step.
     divergence_bound
         An observation beyond this magnitude has diverged.
+    termination : {"success", "failure"}, optional
+        What it means that the environment terminates. After a success the episode goes on to its
+        horizon: with a target the environment is stepped on and every step costs, as it is to stay
+        there; without one it is left, and no reward counts any more, as in Gymnasium. A failure ends
+        the rollout as a divergence does. None: what `is_success` or `success` in the step's info say,
+        and a success where there is neither. The first termination is said.
 
     Returns
     -------
@@ -67,7 +78,8 @@ def from_gymnasium(
     Raises
     ------
     ValueError
-        The spaces are not boxes, the length of an episode is unknown, or the target does not fit.
+        The spaces are not boxes, the length of an episode is unknown, or the target or `termination`
+        does not fit.
     """
     import gymnasium
 
@@ -78,6 +90,13 @@ def from_gymnasium(
     if not isinstance(made, gymnasium.Env):
         raise ValueError(f"env must be a gymnasium.Env or the id of one, got {shown(made)}")
     limit = made.spec.max_episode_steps if made.spec is not None else None
+    if limit is None and made.has_wrapper_attr("_max_episode_steps"):  # a TimeLimit by itself
+        limit = made.get_wrapper_attr("_max_episode_steps")
+    if termination not in (None, *_TERMINATIONS):
+        raise ValueError(
+            f"termination is {shown(termination)}; expected 'success' or 'failure', or None: as the "
+            "environment's info says"
+        )
     for what, space in (("observation", made.observation_space), ("action", made.action_space)):
         if not isinstance(space, gymnasium.spaces.Box):
             raise ValueError(f"the {what} space of {made} must be a Box, got {space}")
@@ -91,6 +110,7 @@ def from_gymnasium(
         state_weight=state_weight,
         action_weight=action_weight,
         divergence_bound=divergence_bound,
+        termination=termination,
     )
 
 
@@ -99,7 +119,14 @@ class GymnasiumPlant(BatchPlant):
 
     settable = False
 
-    def __init__(self, env: Env[Any, Any], *, target: ArrayLike | None, **settings: Any) -> None:
+    def __init__(
+        self,
+        env: Env[Any, Any],
+        *,
+        target: ArrayLike | None,
+        termination: str | None,
+        **settings: Any,
+    ) -> None:
         observed, acted = env.observation_space.shape or (), env.action_space.shape or ()
         n_z, self.quadratic = int(np.prod(observed)), target is not None
         wanted = float_array("target", np.zeros(n_z) if target is None else target).ravel()
@@ -107,6 +134,7 @@ class GymnasiumPlant(BatchPlant):
             raise ValueError(f"target must be {n_z} finite numbers, got shape {wanted.shape}")
         self._first, self._shape, self._space = env, acted, env.action_space
         self._envs: list[Env[Any, Any]] = []
+        self.termination, self._said = termination, False
         n_a = int(np.prod(acted))
         super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, **settings)
 
@@ -123,15 +151,23 @@ class GymnasiumPlant(BatchPlant):
         names = ("horizon", "sample_time", "state_weight", "action_weight", "divergence_bound")
         values = {name: getattr(self, name) for name in names}
         values["target"] = self.target.tolist() if self.quadratic else None
+        if self.termination is not None:
+            values["termination"] = self.termination
         values["environment"] = (
             json.loads(spec.to_json()) if spec is not None else described("env", vars(inner))
         )
         return Definition(values, [source_of(type(inner))])
 
+    def _allocate(self, batch: int) -> None:
+        super()._allocate(batch)
+        self._terminated = np.full(batch, -1, dtype=np.int64)
+        """The step in which each environment terminated with success, or -1."""
+
     def reset(self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None) -> Array:
         """Begin an episode; see `pde_sim_node.plant.Plant.reset`."""
         given = np.asarray(seeds)
         states = super().reset(seeds)
+        self._terminated.fill(-1)
         while len(self._envs) < len(states):
             self._envs.append(called(f"a deep copy of {self._first}", copy.deepcopy, self._first))
         for m, seed in enumerate(given.tolist()):
@@ -141,6 +177,7 @@ class GymnasiumPlant(BatchPlant):
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
         """Begin again in some; see `pde_sim_node.plant.Plant.restart`."""
         states = super().restart(environments, seeds)
+        self._terminated[environments] = -1
         for m, seed in zip(environments.tolist(), np.asarray(seeds).tolist(), strict=True):
             self._begin(self._envs[m], seed)
         return states
@@ -201,13 +238,19 @@ class GymnasiumPlant(BatchPlant):
         low, high = (np.ravel(bound).astype(np.float64) for bound in self._bounds)
         np.clip(self.actions, low, high, out=self.actions)
         for m in np.flatnonzero(self.diverged_step < 0):
+            over = self._terminated[m] >= 0
+            if over and not self.quadratic:
+                continue
             action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
-            observation, *rest = self._returned(
-                "step",
-                self._envs[m].step,
-                action,
-                names=_STEP,
-            )
+            try:
+                observation, *rest = self._returned("step", self._envs[m].step, action, names=_STEP)
+            except OwnCodeError as error:
+                if not over:
+                    raise
+                raise OwnCodeError(
+                    f"{error} (it terminated at step {self._terminated[m]}, and is stepped on: if that "
+                    "is no success, give termination='failure')"
+                ) from error
             reward, terminated, truncated = (
                 self._number(name, value) for name, value in zip(_OUTCOMES, rest[:3], strict=True)
             )
@@ -224,10 +267,30 @@ class GymnasiumPlant(BatchPlant):
             self.totals[m] += cost
             new = self._numbers("step", observation)
             good = (np.abs(new) <= self.divergence_bound).all() and np.isfinite(self.totals[m])
-            if terminated or not good:
+            failed = bool(terminated) and not over and self._terminates(int(m), rest[3])
+            if failed or not good:
                 self.diverged_step[m] = self.step_index
             else:
                 self.states[m] = new
+
+    def _terminates(self, m: int, info: Any) -> bool:
+        """Note that environment m terminates, and say so the first time; whether it is a failure."""
+        info = info if isinstance(info, Mapping) else {}
+        known = [bool(np.all(info[name])) for name in _SUCCESS if name in info]
+        kind = self.termination or ("failure" if known and not any(known) else "success")
+        failed = kind == "failure"
+        if not failed:
+            self._terminated[m] = self.step_index
+        if not self._said:
+            self._said = True
+            source = "" if self.termination or known else ", as its info says nothing of it"
+            other = "success" if failed else "failure"
+            meaning = "ends the rollout as a divergence does" if failed else "ends no rollout"
+            LONG_CALLS.tell(
+                f"{self._first} terminated at step {self.step_index}: taken for a {kind}{source}, "
+                f"which {meaning}; termination='{other}' takes it for a {other}"
+            )
+        return failed
 
     @property
     def _bounds(self) -> tuple[Any, Any]:

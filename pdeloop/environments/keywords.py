@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 import pdeloop
 from loop_interfaces.parameters import PROBLEM, table
@@ -73,3 +75,21 @@ def render_mode(given: str | None) -> str | None:
     if given not in (None, "rgb_array"):
         raise ValueError(f"render_mode is {given!r}; expected 'rgb_array' or None")
     return given
+
+
+class Specified:
+    """An environment whose specification has its own horizon as the limit of an episode."""
+
+    plant: Plant
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gymnasium.make` made it from; its `max_episode_steps` is the horizon."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:
+        self._spec = copy(given)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.plant.horizon

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
-from pdeloop.environments.keywords import Source
+from pdeloop.environments.keywords import Source, Specified
 from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
 from pdeloop.environments.seeds import field_seed, first_fields
 from pdeloop.environments.signals import one, spaces, told
 
 
-class Environment(gymnasium.Env[Array, Array]):
+class Environment(Specified, gymnasium.Env[Array, Array]):
     """One plant.
 
     The action space is bounded by the plant's `action_limit`. Without one the plant takes any action,

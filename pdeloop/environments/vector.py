@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
-from pdeloop.environments.keywords import Source
+from pdeloop.environments.keywords import Source, Specified
 from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
 from pdeloop.environments.seeds import field_seed, first_fields, seed_of_each
 from pdeloop.environments.signals import masked, spaces, told
@@ -23,7 +23,7 @@ from pdeloop.environments.signals import masked, spaces, told
 Flags = NDArray[np.bool_]
 
 
-class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
+class VectorEnvironment(Specified, VectorEnv[Array, Array, NDArray[Any]]):
     """M plants in one batch, each as an `Environment`.
 
     All share one horizon: where a plant diverges, its next episode is truncated together with the

@@ -164,3 +164,81 @@ def test_what_is_no_environment_is_refused() -> None:
         pdeloop.from_gymnasium("Nowhere-v1")
     with pytest.raises(ValueError, match=r"must be a gymnasium\.Env"):
         pdeloop.from_gymnasium(object())  # type: ignore[arg-type]
+
+
+class Goal(gymnasium.Env[Any, Any]):
+    """A double integrator, done within 0.3 of rest; `told` is what it says of that."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def __init__(self, ends: bool = True, **told: Any) -> None:
+        self.ends, self.told = ends, told
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.x = self.np_random.normal(size=2)
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        self.x = self.x + 0.1 * np.array([self.x[1], float(action[0])])
+        distance = float(np.abs(self.x).max())
+        info = self.told if distance < 0.3 else {}
+        return self.x.copy(), -1.0, self.ends and distance < 0.3, False, info
+
+
+def to_rest(k: int, z: Any) -> Any:
+    """A law that brings the double integrator to rest."""
+    return -(z @ np.array([[1.0], [1.7]]))
+
+
+def episode(env: Any, target: Any = (0.0, 0.0), **named: Any) -> Any:
+    plant = pdeloop.from_gymnasium(env, target=target, horizon=80, sample_time=0.1, **named)
+    return pdeloop.rollout(plant, to_rest, [3])
+
+
+@pytest.mark.parametrize(
+    ("told", "named"), [({}, {}), ({"is_success": True}, {}), ({}, {"termination": "success"})]
+)
+def test_an_environment_that_ends_at_its_goal_has_not_diverged(
+    told: Any, named: Any, capfd: Any
+) -> None:
+    """The law is measured to the horizon, as on the plant that has no end."""
+    endless, found = episode(Goal(ends=False)), episode(Goal(**told), **named)
+    assert capfd.readouterr().err.count("terminated at step") == 1
+    assert found.whole and np.array_equal(found.states, endless.states)
+    assert found.costs.total == endless.costs.total
+
+
+@pytest.mark.parametrize(
+    ("told", "named"),
+    [({"success": False}, {}), ({"is_success": True}, {"termination": "failure"})],
+)
+def test_an_environment_that_ends_as_a_failure_ends_the_rollout(
+    told: Any, named: Any, capfd: Any
+) -> None:
+    reached = np.flatnonzero(np.abs(episode(Goal(ends=False)).states[:, 0]).max(axis=1) < 0.3)[0]
+    assert episode(Goal(**told), **named).costs.diverged_step.tolist() == [reached - 1]
+    assert f"terminated at step {reached - 1}: taken for a failure" in capfd.readouterr().err
+
+
+def test_without_a_target_rewards_count_up_to_the_goal_as_in_gymnasium() -> None:
+    reached = np.flatnonzero(np.abs(episode(Goal(ends=False)).states[:, 0]).max(axis=1) < 0.3)[0]
+    found = episode(Goal(), target=None)
+    assert found.whole and found.costs.total.tolist() == [float(reached)]
+
+
+def test_the_limit_of_an_episode_is_the_horizon_of_a_specification_or_of_a_wrapper() -> None:
+    import pdeloop.environments
+
+    made = gymnasium.make("pdeloop/Burgers-v0", n_z=16, horizon=7)
+    assert made.spec is not None and made.spec.max_episode_steps == 7
+    assert pdeloop.from_gymnasium(made).horizon == 7
+    several = gymnasium.make_vec("pdeloop/Burgers-v0", 2, n_z=16, horizon=7)
+    assert several.spec is not None and several.spec.max_episode_steps == 7
+    shorter = gymnasium.make("pdeloop/Burgers-v0", n_z=16, horizon=7, max_episode_steps=5)
+    assert pdeloop.from_gymnasium(shorter).horizon == 5
+    limited = gymnasium.wrappers.TimeLimit(Goal(), 12)
+    assert pdeloop.from_gymnasium(limited).horizon == 12
+    with pytest.raises(ValueError, match="termination is 'won'; expected 'success' or 'failure'"):
+        pdeloop.from_gymnasium(limited, termination="won")
