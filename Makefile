@@ -8,7 +8,7 @@ export PYTHONSAFEPATH := 1
 # What hundreds of processes import is compiled once, also where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup run test coverage packages lint types docs check lock audit clean
+.PHONY: setup run test test-extras coverage packages lint types docs check lock audit clean
 
 setup: .venv/ready
 
@@ -71,6 +71,13 @@ PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 5 --dist worksteal
 # All tests, each of them once; with COVERAGE=1, those without topics are run by `coverage`.
 test: setup packages $(if $(COVERAGE),coverage)
 	$(PYTEST) $(if $(COVERAGE),-m topics)
+
+# The tests of the extras that are not in `dev`, which are large or for few: installed here, without digests.
+test-extras: setup packages
+	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
+	$(PYTEST) $(EXTRAS)
+
+EXTRAS := tests/plant/test_fmu.py
 
 # The tests without topics, with their coverage of the pure modules (pyproject.toml).
 coverage: setup packages

@@ -1,10 +1,11 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """User code: what a name stands for, and which code may be run.
 
-A name is one of the project, an entry point of an installed package, ``package.module:Name`` or
-``path/to/file.py:Name``. The last two are Python code, which is executed to get it. So a name that a
-problem's file gives is not enough: the user has to name the same code, on the command line, in Python
-or in an environment variable, which the processes that are started inherit.
+A name is one of the project, an entry point of an installed package, ``package.module:Name``,
+``path/to/file.py:Name``, or a file of another kind that holds code, like an FMU. All but the first two
+are code, which is executed to get it. So a name that a problem's file gives is not enough: the user
+has to name the same code, on the command line, in Python or in an environment variable, which the
+processes that are started inherit.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,6 +27,8 @@ from typing import Any
 from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.text import shown
 
+FMU = ".fmu"
+"""Ending of a Functional Mock-up Unit, whose name is code as a whole."""
 _handed_over: dict[tuple[str, str], type] = {}
 """Classes of this program, by the kind of code and the names that stand for them."""
 _executing: list[Path] = []
@@ -48,11 +51,14 @@ class OwnCode:
         The environment variable with the names of code that may be run, separated by commas.
     shipped : mapping
         What comes with the project, by name; no package takes these names.
+    files : mapping
+        By the ending of names that are files as a whole, what loads one.
     """
 
     word: str
     variable: str
     shipped: Mapping[str, Any]
+    files: Mapping[str, Callable[[str], Any]] = field(default_factory=dict)
 
     @property
     def group(self) -> str:
@@ -61,8 +67,7 @@ class OwnCode:
 
     def allow(self, name: str) -> str:
         """Allow code for this process and those it starts; its name from any folder."""
-        module, name_in_it = identity(name)
-        whole = f"{module}:{name_in_it}" if ":" in name else name
+        whole = ":".join(filter(None, identity(name)))
         before = os.environ.get(self.variable)
         os.environ[self.variable] = f"{before},{whole}" if before else whole
         return whole
@@ -101,7 +106,8 @@ class OwnCode:
     def require(self, name: str, environment: Mapping[str, str] = os.environ) -> None:
         """A ValueError if the name is code that is not allowed."""
         allowed = {identity(item.strip()) for item in environment.get(self.variable, "").split(",")}
-        if ":" in name and identity(name) not in allowed:
+        code = ":" in name or name.endswith(tuple(self.files))
+        if code and identity(name) not in allowed:
             quoted = shlex.quote(name)
             raise ValueError(
                 f"the {self.word} {shown(name)} is code, which is not run merely because a file "
@@ -121,6 +127,9 @@ class OwnCode:
             return self.shipped[name]
         if (self.word, name) in _handed_over:
             return _handed_over[self.word, name]
+        for ending, load in self.files.items():
+            if name.endswith(ending):
+                return load(name)
         source, separator, name_in_it = name.rpartition(":")
         if not separator:
             return self._load_entry_point(name)
@@ -182,6 +191,8 @@ class OwnCode:
 
 def identity(name: str) -> tuple[str, str]:
     """Module or file, and the name in it: equal for equal code."""
+    if name.endswith(FMU):
+        return str(Path(name).resolve()), ""
     module, _, name_in_it = name.rpartition(":")
     return (str(Path(module).resolve()) if module.endswith(".py") else module), name_in_it
 

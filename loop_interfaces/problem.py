@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.loop_parameters import read_problem
+from loop_interfaces.own_code import FMU
 from loop_interfaces.parameters import (
     OF_THE_PLANT,
     POINTS,
@@ -153,6 +154,8 @@ def _physical(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def code_from(folder: Path, code: str) -> str:
     """The name of code, with a relative file taken from there."""
+    if code.endswith(FMU):
+        return str(folder / code)
     file, colon, name = code.rpartition(":")
     if colon and file.endswith(".py") and not Path(file).is_absolute():
         return f"{folder / file}:{name}"
@@ -161,6 +164,7 @@ def code_from(folder: Path, code: str) -> str:
 
 def _words(plant: str) -> str:
     """The name of a problem that has no file: path/to/rod.py:HeatedRod is heated-rod."""
+    plant = Path(plant).stem if plant.endswith(FMU) else plant
     name = plant.rpartition(":")[2].rpartition(".")[2]
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "-", name)
     return words.strip("-").lower() or "plant"

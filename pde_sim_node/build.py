@@ -14,9 +14,10 @@ from loop_interfaces.spec import ParameterError
 from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Instruments, Plant
-from pde_sim_node.plants import DynamicsPlant, SpectralPlant
+from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.plants.dynamics_plant import SETTABLE
 from pde_sim_node.plants.loading import PHYSICAL, Made, make, physical_of
+from pde_sim_node.plants.stateful_plant import plant_of
 
 _GRID = (
     "n_z",
@@ -115,7 +116,7 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
     made: Made = make(values)
     plant, given = made.plant, {name: values[name] for name in SETTABLE if name in values}
     if not isinstance(plant, Plant):
-        plant = DynamicsPlant(plant, **given)
+        plant = plant_of(plant, **given)
     for name in (*_FIXED, *SETTABLE):
         if name in values and values[name] != getattr(plant, name):
             raise ParameterError(

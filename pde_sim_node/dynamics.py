@@ -47,7 +47,7 @@ class Dynamics(ABC):
     ``__init__``, whose arguments are the plant's parameters (`physical.NAME` in a problem's file).
 
     The same arguments must give the same bits: take random numbers only from the given ``rng``, and
-    keep no state between calls. `step` is called with one LAPACK thread.
+    keep no state between calls unless the class is ``stateful``. `step` has one LAPACK thread.
 
     Attributes
     ----------
@@ -82,6 +82,10 @@ class Dynamics(ABC):
     batched : bool
         Whether `step` takes M states (M, n_z) and actions (M, n_a) at once. The result for
         one must not depend on the others, to the last bit; a matrix product does not guarantee this.
+    stateful : bool
+        Whether the object keeps a state of its own between calls, as a simulator that cannot be set to
+        any z does. `initial_state` then begins an episode, `step` continues it and gets as z what it
+        returned last, and each environment has an object of its own, made with the same arguments.
 
     Examples
     --------
@@ -105,6 +109,7 @@ class Dynamics(ABC):
     divergence_bound: float = 1e3
     supports: Array | None = None
     batched: ClassVar[bool] = False
+    stateful: ClassVar[bool] = False
 
     def __new__(cls, *arguments: Any, **named: Any) -> Dynamics:
         """Remember the arguments, with which other processes make the plant again."""
@@ -174,6 +179,16 @@ class Dynamics(ABC):
         mean: Array = np.mean(drawn, axis=0)
         return mean
 
+    def identity(self) -> Mapping[str, Any]:
+        """The arguments by which it is told from another plant of its class, for the fingerprint.
+
+        Returns
+        -------
+        dict
+            By name; all arguments by default.
+        """
+        return arguments_of(self)
+
     def pull_back(self, z: Array, a: Array, y: Array) -> tuple[Array, Array]:
         """The transposed derivative of `step`, for `pdeloop.Gradients`; not needed elsewhere.
 
@@ -229,6 +244,12 @@ def signature_of(maker: Callable[..., Any]) -> inspect.Signature:
         return inspect.Signature()
     _, *parameters = inspect.signature(maker.__init__).parameters.values()
     return inspect.Signature(parameters)
+
+
+def made_again(dynamics: Dynamics) -> Dynamics:
+    """Another object of its class, made with the same arguments."""
+    arguments, named = getattr(dynamics, "_given", ((), {}))
+    return type(dynamics)(*arguments, **named)
 
 
 def arguments_of(dynamics: Dynamics) -> Mapping[str, Any]:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from loop_method.settings import setting as setting
     from pde_sim_node.dynamics import Dynamics as Dynamics
     from pde_sim_node.plant import Plant as Plant
+    from pde_sim_node.plants.fmu import from_fmu as from_fmu
     from pde_sim_node.plants.gymnasium_plant import from_gymnasium as from_gymnasium
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
@@ -66,6 +67,7 @@ _NAMES = {
     "loop_interfaces.grid": ("Axis", "Grid"),
     "pde_sim_node.dynamics": ("Dynamics",),
     "pde_sim_node.plant": ("Plant",),
+    "pde_sim_node.plants.fmu": ("from_fmu",),
     "pde_sim_node.plants.gymnasium_plant": ("from_gymnasium",),
     "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),

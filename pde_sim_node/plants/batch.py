@@ -87,7 +87,8 @@ class BatchPlant(ABC):
 
     def reset(self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None) -> Array:
         """Begin an episode; see `pde_sim_node.plant.Plant.reset`."""
-        states = self._initial_states(np.asarray(seeds))
+        given = np.asarray(seeds)
+        states = self._initial_states(given, np.arange(len(given)))
         if self.batch != len(states):
             self._allocate(len(states))
         self.step_index = 0
@@ -98,14 +99,16 @@ class BatchPlant(ABC):
 
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
         """Begin again in some environments; see `pde_sim_node.plant.Plant.restart`."""
-        self.states[environments] = self._initial_states(np.asarray(seeds))
+        self.states[environments] = self._initial_states(np.asarray(seeds), environments)
         self.totals[environments] = 0.0
         self.diverged_step[environments] = -1
         return self.states
 
-    def _initial_states(self, seeds: NDArray[Any]) -> Array:
-        """The states that seeds stand for, or that are given."""
+    def _initial_states(self, seeds: NDArray[Any], environments: NDArray[np.intp]) -> Array:
+        """The states of environments that seeds stand for, or that are given."""
         if seeds.ndim == 2:
+            if not self.settable:
+                raise ValueError(f"{self!r} starts from seeds only: its state cannot be set")
             if seeds.shape[1] != self.n_z or not len(seeds):
                 raise ValueError(
                     f"initial fields must have shape (M, {self.n_z}), one for each environment, got "
@@ -123,8 +126,12 @@ class BatchPlant(ABC):
             raise ValueError(
                 f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}"
             )
-        drawn = {seed: self._draw(seed) for seed in set(seeds.tolist())}
-        return np.stack([drawn[seed] for seed in seeds.tolist()])
+        return self._begun(seeds.tolist(), environments.tolist())
+
+    def _begun(self, seeds: list[int], environments: list[int]) -> Array:
+        """The initial states of environments that begin an episode with these seeds."""
+        drawn = {seed: self._draw(seed) for seed in set(seeds)}
+        return np.stack([drawn[seed] for seed in seeds])
 
     @abstractmethod
     def _draw(self, seed: int) -> Array:
@@ -153,6 +160,8 @@ class BatchPlant(ABC):
 
     def evaluate(self, states: Array, actions: Array) -> tuple[Array, Array]:
         """States and stage costs of a step; see `pde_sim_node.plant.Plant.evaluate`."""
+        if not self.settable:
+            raise ValueError(f"{self!r} cannot step from a given state: its state cannot be set")
         new = np.array(states, dtype=np.float64, order="C")
         held = np.array(actions, dtype=np.float64, order="C")
         batch = len(new)

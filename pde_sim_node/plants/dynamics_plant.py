@@ -17,7 +17,7 @@ from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
-from pde_sim_node.dynamics import Dynamics, arguments_of, refuse_misspelt
+from pde_sim_node.dynamics import Dynamics, refuse_misspelt
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
 
@@ -121,7 +121,7 @@ class DynamicsPlant(BatchPlant):
         settings = {name: getattr(self, name) for name in SETTABLE}
         arguments = {
             f"physical.{name}": described(name, value)
-            for name, value in arguments_of(self.dynamics).items()
+            for name, value in self.dynamics.identity().items()
         }
         sources = sources_of(type(self.dynamics), Dynamics)[:-1]  # without that of Dynamics itself
         return Definition({"plant": self.name, **settings, **arguments}, sources)
@@ -164,7 +164,7 @@ class DynamicsPlant(BatchPlant):
             return
         states, totals = self.states[alive], self.totals[alive]
         self.actions[alive] = held = self.applied(self.actions[alive])
-        lost = self._advanced(states, held, totals, self.step_index)
+        lost = self._advanced(states, held, totals, self.step_index, alive)
         if self.step_index + 1 == self.horizon:
             self.cost.add_terminal(totals, states)
         self.states[alive], self.totals[alive] = states, totals
@@ -172,7 +172,7 @@ class DynamicsPlant(BatchPlant):
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
         costs = np.zeros(len(states))
-        self._advanced(states, self.applied(actions), costs, 0)
+        self._advanced(states, self.applied(actions), costs, 0, np.arange(len(states)))
         return costs
 
     def applied(self, actions: Array) -> Array:
@@ -185,24 +185,26 @@ class DynamicsPlant(BatchPlant):
             raise OwnCodeError(f"{self.name}.actuated must return {self.n_a} finite numbers")
         return held
 
-    def _advanced(self, states: Array, actions: Array, totals: Array, step: int) -> Any:
+    def _advanced(
+        self, states: Array, actions: Array, totals: Array, step: int, environments: Any
+    ) -> Any:
         """Advance states in place and add their stage costs; which of them diverged."""
-        new = self._next(states, actions)
+        new = self._next(states, actions, environments)
         self.cost.add(totals, states, actions, step)
         good = np.isfinite(totals) & (np.abs(new) <= self.divergence_bound).all(axis=1)
         states[good] = new[good]
         return ~good
 
-    def _next(self, states: Array, actions: Array) -> Array:
-        """The states after a step, (M, n_z); they may be anything."""
+    def _next(self, states: Array, actions: Array, environments: Any) -> Array:
+        """The states of environments after a step, (M, n_z); they may be anything."""
         if self.dynamics.batched:
             return self._numbers("step", self._step(states, actions), len(states))
         one_by_one = zip(states, actions, strict=True)
         return np.concatenate([self._numbers("step", self._step(z, a), 1) for z, a in one_by_one])
 
-    def _step(self, z: Array, a: Array) -> Any:
+    def _step(self, z: Array, a: Array, of: Dynamics | None = None) -> Any:
         own_z, own_a = z.copy(), a.copy()
-        returned = self._call("step", own_z, own_a)
+        returned = self._call("step", own_z, own_a, of=of)
         for name, own, handed in (("z", own_z, z), ("a", own_a, a)):
             if not np.array_equal(own, handed):
                 raise OwnCodeError(
@@ -211,9 +213,9 @@ class DynamicsPlant(BatchPlant):
                 )
         return returned
 
-    def _call(self, method: str, *arguments: Any) -> Any:
-        """Call a method of the object, with one LAPACK thread: more of them round otherwise."""
-        function = getattr(self.dynamics, method)
+    def _call(self, method: str, *arguments: Any, of: Dynamics | None = None) -> Any:
+        """Call a method of an object, with one LAPACK thread: more of them round otherwise."""
+        function = getattr(of or self.dynamics, method)
         with one_thread(), np.errstate(over="ignore", invalid="ignore"):
             return called(f"{self.name}.{method}", function, *arguments)
 

@@ -182,11 +182,6 @@ class GymnasiumPlant(BatchPlant):
             self._begin(self._envs[m], seed)
         return states
 
-    def _initial_states(self, seeds: NDArray[Any]) -> Array:
-        if seeds.ndim == 2:
-            raise ValueError(f"{self!r} starts from seeds only: its state cannot be set")
-        return super()._initial_states(seeds)
-
     def _draw(self, seed: int) -> Array:
         return self._begin(self._first, seed)
 

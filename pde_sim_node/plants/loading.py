@@ -14,16 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loop_interfaces.own_code import FAILURES, OwnCode, located, name_of
+from loop_interfaces.own_code import FAILURES, FMU, OwnCode, located, name_of
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
 from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants import fmu
 from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
-from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pde_sim_node.plants.interval import Interval
 from pde_sim_node.plants.reactions import (
     Brusselator,
@@ -32,6 +32,7 @@ from pde_sim_node.plants.reactions import (
     GrayScott,
     Plate,
 )
+from pde_sim_node.plants.stateful_plant import plant_of
 from pde_sim_node.plants.vorticity import Kolmogorov
 
 PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
@@ -50,7 +51,7 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
     }
 )
 """Those that are shipped, by name."""
-OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS)
+OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS, {FMU: fmu.maker})
 OBJECT = "object of a Python program:"
 """The prefix of parameters that no file can hold."""
 PHYSICAL = "physical."
@@ -101,7 +102,9 @@ def make(values: Mapping[str, Any]) -> Made:
     try:
         made = maker(**arguments)
     except FAILURES as error:
-        raise ValueError(f"the plant {shown(name)} cannot be made: {located(error)}") from error
+        argument = isinstance(error, ValueError) and name.endswith(FMU)
+        told = str(error) if argument else located(error)
+        raise ValueError(f"the plant {shown(name)} cannot be made: {told}") from error
     if not isinstance(made, Dynamics | Plant):
         raise ValueError(
             f"plant {shown(name)} must be a class derived from pdeloop.Dynamics, or make one of its "
@@ -147,7 +150,8 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     """
     require_complete(plant)
     kind = type(plant)
-    arguments = arguments_of(plant) if isinstance(plant, Dynamics) else {}
+    arguments = dict(arguments_of(plant)) if isinstance(plant, Dynamics) else {}
+    path = arguments.pop("path") if isinstance(plant, fmu.Fmu) else ""
     stored = {
         name: described(name, value) if _storable(value) else f"{OBJECT} {described(name, value)}"
         for name, value in arguments.items()
@@ -155,7 +159,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     }
     if not isinstance(plant, Dynamics):  # its arguments are unknown
         stored = {"plant": f"{OBJECT} {plant.definition.fingerprint}"}
-    name = OWN_PLANTS.allow(name_of(kind))
+    name = OWN_PLANTS.allow(path or name_of(kind))
     _objects[_key(name, stored)] = Made(plant, stored)
     return {"plant": name} | {f"{PHYSICAL}{own}": value for own, value in stored.items()}
 
@@ -163,7 +167,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
 def as_plant(plant: object) -> Plant:
     """A plant as the loop needs it, from one or from a `Dynamics`; ValueError for anything else."""
     if isinstance(plant, Dynamics):
-        return DynamicsPlant(plant)
+        return plant_of(plant)
     if not isinstance(plant, Plant):
         raise ValueError(
             f"plant is {shown(plant)}; expected a Plant, or an object of a class derived from "

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -13,6 +14,10 @@ from loop_interfaces.text import shown
 
 PHYSICAL = "physical."
 """Before the name of a parameter of the equation; `SETTINGS` are those of a method's."""
+OF_AN_FMU = "fmu."
+"""The same for an FMU, whose parameters may be texts and lists."""
+_COMMA = re.compile(r",(?![^\[]*\])")
+"""One between values, not between the indices of A[1,2]."""
 OWN_FLAGS = {
     "out": "--out",
     "resume": "--resume",
@@ -64,6 +69,9 @@ def read_settings(texts: Iterable[str]) -> dict[str, Any]:
             )
         if name in found:
             raise ParameterError(f"parameter '{name}' is given twice; give it once")
+        if name.startswith(OF_AN_FMU):
+            found[PHYSICAL + name.removeprefix(OF_AN_FMU)] = _value(value)
+            continue
         if name.startswith(PHYSICAL):
             found[name] = _number(name, value)
             continue
@@ -85,6 +93,20 @@ def joined(flags: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, A
     if both := sorted({*flags} & {*settings}):
         raise ParameterError(f"parameter '{both[0]}' is given twice; give it once")
     return {**flags, **settings}
+
+
+def _value(text: str) -> float | str | list[float] | list[str]:
+    """A number, a text, or a list of either.
+
+    >>> _value("T[1,1],T[1,2]"), _value("0.5"), _value("20,30")
+    (['T[1,1]', 'T[1,2]'], 0.5, [20.0, 30.0])
+    """
+    parts = [part.strip() for part in _COMMA.split(text)]
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        return parts if len(parts) > 1 else text
+    return numbers if len(numbers) > 1 else numbers[0]
 
 
 def _number(name: str, text: str) -> float:

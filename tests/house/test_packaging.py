@@ -20,7 +20,7 @@ from packaging.utils import canonicalize_name
 from tests.support.interpreter import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text())
 
 

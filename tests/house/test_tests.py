@@ -19,6 +19,11 @@ from tests.support.interpreter import ROOT
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|assert_")
 SKIPS = {
+    "tests/plant/test_fmu.py": [
+        "FMPy is not installed: extra fmi",
+        "needs a C compiler, the command cc (make packages)",
+        "pythonfmu is not installed: extra fmi",
+    ],
     "tests/topics/test_isolation.py": ["needs root, and the right to make namespaces"],
     "tests/topics/test_pairs.py": [
         "needs root, iproute2, and a kernel with veth",
