@@ -1,20 +1,23 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The user's measurements in files, .npz or .csv (docs/identification.md), as trajectories."""
+"""The user's measurements in files (docs/identification.md), as trajectories."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.array_files import MAX_ARRAY_BYTES, read_arrays
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.files import FileError, read_bounded
 from loop_method.reduce.channels import NUMBERED, Channels, listed
+from pdeloop.column_files import read_mat, read_parquet
 from pdeloop.data_table import Columns, read_table
+from pdeloop.log import Log, Remedies, in_seconds, trajectories_of
 
 __all__ = ["Measurements", "read_measurements"]
 
@@ -26,6 +29,7 @@ LARGEST = 1e100
 SAME_STEP = 1e-3
 """Relative tolerance between the sampling times of several files."""
 TABLES = (".csv", ".tsv", ".txt", ".dat")
+READERS = {".mat": read_mat, ".parquet": read_parquet}
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +67,10 @@ def read_measurements(
     inputs: str = "",
     sample_time: float | None = None,
     target: ArrayLike | None = None,
+    time_unit: str = "",
+    missing: Sequence[float] | None = None,
+    cut: bool = False,
+    resample: float | None = None,
 ) -> Measurements:
     """The measurements of one plant, in one or several files.
 
@@ -76,10 +84,13 @@ def read_measurements(
     separated by commas, semicolons, tabs or spaces; except with commas, the decimal mark may be a
     comma.
 
+    A .mat file of any version has either the arrays of a .npz file or a vector or matrix for each group
+    of columns, and a .parquet file has columns; otherwise they are as a .csv file.
+
     Parameters
     ----------
     paths
-        The files, which end in .npz, .csv, .tsv, .txt or .dat.
+        The files, which end in .npz, .csv, .tsv, .txt, .dat, .mat or .parquet.
     time, states, inputs
         Names of columns, or of arrays, separated by commas; patterns such as "T*" for columns. If one
         is given, other columns are ignored.
@@ -87,6 +98,15 @@ def read_measurements(
         Seconds between two states, where the files do not have it.
     target : (n_z,)
         z_r, instead of the one in the files.
+    time_unit
+        Unit of the times, such as "ms", instead of the one in the column's name.
+    missing
+        Values that stand for missing readings, such as -9999.
+    cut
+        Leave out rows with missing readings, spikes, frozen or saturated sensors, and begin a new
+        trajectory after them and after gaps, instead of refusing the file or warning.
+    resample
+        Seconds of equal steps to interpolate to; 0 for the log's own step.
 
     Returns
     -------
@@ -100,10 +120,14 @@ def read_measurements(
     if not paths:
         raise FileError("no file given; expected a .npz or a .csv file")
     columns = Columns(time, states, inputs)
+    try:
+        remedies = Remedies(time_unit, missing, cut, resample)
+    except ValueError as error:
+        raise FileError(str(error)) from error
     found = []
     for path in map(Path, paths):
         try:
-            found.append(_read(path, columns, sample_time))
+            found.append(_read(path, columns, sample_time, remedies))
         except FileError:
             raise
         except ValueError as error:
@@ -120,17 +144,24 @@ def read_measurements(
     return replace(whole, target=wanted)
 
 
-def _read(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
+def _read(
+    path: Path, columns: Columns, sample_time: float | None, remedies: Remedies
+) -> Measurements:
     """One file; ValueError, one sentence, without its name."""
     kind = path.suffix.lower()
+    unit = remedies.time_unit
+    if kind in READERS:
+        found = READERS[kind](path, columns, timed=sample_time is None, time_unit=unit)
+        if isinstance(found, Log):
+            return _checked(_of_log(found, sample_time, remedies))
+        return _checked(_of_arrays(found, columns, sample_time, remedies))
     if kind == ".npz":
-        found = _npz(path, columns, sample_time)
-    elif kind in TABLES:
-        found = _csv(path, columns, sample_time)
-    else:
-        raise FileError(f"{path} must be a .npz or a .csv file (docs/identification.md)")
-    _check(found)
-    return found
+        return _checked(_of_arrays(read_arrays(path), columns, sample_time, remedies))
+    if kind in TABLES:
+        raw = read_bounded(path, MAX_TEXT_BYTES, "give the same as .npz (docs/identification.md)")
+        log = read_table(raw, columns, timed=sample_time is None, time_unit=unit)
+        return _checked(_of_log(log, sample_time, remedies))
+    raise FileError(f"{path} must be a .npz, .csv, .mat or .parquet file (docs/identification.md)")
 
 
 def _together(found: Sequence[Measurements], names: Sequence[str]) -> Measurements:
@@ -173,8 +204,8 @@ def _together(found: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     )
 
 
-def _check(found: Measurements) -> None:
-    """Raises ValueError, one sentence, unless everything fits together."""
+def _checked(found: Measurements) -> Measurements:
+    """The same; ValueError, one sentence, unless everything fits together."""
     target = found.target
     for number, (states, actions) in enumerate(found.trajectories):
         if states.ndim != 2 or actions.ndim != 2 or len(states) != len(actions) + 1:
@@ -211,10 +242,16 @@ def _check(found: Measurements) -> None:
         raise ValueError("expected a target of finite numbers, got NaN or infinity")
     if not 0 < found.sample_time < np.inf:
         raise ValueError(f"expected a sample_time above 0, got {found.sample_time:g}")
+    return found
 
 
-def _npz(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
-    arrays = read_arrays(path)
+def _of_arrays(
+    arrays: Mapping[str, NDArray[Any]],
+    columns: Columns,
+    sample_time: float | None,
+    remedies: Remedies,
+) -> Measurements:
+    """From the arrays states, actions and sample_time, under the names that were chosen."""
     names = {
         "states": columns.states or "states",
         "actions": columns.inputs or "actions",
@@ -245,7 +282,8 @@ def _npz(path: Path, columns: Columns, sample_time: float | None) -> Measurement
             raise ValueError(
                 f"expected one number as {names['sample_time']}, got shape {times.shape}"
             )
-        sample_time = float(times.reshape(()))
+        seconds, _ = in_seconds(names["sample_time"], times.reshape(1), remedies.time_unit)
+        sample_time = float(seconds[0])
     several = states.ndim == 3
     if several and (actions.ndim != 3 or len(actions) != len(states)):
         raise ValueError(
@@ -255,20 +293,48 @@ def _npz(path: Path, columns: Columns, sample_time: float | None) -> Measurement
     if several:
         _check_count(len(states))
     pairs = list(zip(states, actions, strict=True) if several else [(states, actions)])
-    return Measurements(pairs, target, sample_time, sources=_numbered(len(pairs)))
+    plain = Measurements(pairs, target, sample_time, sources=_numbered(len(pairs)))
+    if not 0 < sample_time < np.inf or not all(_fit(*pair) for pair in pairs):
+        return plain  # and refused
+    if not remedies.cut and not all(np.isfinite(a).all() for pair in pairs for a in pair):
+        return plain
+    log = _log(pairs, target, sample_time)
+    found = _of_log(log, sample_time, remedies, named=False)
+    if remedies.cut or remedies.missing is not None or remedies.resample is not None:
+        return found
+    return replace(plain, remarks=found.remarks)
 
 
-def _csv(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
-    raw = read_bounded(path, MAX_TEXT_BYTES, "give the same as .npz (docs/identification.md)")
-    found = read_table(raw, columns, timed=sample_time is None, most=MAX_TRAJECTORIES)
-    if sample_time is not None and found.sample_time is not None:
-        raise ValueError("leave out --sample-time: it has a column of times")
-    step = sample_time if found.sample_time is None else found.sample_time
+def _fit(states: Array, actions: Array) -> bool:
+    """Whether they are of the shapes of a trajectory."""
+    shaped = states.ndim == actions.ndim == 2 and len(states) == len(actions) + 1
+    return shaped and bool(states.size and actions.size)
+
+
+def _log(pairs: Sequence[tuple[Array, Array]], target: Array | None, step: float) -> Log:
+    """Trajectories as a log, whose rows are numbered from 0 in each of them."""
+    n_z, n_a = (part.shape[1] for part in pairs[0])
+    channels = Channels([f"z{i + 1}" for i in range(n_z)], [f"a{j + 1}" for j in range(n_a)])
+    last = np.full((1, n_a), np.nan)
+    values = np.vstack([np.hstack([z, np.vstack([a, last])]) for z, a in pairs])
+    rows = np.concatenate([np.arange(len(z)) for z, _ in pairs])
+    return Log(channels, values, step * rows, rows, target, step)
+
+
+def _of_log(
+    log: Log, sample_time: float | None, remedies: Remedies, *, named: bool = True
+) -> Measurements:
+    """The trajectories of a log; named: whether its channels have names of their own."""
+    if named and sample_time is not None:
+        if log.step is None:
+            raise ValueError("leave out --sample-time: it has a column of times")
+        log = replace(log, step=sample_time, times=log.times * sample_time)
+    found = trajectories_of(log, remedies, timed=log.step is None, most=MAX_TRAJECTORIES)
     return Measurements(
         found.trajectories,
         found.target,
-        1.0 if step is None else step,  # without a trajectory, which is refused
-        found.channels,
+        1.0 if found.sample_time is None else found.sample_time,  # without one, refused
+        found.channels if named else NUMBERED,
         _numbered(len(found.trajectories)),
         tuple(found.remarks),
     )

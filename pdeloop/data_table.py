@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from itertools import pairwise
 from math import isfinite, nan
 from typing import NamedTuple
 
@@ -23,15 +23,16 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.reduce.channels import Channels, listed
+from pdeloop.log import Log, in_seconds
 
-__all__ = ["Columns", "Table", "read_table"]
+__all__ = ["Columns", "places_of", "read_table"]
 
 SEPARATORS = (",", ";", "\t", "|")
 """Tried in this order; without any of them columns are separated by spaces."""
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 """Lower-case texts that stand for a missing value."""
-JITTER = 1e-3
-"""Relative tolerance of a step of t to the median one."""
+TIME = re.compile(r"t(_[a-zµμ]+|\s*[\[(][^\])]*[\])])?")
+"""The column of times where none is named: t, or t with its unit, such as t_ms or t [ms]."""
 TARGET = "target"
 """The word in the column of t whose row has z_r."""
 
@@ -53,31 +54,6 @@ class Columns:
         return bool(self.time or self.states or self.inputs)
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """The contents of a table.
-
-    Attributes
-    ----------
-    channels : Channels
-        Names of the columns.
-    trajectories : list of (states (N + 1, n_z), actions (N, n_a))
-        a_k was held from z_k to z_{k+1}.
-    target : (n_z,) array or None
-        Of the row whose t is the word target.
-    sample_time : float or None
-        Of t, in s; None without such a column.
-    remarks : list of str
-        What was left out.
-    """
-
-    channels: Channels
-    trajectories: list[tuple[Array, Array]]
-    target: Array | None
-    sample_time: float | None
-    remarks: list[str] = field(default_factory=list)
-
-
 class _Places(NamedTuple):
     """Indices of the columns: time is -1 if there is none."""
 
@@ -86,11 +62,11 @@ class _Places(NamedTuple):
     inputs: list[int]
 
 
-def read_table(raw: bytes, columns: Columns, *, timed: bool = True, most: int) -> Table:
+def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: str = "") -> Log:
     """The measurements in the bytes of a file. ValueError, one sentence, if it is not such a table.
 
-    timed: whether there has to be a column of times; without one all rows are one trajectory. most:
-    trajectories that are taken.
+    timed: whether there has to be a column of times; without one all rows are one trajectory, and their
+    numbers the times. time_unit: of t, if not the one in its name.
     """
     separator, numbered = _lines(_text(raw))
     _, first = next(numbered, (1, []))
@@ -99,7 +75,7 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, most: int) -
     head = [name.strip().lstrip("#").strip() for name in first]
     width = max((i for i, name in enumerate(head) if name), default=-1) + 1
     head = head[:width]
-    places = _places(head, columns, timed)
+    places = places_of(head, columns, timed)
     channels = Channels([head[i] for i in places.states], [head[i] for i in places.inputs])
     target: Array | None = None
     values, rows, numbers = array("d"), array("q"), _Numbers(head, separator)
@@ -126,72 +102,11 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, most: int) -
     count = (places.time >= 0) + len(places.states) + len(places.inputs)
     table = np.array(values).reshape(-1, count)
     times = table[:, 0] if places.time >= 0 else np.arange(len(table), dtype=np.float64)
-    own = table[:, places.time >= 0 :]
-    return _cut(own, times, np.array(rows), channels, target, timed=places.time >= 0, most=most)
-
-
-def _cut(
-    values: Array,
-    times: Array,
-    rows: Array,
-    channels: Channels,
-    target: Array | None,
-    *,
-    timed: bool,
-    most: int,
-) -> Table:
-    """The rows as trajectories: each ends where t does not grow."""
-    n_z = len(channels.states)
-    starts = 1 + np.flatnonzero(~(np.diff(times) > 0.0))
-    bounds = [0, *starts.tolist(), len(times)]
-    if len(bounds) - 1 > most:
-        raise ValueError(f"expected at most {most} trajectories, got {len(bounds) - 1}")
-    parts = [slice(a, b) for a, b in pairwise(bounds)]
-    single = [int(rows[part.start]) for part in parts if part.stop - part.start == 1]
-    parts = [part for part in parts if part.stop - part.start > 1]
-    ends = np.array([part.stop - 1 for part in parts], dtype=np.int64)
-    known = np.isfinite(values)
-    known[ends, n_z:] = True  # nothing follows the last actions
-    if not known.all():
-        k, i = (int(place) for place in np.argwhere(~known)[0])
-        name = [*channels.states, *channels.inputs][i]
-        more = int((~known).any(axis=1).sum()) - 1
-        others = f" (and {more} more with gaps)" if more else ""
-        raise ValueError(
-            f"{name} is missing in row {rows[k]}{others}: fill the gap, or cut the file in two there, "
-            "as several files can be given"
-        )
-    step = None
-    if timed and parts:
-        step = _sample_time(times, rows, parts)
-    remarks = []
-    if single:
-        remarks.append(
-            f"left out row {listed([str(row) for row in single])}: t increases neither before nor "
-            "after it"
-        )
-    trajectories = [(values[p, :n_z], values[p.start : p.stop - 1, n_z:]) for p in parts]
-    return Table(channels, trajectories, target, step, remarks)
-
-
-def _sample_time(times: Array, rows: Array, parts: Sequence[slice]) -> float:
-    """The step of t, which has to be the same throughout."""
-    steps = [np.diff(times[part]) for part in parts]
-    every = np.sort(np.concatenate(steps))
-    median = float(
-        every[(len(every) - 1) // 2]
-    )  # an existing one; of two different ones, the shorter
-    # A clock that counts since 1970 has steps that are rounded themselves.
-    rounding = 4 * np.finfo(np.float64).eps * float(np.abs(times).max())
-    for part, own in zip(parts, steps, strict=True):
-        if (wrong := np.flatnonzero(np.abs(own - median) > JITTER * median + rounding)).size:
-            k = part.start + 1 + int(wrong[0])
-            raise ValueError(
-                f"expected equal steps of t, got {own[wrong[0]]:g} s before row {rows[k]} where the "
-                f"others are {median:g} s: fill the gap or resample the log, or cut the file in two "
-                "there, as several files can be given"
-            )
-    return median
+    remarks: list[str] = []
+    if places.time >= 0 and not numbers.instants:
+        times, remarks = in_seconds(head[places.time], times, time_unit)
+    own, step = table[:, places.time >= 0 :], None if places.time >= 0 else 1.0
+    return Log(channels, own, times, np.array(rows), target, step, remarks)
 
 
 def _text(raw: bytes) -> str:
@@ -258,7 +173,7 @@ def _rows(source: io.StringIO, skipped: int, separator: str) -> Iterator[tuple[i
         ) from error
 
 
-def _places(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
+def places_of(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
     """Find time, states and inputs. ValueError if a name is missing, or means two things."""
     shown = ", ".join(head)[:200]
     if twice := sorted({name for name in head if head.count(name) > 1 and name}):
@@ -266,7 +181,7 @@ def _places(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
     if not columns.chosen:
         kinds = {"t": [], "z": [], "a": [], "": []}  # type: dict[str, list[int]]
         for i, name in enumerate(head):
-            kind = "t" if name == "t" else name[:1] if name[:1] in ("z", "a") else ""
+            kind = "t" if TIME.fullmatch(name) else name[:1] if name[:1] in ("z", "a") else ""
             kinds[kind].append(i)
         if kinds[""] or not (kinds["z"] and kinds["a"] and (kinds["t"] or not timed)):
             raise ValueError(
@@ -274,9 +189,10 @@ def _places(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
                 f"or tabs, got '{shown}'; or choose columns with --time, --states and --inputs"
             )
         return _Places(kinds["t"][0] if kinds["t"] else -1, kinds["z"], kinds["a"])
+    named = next((name for name in head if TIME.fullmatch(name)), "t")
     found = {
         "--time": _matching(
-            head, columns.time or "t", "--time", needed=bool(columns.time) or timed
+            head, columns.time or named, "--time", needed=bool(columns.time) or timed
         ),
         "--states": _matching(head, columns.states or "z*", "--states"),
         "--inputs": _matching(head, columns.inputs or "a*", "--inputs"),
@@ -324,6 +240,11 @@ class _Numbers:
         self._separator = separator
         self._mark = ""
         self._since: datetime | None = None
+
+    @property
+    def instants(self) -> bool:
+        """Whether times were instants like 2026-01-31 12:00, which have no unit."""
+        return self._since is not None
 
     def read(self, line: Sequence[str], i: int, row: int) -> float:
         """The number in a cell; NaN where it is missing."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from math import isfinite
 
 from loop_interfaces.parameters import IDENTIFICATION
@@ -19,7 +20,10 @@ from pdeloop.commands.common import (
 )
 from pdeloop.output import print_json
 
-OF_DATA = ("time", "states", "inputs", "sample_time")
+OF_DATA = (
+    *("time", "states", "inputs", "sample_time"),
+    *("time_unit", "missing", "cut", "resample"),
+)
 """The options that only --data has."""
 
 
@@ -43,8 +47,8 @@ def add(commands: Commands) -> None:
         type=a_path,
         metavar="FILE",
         nargs="+",
-        help="states, actions, target and sampling time as .npz or .csv, one file or several of one "
-        "plant (docs/identification.md)",
+        help="states, actions, target and sampling time as .npz, .csv, .mat or .parquet, one file or "
+        "several of one plant (docs/identification.md)",
     )
     add = identify.add_argument_group("with --data").add_argument
     add("--time", metavar="NAME", help="the column of times (s), or the array sample_time [t]")
@@ -60,6 +64,30 @@ def add(commands: Commands) -> None:
         help="the columns of the inputs [those whose names begin with a]",
     )
     add("--sample-time", type=float, metavar="S", help="sampling time (s), if no column has times")
+    add(
+        "--time-unit", metavar="UNIT", help="unit of the times [the one in the column's name, or s]"
+    )
+    add(
+        "--missing",
+        type=partial(_numbers, finite=False),
+        metavar="X,...",
+        help="values that stand for missing readings, as in --missing=-9999",
+    )
+    add(
+        "--cut",
+        action="store_true",
+        default=None,
+        help="leave out rows with missing readings, spikes, frozen or saturated sensors, and begin a "
+        "new trajectory there and after gaps",
+    )
+    add(
+        "--resample",
+        type=float,
+        nargs="?",
+        const=0.0,
+        metavar="S",
+        help="interpolate to equal steps of S seconds [without S, the log's own]",
+    )
     add = identify.add_argument
     add(
         "--target",
@@ -117,7 +145,14 @@ def _identify(options: argparse.Namespace) -> int:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")
         table = {name: getattr(options, name) or "" for name in ("time", "states", "inputs")}
         measured = read_measurements(
-            *options.data, **table, sample_time=options.sample_time, target=options.target
+            *options.data,
+            **table,
+            sample_time=options.sample_time,
+            target=options.target,
+            time_unit=options.time_unit or "",
+            missing=options.missing,
+            cut=bool(options.cut),
+            resample=options.resample,
         )
         found = identify_data(measured, given)
     else:
@@ -154,15 +189,15 @@ def _identify(options: argparse.Namespace) -> int:
     return 0
 
 
-def _numbers(text: str) -> list[float]:
+def _numbers(text: str, finite: bool = True) -> list[float]:
     """A list of numbers, for argparse."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if not numbers or not all(map(isfinite, numbers)):
+    if not numbers or (finite and not all(map(isfinite, numbers))):
         raise argparse.ArgumentTypeError(
-            f"expected finite numbers with commas between, got '{text}'"
+            f"expected {'finite ' * finite}numbers with commas between, got '{text}'"
         )
     return numbers
 

@@ -118,7 +118,7 @@ def test_a_flawed_csv_is_refused(tmp_path: Path, content: bytes, words: str) -> 
 def test_other_files_and_larger_ones_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused(tmp_path / "own.xlsx", r"must be a .npz or a .csv file")
+    refused(tmp_path / "own.xlsx", r"must be a .npz, .csv, .mat or .parquet file")
     refused(tmp_path / "none.csv", "cannot be read: No such file")
     monkeypatch.setattr(data_file, "MAX_TEXT_BYTES", 100)
     refused(EXAMPLE, "larger than 100 bytes; give the same as .npz")

@@ -1,0 +1,371 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What loggers and sensors do to a log, found before anything is fitted to it.
+
+Every function looks at the rows of a log in order. `resolution` is the smallest change of a channel:
+a signal that comes to rest does so by changes of that size, whereas a frozen or a saturated sensor
+stops in the middle of a motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import SHOWN, Channels, listed
+
+__all__ = ["Finding", "findings", "sentinels"]
+
+FULL_SCALE = (32767.0, -32768.0, 65535.0, 2147483647.0, -2147483648.0, 4294967295.0, 1e20, 1e30)
+"""Values besides 99, 999.9, -9999, ... that stand for no reading."""
+ISOLATED = 3.0
+"""Ranges of a channel between it and a value that is none of its own."""
+RESTING = 3.0
+"""Resolutions by which a signal that comes to rest changes at most."""
+FROZEN = 15
+"""Equal rows of a frozen sensor."""
+LONGER = 5
+"""Usual runs of equal rows that a frozen one is as long as."""
+SATURATED = 10
+"""Rows at an extreme value of a saturated sensor, at least, and `SATURATED_SHARE` of all."""
+SATURATED_SHARE = 0.02
+SPIKE = 5.0
+"""Size of a jump and of the one back, relative to the 98th percentile of all."""
+OFFSET = 20.0
+"""Standard deviations between 0 and the mean of a channel with a large offset."""
+ONE = 1e-7
+"""Standard deviation of the difference of two channels that are one, relative to their own."""
+LEAST = 20
+"""Rows of a log in which anything is looked for."""
+PAIRS = 256
+"""Channels of which each two are compared, at most."""
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Rows of a log that are not what the plant did, or a property of its channels.
+
+    Attributes
+    ----------
+    text : str
+        One sentence with the channels, the first row, and the option that helps.
+    spoilt : (R,) array of bool
+        The rows that `--cut` leaves out.
+    step : int
+        Rows between two readings of a sensor that is slower than the log; 0: none.
+    """
+
+    text: str
+    spoilt: Flags
+    step: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Equal values in a row, of one channel: first row, length, the changes before and after.
+
+    grain: the last digit of each value, or the resolution if that is larger.
+    """
+
+    begins: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    before: Array
+    after: Array
+    resolution: float
+    grain: Array
+
+    @staticmethod
+    def of(x: Array, first: Flags) -> _Runs:
+        """first: the first rows of trajectories, where no change is one."""
+        begins = np.flatnonzero(np.r_[True, x[1:] != x[:-1]] | first)
+        lengths = np.diff(np.r_[begins, len(x)])
+        change = np.abs(x[begins] - x[begins - 1])
+        change[first[begins]] = 0.0
+        moved = change[change > 0.0]
+        resolution = float(moved.min()) if moved.size else 0.0
+        grain = np.full(len(begins), resolution)
+        for number in np.flatnonzero(lengths >= 3):
+            value = repr(float(x[begins[number]])).lower()
+            mantissa, _, exponent = value.partition("e")
+            digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+            grain[number] = max(resolution, digit)
+        return _Runs(begins, lengths, change, np.r_[change[1:], 0.0], resolution, grain)
+
+    @property
+    def abrupt(self) -> Flags:
+        """Runs before which the channel was in motion."""
+        return np.asarray(self.before > RESTING * self.grain)
+
+    @property
+    def whole(self) -> Flags:
+        """Runs that neither begin nor end a trajectory."""
+        return np.asarray((self.before > 0.0) & (self.after > 0.0))
+
+    def rows(self, chosen: Flags, size: int) -> Flags:
+        """The rows of some of them."""
+        found = np.zeros(size, dtype=bool)
+        for begin, length in zip(self.begins[chosen], self.lengths[chosen], strict=True):
+            found[begin : begin + length] = True
+        return found
+
+
+def sentinels(values: Array, n_z: int) -> list[tuple[int, float, Flags]]:
+    """Values that stand for no reading: column, value, rows.
+
+    Of the states also any other value that comes back exactly and is far from all others; of the
+    inputs, which may well have rare pulses, only the usual ones.
+    """
+    found = []
+    for i, x in enumerate(values.T):
+        known = x[np.isfinite(x)]
+        usual = _usual_sentinel(known)
+        own = known[~usual]
+        if known.size < LEAST or own.size < known.size / 2:
+            continue
+        low, high = _cluster(own) if i < n_z else (float(own.min()), float(own.max()))
+        reach = ISOLATED * max(high - low, 0.0 if i < n_z else max(abs(low), abs(high)))
+        for value in np.unique(known[(known < low - reach) | (known > high + reach)]):
+            rows = x == value
+            again = int(rows.sum()) > 1 and i < n_z and high > low
+            if _usual_sentinel(np.array([value]))[0] or again:
+                found.append((i, float(value), rows))
+    return found
+
+
+def _usual_sentinel(x: Array) -> Flags:
+    """Nothing but nines, or the full scale of a converter."""
+    text = np.array([f"{abs(value):.6g}".replace(".", "") for value in np.unique(x)])
+    nines = [len(t) > 1 and set(t) == {"9"} for t in text]
+    special = np.unique(x)[np.array(nines, dtype=bool)] if text.size else np.zeros(0)
+    return np.isin(x, [*special, *FULL_SCALE]) | (np.abs(x) >= 1e30)
+
+
+def _cluster(x: Array) -> tuple[float, float]:
+    """Lowest and highest value of the channel itself: no gap of `ISOLATED` of its ranges in between."""
+    values = np.unique(x)
+    low, high = (float(q) for q in np.quantile(x, (0.05, 0.95)))
+    reach = ISOLATED * (high - low)
+    for value in values[values > high]:
+        if value - high > reach:
+            break
+        high = float(value)
+    for value in values[values < low][::-1]:
+        if low - value > reach:
+            break
+        low = float(value)
+    return low, high
+
+
+def findings(
+    values: Array, first: Flags, rows: NDArray[np.int64], channels: Channels, step: float
+) -> list[Finding]:
+    """What the rows of a log show.
+
+    Parameters
+    ----------
+    values : (R, n_z + n_a) array
+        States and inputs; NaN where a number is missing.
+    first : (R,) array of bool
+        The first row of each trajectory.
+    rows : (R,) array of int
+        Their numbers in the file.
+    channels : Channels
+        Names.
+    step : float
+        Seconds between two rows.
+    """
+    if len(values) < LEAST:
+        return []
+    n_z = len(channels.states)
+    states, inputs = values[:, :n_z], values[:, n_z:]
+    held = np.r_[True, (inputs[1:] == inputs[:-1]).all(axis=1)] | first
+    found: dict[tuple[str, int, int], tuple[list[int], Flags]] = {}
+    slow: dict[int, list[int]] = {}
+    for i, x in enumerate(states.T):
+        if np.ptp(x[np.isfinite(x)]) == 0.0 if np.isfinite(x).any() else True:
+            continue
+        runs = _Runs.of(x, first)
+        period = _slow(runs)
+        if period:
+            slow.setdefault(period, []).append(i)
+        kinds = {"spike": _spikes(x, inputs, first)}
+        if not period:
+            kinds |= {"saturated": _saturated(x, runs), "frozen": _frozen(x, runs, held)}
+            kinds["frozen"] &= ~kinds["saturated"]
+        for kind, spoilt in kinds.items():
+            if spoilt.any():
+                place = int(np.argmax(spoilt)), int(spoilt.sum())
+                found.setdefault((kind, *place), ([], spoilt))[0].append(i)
+    result = [
+        Finding(_sentence(kind, own, spoilt, states, rows, channels), spoilt)
+        for (kind, _, _), (own, spoilt) in found.items()
+    ]
+    nothing = np.zeros(len(values), dtype=bool)
+    if (
+        sum(map(len, slow.values())) < n_z
+    ):  # the others are as fast as the log: what follows an input?
+        for x in inputs.T:
+            slow.pop(_slow(_Runs.of(x, first)), None)
+    for period, own in slow.items():
+        names = listed([channels.state(i) for i in own])
+        result.append(
+            Finding(
+                f"{names} {'changes' if len(own) == 1 else 'change'} in every "
+                f"{_ordinal(period)} row only, so the log is faster than the sensor (first in row "
+                f"{rows[min(period, len(rows) - 1)]}): give --resample {period * step:.6g}",
+                nothing,
+                period,
+            )
+        )
+    result += [Finding(text, nothing) for text in _offsets(values, channels)]
+    result += [Finding(text, nothing) for text in _twins(values, rows, channels)]
+    return result
+
+
+def _sentence(
+    kind: str,
+    own: Sequence[int],
+    spoilt: Flags,
+    states: Array,
+    rows: NDArray[np.int64],
+    channels: Channels,
+) -> str:
+    k, count = int(np.argmax(spoilt)), int(spoilt.sum())
+    names, value = listed([channels.state(i) for i in own]), states[k, own[0]]
+    are = "is" if len(own) == 1 else "are"
+    if kind == "spike":
+        more = f" (and in {count - 1} more rows)" if count > 1 else ""
+        return (
+            f"{names} {'jumps' if len(own) == 1 else 'jump'} to {value:.6g} for one row, row "
+            f"{rows[k]}{more}: leave it out with --cut"
+        )
+    if kind == "saturated":
+        return (
+            f"{names} {are} at {value:.6g}, an end of the range, in {count} rows, the first of them "
+            f"row {rows[k]}, as of a saturated sensor: leave them out with --cut"
+        )
+    return (
+        f"{names} {are} frozen ({value:.6g}) in {count} rows, from row {rows[k]} on: leave them out "
+        "with --cut"
+    )
+
+
+def _slow(runs: _Runs) -> int:
+    """Rows between two changes of a channel that hardly ever changes twice in a row; or 0."""
+    lengths, changes = runs.lengths[runs.whole], runs.before[runs.whole]
+    if len(lengths) < 10 or (lengths == 1).mean() >= 0.1:
+        return 0
+    if np.median(changes) < 3.0 * runs.resolution:  # a slow signal in coarse steps
+        return 0
+    return int(np.median(lengths))
+
+
+def _spikes(x: Array, inputs: Array, first: Flags) -> Flags:
+    """Rows to which a channel jumps, and back, as it never does else, without a pulse of an input."""
+    change = np.diff(x)
+    change[first[1:]] = np.nan
+    size = np.abs(change)
+    known = size[np.isfinite(size)]
+    found = np.zeros(len(x), dtype=bool)
+    if not known.any():
+        return found
+    usual = max(float(np.quantile(known, 0.98)), RESTING * float(known[known > 0].min()))
+    back = change[:-1] * change[1:] < 0.0
+    found[1:-1] = back & (np.minimum(size[:-1], size[1:]) > SPIKE * usual)
+    pulse = np.zeros(len(x), dtype=bool)
+    moved = np.diff(inputs, axis=0)
+    pulse[1:-1] = (moved[:-1] * moved[1:] < 0.0).any(axis=1)
+    pulse[1:] |= pulse[:-1].copy()
+    return found & ~pulse
+
+
+def _frozen(x: Array, runs: _Runs, held: Flags) -> Flags:
+    """Rows of long runs that begin or end in the middle of a motion."""
+    others = np.quantile(runs.lengths, 0.95) if len(runs.lengths) > LEAST else 1.0
+    long = (runs.lengths >= FROZEN) & (runs.lengths >= LONGER * others) & (runs.before > 0.0)
+    left = runs.after > RESTING * runs.grain
+    for number in np.flatnonzero(long & ~runs.abrupt):
+        begin = runs.begins[number]
+        moved = not held[begin + 1 : begin + runs.lengths[number] - 1].all()
+        long[number] = moved and left[number]
+    return runs.rows(long, len(x))
+
+
+def _saturated(x: Array, runs: _Runs) -> Flags:
+    """Rows of several runs at the largest or the smallest value, reached in the middle of a motion."""
+    found = np.zeros(len(x), dtype=bool)
+    for end in (np.nanmax(x), np.nanmin(x)):
+        own = (x[runs.begins] == end) & (runs.lengths >= 3)
+        count, rows = int(own.sum()), int(runs.lengths[own].sum())
+        elsewhere = runs.lengths[~own & (x[runs.begins] != end)]
+        usual = float(elsewhere.mean()) if elsewhere.size else np.inf
+        enough = count > 1 and rows >= max(SATURATED, SATURATED_SHARE * len(x))
+        if enough and runs.abrupt[own].mean() >= 0.5 and rows / count >= 3.0 * usual:
+            found |= x == end
+    return found
+
+
+def _offsets(values: Array, channels: Channels) -> list[str]:
+    """States that vary little about a large value, if most do: of a field some points may."""
+    known = [x[np.isfinite(x)] for x in values.T[: len(channels.states)]]
+    mean = np.array([x.mean() if x.size else 0.0 for x in known])
+    spread = np.array([x.std() if x.size else 0.0 for x in known])
+    own = np.flatnonzero((np.abs(mean) > OFFSET * spread) & (spread > 0.0)).tolist()
+    if len(own) < 0.5 * len(known):
+        return []
+    worst = max(own, key=lambda i: abs(mean[i]) / spread[i])
+    return [
+        f"{listed([channels.state(i) for i in own])} {'varies' if len(own) == 1 else 'vary'} little "
+        f"about a large offset ({channels.state(worst)} by {spread[worst]:.3g} about "
+        f"{mean[worst]:.5g}), which a model without a constant term takes for a mode that stays"
+    ]
+
+
+def _twins(values: Array, rows: NDArray[np.int64], channels: Channels) -> list[str]:
+    """Two channels, of which one at least is a state, that are one in two units."""
+    n_z, names = len(channels.states), [*channels.states, *channels.inputs]
+    whole = values[np.isfinite(values).all(axis=1)]
+    if len(whole) < LEAST or values.shape[1] > PAIRS:
+        return []
+    centred = whole - whole.mean(axis=0)
+    spread = centred.std(axis=0)
+    moving = np.flatnonzero(spread > 1e-12 * np.abs(whole).max(axis=0))
+    unit = centred[:, moving] / spread[moving]
+    with np.errstate(all="ignore"):
+        change = np.abs(np.diff(whole[:, moving], axis=0))
+        grain = np.nanmin(np.where(change > 0.0, change, np.nan), axis=0) / spread[moving]
+    grain = np.where(grain < 0.02, grain, 0.0)
+    same = np.abs(unit.T @ unit) / len(unit)
+    found, taken = [], set[int]()
+    for i, j in np.argwhere(np.triu(same > 1.0 - 1e-3, 1)).tolist():
+        one, other = int(moving[i]), int(moving[j])
+        if one in taken or other in taken or (one >= n_z and other >= n_z):
+            continue
+        sign = np.sign(unit[:, i] @ unit[:, j])
+        if np.abs(unit[:, j] - sign * unit[:, i]).max() > max(ONE, grain[i] + grain[j]):
+            continue
+        taken.add(other)
+        factor = sign * spread[other] / spread[one]
+        offset = whole[:, other].mean() - factor * whole[:, one].mean()
+        scaled = names[one] if abs(factor - 1) < 1e-3 else f"{factor:.4g} {names[one]}"
+        small = abs(offset) < 1e-3 * spread[other]
+        plus = "" if small else f" {'+' if offset > 0.0 else '-'} {abs(offset):.4g}"
+        flag = "--states" if other < n_z else "--inputs"
+        found.append(
+            f"{names[other]} is {scaled}{plus} in every row from row {rows[0]} on, so the two are one "
+            f"channel: leave one out of {flag}"
+        )
+    if len(found) > SHOWN:
+        found[SHOWN:] = [f"{len(found) - SHOWN} more channels are others again"]
+    return found
+
+
+def _ordinal(number: int) -> str:
+    """2nd, 3rd, 4th, ..."""
+    endings = {1: "st", 2: "nd", 3: "rd"}
+    return f"{number}{'th' if number % 100 in (11, 12, 13) else endings.get(number % 10, 'th')}"
