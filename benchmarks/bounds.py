@@ -25,6 +25,7 @@ from benchmarks.descent import Descent, descend
 from benchmarks.families.cases import Case
 from benchmarks.true_model import TrueModel
 from benchmarks.warm_start import warm_start
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.one_thread import one_thread
 from loop_interfaces.parameters import INSTRUMENTS
@@ -103,7 +104,7 @@ def closed_loop(values: Mapping[str, Any], U: Array) -> ClosedLoop:
         ideal.state_weight,
         ideal.action_weight,
         ideal.horizon,
-        values["action_limit"],
+        ActionSet.of(values),
         model=TrueModel(ideal),
         noise=values["measurement_noise"],
     )
@@ -170,16 +171,23 @@ def best_inputs(
     """
     loop = replace(loop, noise=0.0)
     start = np.zeros((loop.horizon, len(fields), loop.model.n_a))
-    if loop.action_limit:
+    admissible = loop.action_set
+    if admissible.bounded:
         # Without the law, as what is added to an action that saturates has no effect.
         start, theta = loop.simulate(theta, fields).actions, np.zeros_like(theta)
+
+    def balanced(v: Array) -> tuple[float, Array]:
+        cost, gradient = _mean(*inputs_cost(loop, theta, admissible.project(v), fields))
+        return cost, admissible.pull_back(v, gradient)
+
     found = descend(
-        lambda v: _mean(*inputs_cost(loop, theta, v, fields)),
+        balanced if admissible.zero_mean else lambda v: _mean(*inputs_cost(loop, theta, v, fields)),
         start,
         tolerance=tolerance,
-        limit=loop.action_limit,
+        action_set=admissible,
     )
-    return inputs_cost(loop, theta, found.x, fields)[0], found
+    inputs = admissible.project(found.x) if admissible.zero_mean else found.x
+    return inputs_cost(loop, theta, inputs, fields)[0], found
 
 
 def _mean(costs: Array, gradient: Array) -> tuple[float, Array]:

@@ -215,7 +215,7 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
     numbers = count_from(1)
 
     def costs_of(K: Array, b: Array) -> Array:
-        acts = saturated(affine_law(K, b), context.action_limit)
+        acts = saturated(affine_law(K, b), context.action_set)
         noise = 10**6 * next(numbers) + np.arange(len(seeds))  # of every rollout its own
         own = noise if context.noise else None
         found = pdeloop.rollout(pair.plant, acts, seeds, own, keep=False).costs

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 
 __all__ = ["Descent", "descend"]
@@ -46,7 +47,7 @@ def descend(
     *,
     tolerance: float,
     iterations: int = 1000,
-    limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
 ) -> Descent:
     """Minimise function(x) = (J, dJ/dx) from x on.
 
@@ -60,8 +61,8 @@ def descend(
         Converged when J falls by less than this share of it in WINDOW iterations.
     iterations
         At most.
-    limit
-        Largest magnitude of the numbers of x; 0 for none.
+    action_set
+        Whose bounds the numbers of x, (..., n_a), have.
 
     Raises
     ------
@@ -88,19 +89,20 @@ def descend(
         if len(costs) > WINDOW and fall() < tolerance:
             raise StopIteration
 
+    low, high = (np.broadcast_to(b, x.shape) for b in (action_set.low, action_set.high))
     options = {"maxiter": iterations, "maxfun": 10 * iterations, "maxcor": MEMORY}
     end = minimize(
         bounded,
         x.ravel(),
         jac=True,
         method="L-BFGS-B",
-        bounds=[(-limit, limit)] * x.size if limit else None,
+        bounds=Bounds(low.ravel(), high.ravel()) if action_set.bounded else None,
         callback=after,
         options={**options, "ftol": 0.0, "gtol": 0.0},
     )
     _, gradient = bounded(end.x)
-    if limit:  # what points out of the bounds is nothing that is left to fall
-        outward = (np.abs(end.x) >= limit) & (gradient * end.x < 0.0)
+    if action_set.bounded:  # what points out of the bounds is nothing that is left to fall
+        outward = np.where(gradient > 0.0, end.x <= low.ravel(), end.x >= high.ravel())
         gradient = np.where(outward, 0.0, gradient)
     norm = float(np.linalg.norm(end.x) * np.linalg.norm(gradient) / end.fun)
     # A descent that comes to the bottom fast ends before its window is full of small falls. What is

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_method.design.lqt import Gains
 from loop_method.reduce.reduced_model import ReducedModel
@@ -44,9 +45,9 @@ class KalmanLaw:
     and s_0 are those found there. Anderson, Moore, *Optimal Filtering*, section 3.1.
     """
 
-    def __init__(self, known: Identified, n_y: int, limit: float) -> None:
+    def __init__(self, known: Identified, n_y: int, action_set: ActionSet) -> None:
         model, data = known.model, known.data
-        self._known, self._n_y, self._limit = known, n_y, limit or np.inf
+        self._known, self._n_y, self._action_set = known, n_y, action_set
         s = [each.states @ model.U for each in data]
         w = [
             own[1:] - own[:-1] @ model.A.T - each.actions @ model.B.T
@@ -73,7 +74,7 @@ class KalmanLaw:
         s = self._s + (states[:, : self._n_y] - self._s @ C.T) @ gain.T
         P = (np.eye(n_s) - gain @ C) @ self._P
         actions: Array = s @ self._known.gains.K_a.T + self._known.gains.K_b @ self._known.s_r
-        actions = np.clip(actions, -self._limit, self._limit)
+        actions = self._action_set.project(actions)
         self._s, self._P = s @ A.T + actions @ B.T, A @ P @ A.T + self._W
         return actions
 

@@ -19,10 +19,11 @@ from scipy import linalg
 import pdeloop
 from benchmarks.families import plants
 from benchmarks.families.cases import CASES, Case
+from loop_interfaces.action_set import ANY_ACTION
 from loop_interfaces.arrays import Array
 from loop_method.design.finite_horizon import finite_horizon
 from loop_method.models import FittedModel, Measured, affine_law, fit_field_model
-from loop_method.models.base import Law
+from loop_method.models.base import Law, saturated
 from loop_method.models.prediction import errors
 
 __all__ = ["run", "text"]
@@ -53,12 +54,12 @@ class Rollouts:
         if self._own is not None:
             plant: Any = self._own
             self.variance, self.components = plant.exploration_variance, plant_components(plant)
-            self.limit = self.noise = 0.0
+            self.action_set, self.noise = ANY_ACTION, 0.0
         else:
             problem = pdeloop.problem(case.base, **case.parameters())
             plant = self._plant = problem.plant()
             self.variance, self.components = problem.values["exploration_variance"], 1
-            self.limit = plant.instruments.action_limit
+            self.action_set = plant.action_set
             self.noise = plant.instruments.measurement_noise
         self.n_a, self.horizon = plant.n_a, plant.horizon
         self.weights = plant.state_weight, plant.action_weight
@@ -107,7 +108,7 @@ class Rollouts:
             self.target,
             components=self.components,
             noise=self.noise,
-            action_limit=self.limit,
+            action_set=self.action_set,
         )
 
     def law(self, fitted: FittedModel) -> Law | None:
@@ -119,8 +120,7 @@ class Rollouts:
             K, b = finite_horizon(A, B, drift, *self.weights, self.horizon)
         except (linalg.LinAlgError, ValueError):
             return None
-        law, limit = affine_law(K, b - K @ self.target), self.limit
-        return (lambda k, z: np.clip(law(k, z), -limit, limit)) if limit else law
+        return saturated(affine_law(K, b - K @ self.target), self.action_set)
 
 
 def plant_components(plant: Any) -> int:

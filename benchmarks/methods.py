@@ -19,6 +19,7 @@ from benchmarks.estimators import Experiment, Identified, KalmanLaw, LikeliestFi
 from benchmarks.warm_start import warm_start
 from controller_node.identification import identify
 from controller_node.policy import excitation
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.one_thread import one_thread
@@ -145,11 +146,13 @@ def cma_es(
 class Predictive:
     """Linear model predictive control on a reduced model, its quadratic programs solved by OSQP.
 
-        min  sum_{j<N} q |s_j - s_r|^2 + r |a_j|^2 + V(s_N),    s_{j+1} = A s_j + B a_j,  |a_j| <= limit
+        min  sum_{j<N} q |s_j - s_r|^2 + r |a_j|^2 + V(s_N),    s_{j+1} = A s_j + B a_j,
 
-    V is the value of LQ tracking, so that without limit it is the LQT law, whatever N. Rawlings, Mayne,
-    Diehl, *Model Predictive Control*, 2nd edition, section 1.3; Stellato et al., "OSQP", Math. Prog.
-    Comp. 12, 2020.
+    within bounds of a_j.
+
+    V is the value of LQ tracking, so that without bounds it is the LQT law, whatever N. Rawlings,
+    Mayne, Diehl, *Model Predictive Control*, 2nd edition, section 1.3; Stellato et al., "OSQP", Math.
+    Prog. Comp. 12, 2020.
     """
 
     def __init__(self, known: Identified, values: Values, N: int) -> None:
@@ -157,7 +160,12 @@ class Predictive:
 
         A, B, n_s, n_a = known.model.A, known.model.B, known.model.n_s, known.model.n_a
         q, r = values["state_weight"], values["action_weight"]
-        limit = values["action_limit"] or np.inf
+        admissible = ActionSet.of(values)
+        if admissible.zero_mean:
+            raise ValueError("predictive control knows no actions of mean zero")
+        low, high = (
+            np.broadcast_to(b, (N, n_a)).ravel() for b in (admissible.low, admissible.high)
+        )
         # s_{1..N} = free s_0 + forced a
         powers = [np.linalg.matrix_power(A, j) for j in range(N + 1)]
         free, forced = np.vstack(powers[1:]), np.zeros((N * n_s, N * n_a))
@@ -177,8 +185,8 @@ class Predictive:
             sparse.csc_matrix(np.triu(forced.T @ weight @ forced + r * np.eye(N * n_a))),
             np.zeros(N * n_a),
             sparse.eye(N * n_a, format="csc"),
-            np.full(N * n_a, -limit),
-            np.full(N * n_a, limit),
+            low,
+            high,
             verbose=False,
             eps_abs=1e-6,
             eps_rel=1e-6,
@@ -206,7 +214,7 @@ def identified_again(
     pair = LocalPair(values)
     plant, weights = pair.plant, {name: values[name] for name in ("state_weight", "action_weight")}
     target = build_plant({**values, "sensors": 0}).target if whole else plant.target
-    variance, limit = values["exploration_variance"], values["action_limit"] or np.inf
+    variance, admissible = values["exploration_variance"], ActionSet.of(values)
     data: list[Experiment] = []
     law: Law | None = None
     paid = 0
@@ -220,7 +228,7 @@ def identified_again(
             actions = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
             if law is not None:
                 actions += law(k, states)
-            return actions.clip(-limit, limit)
+            return admissible.project(actions)
 
         episode = rollout(plant, excited, fields)
         paid += count
@@ -255,7 +263,7 @@ def lqg(values: Values, *, whole: bool) -> tuple[LocalPair, Law, int]:
 
     def controller(plant: Plant, known: Identified) -> Law:
         assert isinstance(plant, InstrumentedPlant)
-        return KalmanLaw(known, plant.positions.size, values["action_limit"])
+        return KalmanLaw(known, plant.positions.size, ActionSet.of(values))
 
     if not values["sensors"]:
         raise ValueError("lqg is for plants with few sensors: give --settings sensors=16")

@@ -32,7 +32,7 @@ class Exploration:
     def actions(self, step: int) -> Array:
         """The actions of all environments in a step, (M, n_a)."""
         settings = self._settings
-        return excitations(self._start.values, step, settings.n_a, settings.action_limit)
+        return excitations(self._start.values, step, settings.n_a, settings.action_set)
 
     def lacks(self, state: Frame) -> bool:
         """True if the state must be kept. Two different ones of a step make the episode unusable."""
@@ -112,7 +112,7 @@ class Exploration:
 
     def _signature(self) -> float:
         start, settings = self._start, self._settings
-        digest = digest_of(start.values, settings.action_limit) if start.plant else 0
+        digest = digest_of(start.values, settings.action_set.signed) if start.plant else 0
         return signature(digest, design_digest(asdict(settings)))
 
     def _failure(self, reason: str, *, retry: bool) -> ModelFailure:

@@ -76,7 +76,7 @@ class ControllerFastPath(FastPath):
         if state is None or answering is None or answering.law is None:
             return False
         law = answering.law.compiled
-        if law is None:
+        if law is None or law.action_set.zero_mean:
             return False
         batch, n_z = state.values.shape
         if not self.expect(state, (batch, n_z), (batch, law.n_a)):

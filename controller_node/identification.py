@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.one_thread import one_thread
@@ -46,8 +47,8 @@ class DesignSettings:
         n_s of "field" and "regression"; 0: as `order.study_orders` suggests.
     state_weight, action_weight : float
         Of the stage cost.
-    action_limit : float
-        Magnitude at which actions saturate; 0: none. The gains are designed without it.
+    action_set : ActionSet
+        Admissible actions. The gains are designed without it.
     measurement_noise : float
         Standard deviation of the noise on every number of the states, for "field"; 0: none.
     cost : sequence of str
@@ -70,7 +71,7 @@ class DesignSettings:
     reduced_order: int
     state_weight: float
     action_weight: float
-    action_limit: float = 0.0
+    action_set: ActionSet = ANY_ACTION
     measurement_noise: float = 0.0
     cost: Sequence[str] = ()
     identification: str = "regression"
@@ -83,9 +84,10 @@ class DesignSettings:
     @staticmethod
     def of(values: Mapping[str, Any]) -> DesignSettings:
         """Those among the parameters."""
-        names = {item.name for item in fields(DesignSettings)} - {"constants"}
+        names = {item.name for item in fields(DesignSettings)} - {"constants", "action_set"}
         return DesignSettings(
             **{name: values[name] for name in names},
+            action_set=ActionSet.of(values),
             constants={name: value for name, value in values.items() if name.startswith(CONSTANTS)},
         )
 
@@ -276,7 +278,7 @@ def designed(
             [*trajectories, *further],
             target,
             rows,
-            action_limit=settings.action_limit,
+            action_set=settings.action_set,
             noise=settings.measurement_noise,
             settings=settings.method,
             models=settings.field_models,

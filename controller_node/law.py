@@ -33,12 +33,13 @@ LAW = np.dtype(
         ("n_z", np.int64),
         ("n_s", np.int64),
         ("n_a", np.int64),
-        ("limit", np.float64),  # magnitude at which an action saturates; 0: none
         # Addresses of arrays; the last axis of the first three is filled up to whole lanes.
         ("bases", np.int64),  # U, models by n_z by n_s
         ("constant", np.int64),  # K_b s_r, M by n_a
         ("feedback", np.int64),  # K_a^T, M by n_s by n_a
         ("index", np.int64),  # model of every environment, M
+        ("low", np.int64),  # bounds of an action, n_a
+        ("high", np.int64),
         ("scratch", np.int64),  # four times n_s and once n_a, each up to whole lanes
     ]
 )
@@ -97,11 +98,11 @@ def answer(law: Any, m: int, s: int, action: int) -> None:
             a = fma(load(law.feedback, (m * n_s + j) * wide + block), splat(read(s, j)), a)
         store(sums, block, a)
     for k in range(n_a):
-        value, limit = read(sums, k), law.limit
-        if limit > 0.0 and value > limit:
-            value = limit
-        elif limit > 0.0 and value < -limit:
-            value = -limit
+        value, low, high = read(sums, k), read(law.low, k), read(law.high, k)
+        if value > high:
+            value = high
+        elif value < low:
+            value = low
         write(action, k, value)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller_node.policy import ProjectedLaw, checked_index
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import digest
 from loop_method.laws.base import Law, Parts
@@ -41,15 +42,17 @@ class LawBatch:
         That of each model that environments can use; all of one kind and size.
     target : (n_z,) array
         z_r.
-    action_limit : float
-        Largest magnitude of an action; 0 for none.
+    action_set : ActionSet
+        Admissible actions, the nearest of which answers.
 
     Anything malformed raises a ValueError and leaves it as it was.
     """
 
-    def __init__(self, laws: Sequence[Law], target: ArrayLike, action_limit: float = 0.0) -> None:
-        self._laws, self._limit = list(laws), action_limit
-        projected = ProjectedLaw([law.model.U for law in laws], target, action_limit)
+    def __init__(
+        self, laws: Sequence[Law], target: ArrayLike, action_set: ActionSet = ANY_ACTION
+    ) -> None:
+        self._laws, self._action_set = list(laws), action_set
+        projected = ProjectedLaw([law.model.U for law in laws], target, action_set)
         self.compiled = projected if self._laws[0].compiled else None
         """The compiled form, if the law has one."""
         self._environments: list[tuple[Law, Parts]] = []
@@ -155,7 +158,7 @@ class LawBatch:
                 )
             ]
         )
-        return np.clip(found, -self._limit, self._limit) if self._limit > 0.0 else found
+        return self._action_set.project(found)
 
 
 def _vectors(theta: Array) -> list[Array]:

@@ -3,7 +3,7 @@
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
 
-saturated at +- action_limit if there is one. It is computed by `controller_node.law`.
+and the nearest admissible action in place of it. It is computed by `controller_node.law`.
 """
 
 import math
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array, read_only
 from loop_interfaces.jit.simd import whole_lanes
 from loop_interfaces.topics import StartColumn
@@ -29,15 +30,18 @@ class ProjectedLaw:
         The bases U that environments can use; all of one shape.
     target : (n_z,) array
         The target field z_r.
-    action_limit : float
-        Largest magnitude of an action; 0 for none.
+    action_set : ActionSet
+        Admissible actions.
 
     Call `set` before the first `actions`. Anything malformed raises a ValueError and leaves the law
     as it was.
     """
 
     def __init__(
-        self, models: Sequence[ArrayLike], target: ArrayLike, action_limit: float = 0.0
+        self,
+        models: Sequence[ArrayLike],
+        target: ArrayLike,
+        action_set: ActionSet = ANY_ACTION,
     ) -> None:
         bases = [np.asarray(basis, dtype=np.float64) for basis in models]
         shapes = {basis.shape for basis in bases}
@@ -62,6 +66,7 @@ class ProjectedLaw:
         plan = self._plan[0]
         plan["n_z"], plan["n_s"] = self._n_z, self._n_s
         plan["bases"] = self._bases.ctypes.data
+        self.action_set = ANY_ACTION
         # The reduced targets come from the same kernel as the reduced states: an identity for the
         # feedback.
         count = len(bases)
@@ -70,7 +75,7 @@ class ProjectedLaw:
         identity = np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))
         self._take(np.concatenate([identity] * 2, axis=2), np.arange(count))
         control(self._plan, read_only(np.tile(z_r, (count, 1))), self._reduced_targets)
-        plan["limit"] = action_limit
+        self.action_set = action_set
         self._set = False
 
     @property
@@ -128,6 +133,9 @@ class ProjectedLaw:
         plan["constant"], plan["feedback"] = (array.ctypes.data for array in self._gains)
         self._scratch = np.zeros(4 * whole_lanes(self._n_s) + whole_lanes(gains.shape[1]))
         plan["scratch"] = self._scratch.ctypes.data
+        bounds = self.action_set.low, self.action_set.high
+        self._bounds = [np.broadcast_to(bound, gains.shape[1]).copy() for bound in bounds]
+        plan["low"], plan["high"] = (array.ctypes.data for array in self._bounds)
 
     def actions(self, states: ArrayLike) -> Array:
         """The actions that answer the states.
@@ -154,7 +162,7 @@ class ProjectedLaw:
             )
         actions: Array = np.empty(shape)
         control(self._plan, z, actions)
-        return actions
+        return self.action_set.project(actions) if self.action_set.zero_mean else actions
 
 
 def checked_index(model_index: ArrayLike | None, count: int, models: int) -> IndexArray:
@@ -173,14 +181,16 @@ def checked_index(model_index: ArrayLike | None, count: int, models: int) -> Ind
     return index
 
 
-def excitations(rows: Array, step: int, n_a: int, action_limit: float = 0.0) -> Array:
+def excitations(rows: Array, step: int, n_a: int, action_set: ActionSet = ANY_ACTION) -> Array:
     """The exploratory actions of a step, (M, n_a); rows (M, 4) or (M, 5): of `episode/start`."""
     drawn = rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].tolist()
-    return np.stack([excitation(int(s), step, n_a, v, action_limit) for s, v in drawn])
+    return np.stack([excitation(int(s), step, n_a, v, action_set) for s, v in drawn])
 
 
-def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: float = 0.0) -> Array:
-    """The exploratory action (n_a,) of one step, drawn from N(0, variance I) and saturated.
+def excitation(
+    seed: int, step: int, n_a: int, variance: float, action_set: ActionSet = ANY_ACTION
+) -> Array:
+    """The exploratory action (n_a,) of one step: the nearest to a draw of N(0, variance I).
 
     A pure function of (seed, step), so that a step that is answered twice gets the same action
     twice.
@@ -193,5 +203,4 @@ def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: fl
     if not (np.isfinite(variance) and variance >= 0.0):
         raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
     draw: Array = np.random.default_rng([seed, step]).standard_normal(n_a)
-    action: Array = math.sqrt(variance) * draw
-    return np.clip(action, -action_limit, action_limit) if action_limit else action
+    return action_set.project(math.sqrt(variance) * draw)

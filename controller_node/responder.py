@@ -293,7 +293,7 @@ class Responder:
             models, policies = run.models_of(start.step), run.policies_of(pending.episode)
             lacking += [] if models else ["model"]
             lacking += [] if policies else ["policy"]
-            if models and policies and run.inputs_for(start, self._settings.action_limit) is None:
+            if models and policies and run.inputs_for(start, self._settings.action_set) is None:
                 lacking.append("one tuner (different policies or models arrived)")
         return lacking
 
@@ -344,12 +344,12 @@ class Responder:
             return None
         law, inputs = None, None
         if run.exploration is None:
-            if (inputs := run.inputs_for(start, self._settings.action_limit)) is None:
+            if (inputs := run.inputs_for(start, self._settings.action_set)) is None:
                 return None
             law = self._law(run, frame.plant, start, inputs, target)
         signed = NOT_SIGNED
         if start.plant:
-            digest = digest_of_start(start, inputs, self._settings.action_limit)
+            digest = digest_of_start(start, inputs, self._settings.action_set)
             signed = signature(digest, target)
         run.answering = Answering(frame.plant, frame.episode, law, signed)
         return run.answering
@@ -364,11 +364,11 @@ class Responder:
             raise FrameError(
                 f"expected policies for {len(index)} environments, got {len(policy.values)}"
             )
-        limit = self._settings.action_limit
-        made_from = start.episode, digest_of_start(start, inputs, limit), digest_of(target)
+        admissible = self._settings.action_set
+        made_from = start.episode, digest_of_start(start, inputs, admissible), digest_of(target)
         known = run.laws.get(plant)
         if known is None or known[0] != made_from:
-            law = LawBatch(models.laws, target, limit)
+            law = LawBatch(models.laws, target, admissible)
             law.set(policy.values, index)
             known = made_from, law
         run.use_law(plant, known)

@@ -10,6 +10,7 @@ import numpy as np
 
 from controller_node.exploration import Exploration
 from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import Frame
 from loop_interfaces.signature import digest_of
 from loop_method.laws.base import Law
@@ -100,7 +101,7 @@ class RunState:
         start = self.start
         return start if start is not None and start.episode == frame.episode else None
 
-    def inputs_for(self, start: Frame, action_limit: float) -> EpisodeInputs | None:
+    def inputs_for(self, start: Frame, action_set: ActionSet) -> EpisodeInputs | None:
         """Policies and models of the run's episode, None while they have not arrived.
 
         Of several those that the start signs, or the newest if it signs none of them; None if it
@@ -116,15 +117,15 @@ class RunState:
             signed = [
                 named
                 for named in fitting
-                if digest_of_start(start, named, action_limit) == start.plant
+                if digest_of_start(start, named, action_set) == start.plant
             ]
             return (signed or fitting)[-1] if start.plant else None
         return next(iter(fitting or found), None)
 
 
-def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_limit: float) -> int:
+def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_set: ActionSet) -> int:
     """D of an episode, see loop_interfaces.signature. inputs: None where it explores."""
-    published: list[Any] = [start.values, action_limit]
+    published: list[Any] = [start.values, action_set.signed]
     if inputs is not None:
         policy, models = inputs
         published += [policy.values, models.digest]

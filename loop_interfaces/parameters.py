@@ -44,6 +44,10 @@ INSTRUMENTS = _section(
     Spec("action_limit", 0.0, 0.0, 1e9, nodes="PCT", group="problem").means(
         "magnitude at which actions saturate; 0: no limit"
     ),
+    Spec("action_bounds", [], -1e300, 1e300, nodes="PCT").means(
+        "lowest actions, highest actions, and 1 if their mean is zero, else 0; filled in by a plant of "
+        "your own; -1e300 and 1e300: no bound; empty: none"
+    ),
     Spec("sensors", 0, 0, 65536, group="problem").means(
         "number n_y of equally spaced point sensors; 0: the whole state is measured"
     ),
@@ -168,6 +172,7 @@ POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 OF_THE_PLANT = (
     "grid",
     "cost",
+    "action_bounds",
     "length",
     "n_z",
     "n_a",

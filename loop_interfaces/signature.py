@@ -4,11 +4,12 @@
 Tuner, controller and plant each compute the same numbers, so the plant can recognise whether an action
 comes from a controller that has the tuner's policy, model and target:
 
-    D = h(rows, action_limit, policy, h(model))    in the header of `episode/start`, as `plant`
+    D = h(rows, bounds, policy, h(model))          in the header of `episode/start`, as `plant`
     s = -h(D, z_r)                                 in the header of every `action`, as `time`
     s = -h(D, h(the parameters DESIGN))            in that of `model/identified`, as `time`
 
-with h the first 53 bits of BLAKE2b over the numbers as little-endian float64. Where the controller
+with h the first 53 bits of BLAKE2b over the numbers as little-endian float64, and bounds the
+parameters action_limit and action_bounds. Where the controller
 explores there is neither policy nor model. A simulated time is never negative, so a controller that
 echoes the state's time, or sends 0, differs from one that signs. It does not protect against an
 attacker who reads the messages and copies the number.

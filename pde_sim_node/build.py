@@ -31,8 +31,8 @@ _GRID = (
 )
 _FIXED = ("n_z", "n_a", "sample_time")
 """Parameters that a user's own plant supplies and a problem cannot change."""
-EXTENTS = "actuator_extents"
-SUPPLIED = (*_FIXED, "grid", "length", "cost", EXTENTS)
+EXTENTS, BOUNDS = "actuator_extents", "action_bounds"
+SUPPLIED = (*_FIXED, "grid", "length", "cost", BOUNDS, EXTENTS)
 """Those and the other parameters that such a plant fills in."""
 
 
@@ -69,6 +69,7 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     axes = plant.grid.axes
     own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
     own["cost"] = plant.cost.texts if values["plant"] else list(values.get("cost", ()))
+    own[BOUNDS] = plant.action_set.bounds
     own[EXTENTS] = _declared_actuators(plant, values)
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
@@ -95,7 +96,10 @@ def _declared_actuators(plant: Plant, values: Mapping[str, Any]) -> list[float]:
 def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
     """A plant, and the parameters of the equation or plant itself, the defaults among them."""
     plant, physical = _own_plant(values) if values["plant"] else _spectral_plant(values, compiled)
-    instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
+    given = {spec.name: values.get(spec.name, spec.default) for spec in INSTRUMENTS}
+    if values["plant"]:
+        del given[BOUNDS]  # it applies its own
+    instruments = Instruments(**given)
     return plant if instruments.ideal else InstrumentedPlant(plant, instruments), physical
 
 
@@ -126,5 +130,9 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
     if values.get("cost") and "".join(values["cost"]) != "".join(plant.cost.texts):
         raise ParameterError(
             f"parameter 'cost' differs from that of the plant {values['plant']}; leave it out"
+        )
+    if values.get(BOUNDS) and list(values[BOUNDS]) != plant.action_set.bounds:
+        raise ParameterError(
+            f"parameter '{BOUNDS}' differs from that of the plant {values['plant']}; leave it out"
         )
     return plant, made.parameters

@@ -28,9 +28,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
-from pde_sim_node.action_set import ActionSet
 
 SPELT_ALIKE = 0.83
 """Similarity of names, of difflib, from which one is taken for a misspelt other one."""
@@ -163,9 +163,8 @@ class Dynamics(ABC):
             The action passed to `step`; by default the nearest one that ``action_low``,
             ``action_high`` and ``zero_mean`` admit.
         """
-        allowed = ActionSet(self.n_a, self.action_low, self.action_high, self.zero_mean)
-        nearest: Array = allowed.project(a[np.newaxis])[0]
-        return nearest
+        bounds = self.action_low, self.action_high, self.zero_mean
+        return ActionSet(self.n_a, *bounds).project(a)
 
     def mean_state(self) -> Array:
         """The mean initial state, from which reports show the controllers.

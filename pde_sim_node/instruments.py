@@ -2,11 +2,11 @@
 """Instruments between a plant and its controller: noise, actuators that saturate, few sensors.
 
     y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
-    z_{k+1} = f(z_k, sat(a_k)) + w_k,       w_k ~ N(0, process_noise^2 dt / dx I)
+    z_{k+1} = f(z_k, P(a_k)) + w_k,         w_k ~ N(0, process_noise^2 dt / dx I)
 
-with sat(a)_i = min(max(a_i, -action_limit), action_limit). C picks the grid points of the n_y
-sensors, or all. The stage cost is that of the true z_k and of sat(a_k), which a real plant could
-only estimate.
+with P(a) the nearest action within action_limit and action_bounds (`loop_interfaces.action_set`). C
+picks the grid points of the n_y sensors, or all. The stage cost is that of the true z_k and of P(a_k),
+which a real plant could only estimate.
 
 With sensors the plant publishes the last d measurements, scaled,
 
@@ -37,12 +37,12 @@ Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 20
 """
 
 import math
-from dataclasses import asdict
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from pde_sim_node.definition import Definition
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
@@ -99,6 +99,12 @@ class InstrumentedPlant:
         self.horizon, self.sample_time = plant.horizon, plant.sample_time
         self.state_weight, self.action_weight = plant.state_weight, plant.action_weight
         self.cost = plant.cost
+        limit, bounds = instruments.action_limit, instruments.action_bounds
+        given = {"n_a": plant.n_a, "action_limit": limit, "action_bounds": bounds}
+        self._saturates = ActionSet.of(given)
+        self.action_set = ActionSet.of(
+            {**given, "action_bounds": bounds or plant.action_set.bounds}
+        )
         if instruments.sensors and not plant.cost.plain:
             raise ValueError(
                 f"sensors need scalar weights and a constant target, unlike the cost of {plant!r}: "
@@ -131,7 +137,7 @@ class InstrumentedPlant:
     @property
     def definition(self) -> Definition:
         """The plant's, with the instruments."""
-        return self.plant.definition.having(asdict(self.instruments))
+        return self.plant.definition.having(self.instruments.values)
 
     @property
     def batch(self) -> int:
@@ -183,8 +189,7 @@ class InstrumentedPlant:
 
     def step(self, actions: Array) -> Array:
         """Hold the saturated actions for one sampling time; returns the measurement after it."""
-        limit = self.instruments.action_limit
-        self.plant.step(np.clip(actions, -limit, limit) if limit else actions)
+        self.plant.step(self._saturates.project(actions))
         if self._forcing:
             self._force()
         newest = self._measure()
@@ -205,7 +210,7 @@ class InstrumentedPlant:
         """There is none: actions saturate, and the states are not those that are measured."""
         raise ValueError(
             "exact gradients need a plant without noise, limits and sensors: leave "
-            "measurement_noise, process_noise, action_limit and sensors at 0"
+            "measurement_noise, process_noise, action_limit, action_bounds and sensors at 0"
         )
 
     def refined(self) -> Plant | None:

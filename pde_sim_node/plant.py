@@ -6,12 +6,14 @@ The loop uses nothing else of a plant. Implementations are in `pde_sim_node.plan
 `pde_sim_node.instruments` adds noise, limits and sensors to any of them.
 """
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
@@ -66,13 +68,28 @@ class Instruments:
     measurement_noise: float = 0.0
     process_noise: float = 0.0
     action_limit: float = 0.0
+    action_bounds: Sequence[float] = ()
     sensors: int = 0
     sensor_delays: int = 1
 
     @property
     def ideal(self) -> bool:
         """True if there is nothing between the field and the controller."""
-        return self == Instruments(sensor_delays=self.sensor_delays)
+        return not (
+            self.measurement_noise
+            or self.process_noise
+            or self.action_limit
+            or self.action_bounds
+            or self.sensors
+        )
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What there is, by name, for a plant's definition."""
+        values = asdict(self)
+        if not values["action_bounds"]:
+            del values["action_bounds"]
+        return values
 
 
 class Adjoint(Protocol):
@@ -138,6 +155,8 @@ class Plant(Protocol):
         Whether its state can be set, so that `evaluate` works and process noise can force it.
     quadratic : bool
         Whether its stage cost is ``cost``.
+    action_set : ActionSet
+        Admissible actions; the nearest one is applied in place of any other.
     instruments : Instruments
         What stands between the state and the controller.
     parallel : ParallelStep or None
@@ -170,6 +189,7 @@ class Plant(Protocol):
     target: Array
     grid: Grid
     forced: slice
+    action_set: ActionSet
     instruments: Instruments
 
     @property

@@ -174,7 +174,7 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     basis = finite_basis(plant, U)
     gains = float_array("policy", policy)
     gains = finite_array("policy", gains, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
-    projected, batch = ProjectedLaw([basis], plant.target, plant.instruments.action_limit), 0
+    projected, batch = ProjectedLaw([basis], plant.target, plant.action_set), 0
 
     def actions(k: int, states: Array) -> Array:
         nonlocal batch

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.parameters import noisy
@@ -173,7 +174,7 @@ class FinishedRun:
         """
         theta, m = self.theta(which, seed), self.index(seed)
         law, model = self.laws[m], self.models[m]
-        batch = LawBatch([law], self._target(model), float(self.values["action_limit"]))
+        batch = LawBatch([law], self._target(model), ActionSet.of(self.values))
         plants = 0
 
         def act(k: int, states: Array) -> Array:

@@ -55,7 +55,7 @@ class LocalPair:
             model_rows.unpack(rows, self._settings.n_a, self._kind.filtered) for rows in models
         ]
         laws = laws_of(self._kind, unpacked, self._settings.horizon, self._settings.cost)
-        self._law = LawBatch(laws, self.plant.target, self._settings.action_limit)
+        self._law = LawBatch(laws, self.plant.target, self._settings.action_set)
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. NoModelError if exploration gives no model though no rollout diverged."""
@@ -115,8 +115,8 @@ class LocalPair:
             assert law is not None
             law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
             return law.actions
-        n_a, limit = self._settings.n_a, self._settings.action_limit
-        return lambda k, states: excitations(batch.rows, k, n_a, limit)
+        n_a, admissible = self._settings.n_a, self._settings.action_set
+        return lambda k, states: excitations(batch.rows, k, n_a, admissible)
 
 
 def train(

@@ -258,7 +258,7 @@ def _first_law(plant: Plant, rows: ModelRows, settings: DesignSettings) -> Law:
     """The law that a training with this design begins with, for the drawn fields."""
     kind = law_kind(settings.law, settings.constants)
     [law] = laws_of(kind, [rows], settings.horizon, settings.cost)
-    batch = LawBatch([law], plant.target, settings.action_limit)
+    batch = LawBatch([law], plant.target, settings.action_set)
     batch.set(np.repeat(law.theta_start.reshape(1, *law.shape), DRAWN, axis=0))
     return batch.actions
 

@@ -9,6 +9,7 @@ from itertools import repeat
 
 import numpy as np
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
 from loop_method.adapt import Rollout, RolloutResult, Trajectory
@@ -132,7 +133,7 @@ class TrainingSettings:
     """Rollouts of an exploration, from as many initial fields."""
     noise: bool = False
     """True if rollouts get seeds for the plant's noise."""
-    action_limit: float = 0.0
+    action_set: ActionSet = ANY_ACTION
     measurement_noise: float = 0.0
     """Standard deviation of the noise on every number of the states."""
     sensors: int = 0

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.actuators import indicators, placed_indicators
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
@@ -261,6 +262,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     centres, widths = declared_actuators(values)
     given |= {
         "law": law,
+        "action_set": ActionSet.of(values),
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
         "actuator_positions": centres,
@@ -287,9 +289,10 @@ def build_dispatcher(
     values: Mapping[str, Any], training: Training, identity: RunIdentity
 ) -> Dispatcher:
     """The dispatcher that serves a training with the pairs of the tuner's parameters."""
-    names = ("n_a", "max_batch", "episode_timeout", "max_attempts", "action_limit")
+    names = ("n_a", "max_batch", "episode_timeout", "max_attempts")
     return Dispatcher(
         **{name: values[name] for name in names},
+        action_set=training.settings.action_set,
         run=identity.run,
         pairs=len(values["pairs"]),
         incarnation=identity.incarnation,

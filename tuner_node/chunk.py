@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces import topics
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import Publication
@@ -76,7 +77,7 @@ def messages_of(
     batch: Batch,
     chunk: Chunk,
     frame: Callable[[Array, int], Frame],
-    action_limit: float,
+    action_set: ActionSet,
     models_digest: int,
 ) -> list[Publication]:
     """What asks for the episode of a chunk: the policies, if there are any, and the signed start.
@@ -85,7 +86,7 @@ def messages_of(
     then mostly there when the first state arrives.
     """
     sends, rows = [], batch.rows[chunk.rows]
-    signed: list[ArrayLike] = [rows, action_limit]
+    signed: list[ArrayLike] = [rows, action_set.signed]
     if batch.policies is not None:
         policies = batch.policies[chunk.rows]
         sends.append(Publication(topics.POLICY, frame(policies, 0)))

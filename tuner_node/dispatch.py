@@ -26,6 +26,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces import topics
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import EPISODES_PER_START, episode_name
 from loop_interfaces.frames import Frame, FrameError
@@ -70,14 +71,14 @@ class Dispatcher:
         episode_timeout: float,
         max_attempts: int,
         plant: int = UNKNOWN_PLANT,
-        action_limit: float = 0.0,
+        action_set: ActionSet = ANY_ACTION,
         design: int = 0,
     ) -> None:
         self.run, self.n_a, self.incarnation = run, n_a, incarnation
         self.max_batch, self.episode_timeout = max_batch, episode_timeout
         self.max_attempts = max_attempts
         self.state_size, self.horizon = state_size, horizon
-        self.plant, self.action_limit, self.design = plant, action_limit, design
+        self.plant, self.action_set, self.design = plant, action_set, design
         self.pairs = [Pair(number) for number in range(pairs)]
         self.counters: Counter[str] = Counter()
         """Events, counted by name."""
@@ -390,7 +391,7 @@ class Dispatcher:
         def frame(values: Array, plant: int = 0) -> Frame:
             return Frame(self.run, pair.episode, generation, self.sim_time, values, plant)
 
-        sends = messages_of(self._batch, chunk, frame, self.action_limit, self._models_digest)
+        sends = messages_of(self._batch, chunk, frame, self.action_set, self._models_digest)
         pair.started(sends[-1])
         if again and self._models is not None:
             sends.insert(0, Publication(topics.MODEL, self._models))

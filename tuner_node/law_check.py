@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import MAX_GAIN
 from loop_method.adapt import Rollout, Trajectory
@@ -24,11 +25,11 @@ def check_law(
     asked: Sequence[Rollout],
     law: Law,
     seen: Sequence[Trajectory | None],
-    action_limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
 ) -> None:
     """See that the actions are the law's all along in rollouts of one model; a ValueError if not.
 
-    asked, seen: the policies, and what was measured under them; action_limit: 0: none.
+    asked, seen: the policies, and what was measured under them; action_set: admissible actions.
     """
     for rollout, trajectory in zip(asked, seen, strict=True):
         assert trajectory is not None
@@ -42,8 +43,7 @@ def check_law(
                 near = _actions(law, theta, (1.0 + NEARBY) * states, actions)
                 moved = np.abs(near - expected).max(axis=1, initial=0.0)
                 allowed = MARGIN * np.maximum.accumulate(moved)
-        if action_limit > 0.0:
-            expected = np.clip(expected, -action_limit, action_limit)
+        expected = action_set.project(expected)
         scale = np.maximum.accumulate(np.abs(actions).max(axis=1, initial=1.0))  # so far
         allowed += TOLERANCE * scale
         if not (np.abs(actions - expected) <= allowed[:, None]).all():

@@ -34,7 +34,7 @@ def context_of(
         horizon=len(exploration.actions),
         exploration=exploration,
         measured=measured,
-        action_limit=settings.action_limit,
+        action_set=settings.action_set,
         noise=settings.measurement_noise,
         sensors=settings.sensors,
         actuator_positions=settings.actuator_positions,

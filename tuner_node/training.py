@@ -370,7 +370,7 @@ class Training:
             own = list(islice(results, len(asked)))
             if result.trajectories is not None:
                 seen = [measured.trajectory for measured in own]
-                check_law(asked, laws[m], seen, self.settings.action_limit)
+                check_law(asked, laws[m], seen, self.settings.action_set)
                 self.law_seen = True
             report = calls.tell(optimizer, own)
             self.budget.count("adapt", [m] * len(asked))

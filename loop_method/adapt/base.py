@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
@@ -138,8 +139,8 @@ class Context:
         The exploratory trajectory that the reduced model was identified from.
     measured : sequence of Record
         Rollouts from before the optimisation: those that checked the first law, and no control.
-    action_limit : float
-        Magnitude at which actions saturate; 0 for none.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown.
     sensors : int
@@ -175,7 +176,7 @@ class Context:
     horizon: int
     exploration: Trajectory
     measured: Sequence[Record] = ()
-    action_limit: float = 0.0
+    action_set: ActionSet = ANY_ACTION
     noise: float = 0.0
     sensors: int = 0
     actuator_positions: Sequence[float] = ()

@@ -83,7 +83,7 @@ class Belief:
             context.state_weight,
             context.action_weight,
             context.horizon,
-            context.action_limit,
+            context.action_set,
         )
         on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
         if isinstance(self.model, ReadingsModel):
@@ -132,7 +132,7 @@ def believe(
         context.target,
         settings=context.field_models,
         noise=context.noise,
-        action_limit=context.action_limit,
+        action_set=context.action_set,
         first=first,
         line=context.line,
         shape=context.shape,

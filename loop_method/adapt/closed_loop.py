@@ -6,15 +6,15 @@ input of the memory:
 
     [a_k; u_k] = theta [s_k; p_k; 1],        z_{k+1} = f(z_k, a_k),        p_{k+1} = u_k + B a_k,
 
-with f the model, p_0 = s_0, and a_k saturated at the action limit. The affine law has no memory, and
-theta = [K_a b]; `observed_loop` has that of a law with an observer. From an initial field z_0 the
-cost is
+with f the model, p_0 = s_0, and the nearest admissible action P(a_k) in place of a_k
+(`loop_interfaces.action_set`). The affine law has no memory, and theta = [K_a b]; `observed_loop` has
+that of a law with an observer. From an initial field z_0 the cost is
 
     J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2).
 
 With eta_k = dJ/dz_k and mu_k = dJ/dp_k, both 0 at k = T, the gradient follows backwards in time,
 
-    g_k     = (df/da)^T eta_{k+1} + B^T mu_{k+1} + 2 r/T a_k        (0 where a_k is saturated),
+    g_k     = (df/da)^T eta_{k+1} + B^T mu_{k+1} + 2 r/T a_k        times (dP/da)^T,
     [v; mu_k] = [theta_s theta_p]^T [g_k; mu_{k+1}],
     eta_k   = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + U v,
     dJ/dtheta = sum_k [g_k; mu_{k+1}] [s_k; p_k; 1]^T.
@@ -39,6 +39,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.adapt.base import Record
@@ -59,8 +60,8 @@ class ClosedLoopProblem:
         q and r.
     horizon : int
         T, the steps of an episode.
-    action_limit : float
-        Magnitude at which actions saturate; 0 for none.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
     """
 
     U: Array
@@ -68,7 +69,7 @@ class ClosedLoopProblem:
     state_weight: float
     action_weight: float
     horizon: int
-    action_limit: float = 0.0
+    action_set: ActionSet = ANY_ACTION
 
     @cached_property
     def s_r(self) -> Array:
@@ -188,8 +189,7 @@ class ClosedLoop(ClosedLoopProblem):
                 known[:, n_s:] = memory if k else s[:, :n_p]
                 out = known @ gains + constant
                 a = out[:, :n_a]
-                if self.action_limit:
-                    np.clip(a, -self.action_limit, self.action_limit, out=a)
+                self.action_set.project(a, out=a)
                 self._add_stage(costs, states[k], outputs, a, k)
                 # Diverged fields stay marked and continue with numbers that a model can take.
                 memory = out[:, n_a:] + a @ B.T
@@ -219,6 +219,7 @@ class ClosedLoop(ClosedLoopProblem):
             return np.inf, gradient
         states, actions = simulation.states, simulation.actions
         B, gains, n_s = self.memory_input, theta[:, :-1], self.U.shape[1]
+        constant = self.constant_feature * theta[:, -1]
         eta, mu = np.zeros_like(states[0]), np.zeros((len(fields), len(B)))
         weight = weights[:, None] / self.horizon
         if self.cost is not None:
@@ -234,8 +235,9 @@ class ClosedLoop(ClosedLoopProblem):
             else:
                 on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
             g = g + on_a + mu @ B
-            if self.action_limit:
-                g = g * (np.abs(a) < self.action_limit)
+            if self.action_set.bounded:
+                requested = simulation.features[k, :, :-1] @ gains.T + constant
+                g = self.action_set.pull_back(requested[:, : a.shape[1]], g)
             out = np.hstack([g, mu])
             gradient[:, :-1] += out.T @ simulation.features[k, :, :-1]
             gradient[:, -1] += self.constant_feature * out.sum(axis=0)

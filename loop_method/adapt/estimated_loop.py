@@ -161,8 +161,7 @@ def simulate_estimated(
             if gains is not None:
                 gains.append(known.gain(S))
             a = x @ parts["K_e"].T + p @ parts["K"].T + s @ parts["D"].T + parts["b"]
-            if loop.action_limit:
-                np.clip(a, -loop.action_limit, loop.action_limit, out=a)
+            loop.action_set.project(a, out=a)
             error = z - loop.target
             costs += loop.state_weight * np.einsum("fi,fi->f", error, error)
             costs += loop.action_weight * np.einsum("fi,fi->f", a, a)

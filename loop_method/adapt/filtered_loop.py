@@ -6,11 +6,11 @@ With f the plant, g the filter's model of it, and H the sensors,
     y_k = H z_k + v_k,      x_k = w_k + L_k (y_k - H w_k),      a_k = K U^T x_k + b,
     z_{k+1} = f(z_k, a_k),  w_{k+1} = g(x_k, a_k),
 
-w_0 the mean of initial fields, and a_k saturated at the action limit. The gains are those of an
-extended Kalman filter (`loop_method.models.sensed_filter`) under the law to begin with: how they change
-with the law is left out. With eta_k = dJ/dz_k and omega_k = dJ/dw_k, both 0 at k = T,
+w_0 the mean of initial fields, and the nearest admissible action P(a_k) in place of a_k. The gains are
+those of an extended Kalman filter (`loop_method.models.sensed_filter`) under the law to begin with: how
+they change with the law is left out. With eta_k = dJ/dz_k and omega_k = dJ/dw_k, both 0 at k = T,
 
-    g_k     = (df/da)^T eta_{k+1} + (dg/da)^T omega_{k+1} + 2 r/T a_k      (0 where a_k is saturated),
+    g_k     = (df/da)^T eta_{k+1} + (dg/da)^T omega_{k+1} + 2 r/T a_k      times (dP/da)^T,
     xi_k    = (dg/dx)^T omega_{k+1} + U K^T g_k,
     omega_k = (I - L_k H)^T xi_k,
     eta_k   = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + H^T L_k^T xi_k,
@@ -76,8 +76,7 @@ class FilteredLoop(ClosedLoop):
                 x = x + np.einsum("fnj,fj->fn", self.gains[k], missed)
                 features[k, :, :-1] = s = x @ self.U
                 a = s @ K.T + b
-                if self.action_limit:
-                    np.clip(a, -self.action_limit, self.action_limit, out=a)
+                self.action_set.project(a, out=a)
                 self._add_stage(costs, z, z, a, k)
                 finite &= np.isfinite(costs) & np.isfinite(x).all(axis=1)
                 for part in (a, x, features[k, :, :-1]):
@@ -97,6 +96,7 @@ class FilteredLoop(ClosedLoop):
         if not np.isfinite(simulation.costs[counted]).all():
             return np.inf, gradient
         g, back = self.known.model, self.U @ theta[:, :-1].T
+        gains, constant = theta[:, :-1], self.constant_feature * theta[:, -1]
         eta, omega = np.zeros_like(fields), np.zeros_like(fields)
         share = 2.0 / self.horizon * weights[:, None]
         for k in reversed(range(self.horizon)):
@@ -104,8 +104,9 @@ class FilteredLoop(ClosedLoop):
             eta, by_plant = self.model.pull_back(z, a, eta)
             xi, by_filter = g.pull_back(estimates[k], a, omega)
             by_a = by_plant + by_filter + self.action_weight * share * a
-            if self.action_limit:
-                by_a *= np.abs(a) < self.action_limit
+            if self.action_set.bounded:
+                requested = simulation.features[k, :, :-1] @ gains.T + constant
+                by_a = self.action_set.pull_back(requested, by_a)
             gradient[:, :-1] += by_a.T @ simulation.features[k, :, :-1]
             gradient[:, -1] += self.constant_feature * by_a.sum(axis=0)
             xi += by_a @ back.T
@@ -145,7 +146,7 @@ def improve_through_filter(
         loop.state_weight,
         loop.action_weight,
         loop.horizon,
-        loop.action_limit,
+        loop.action_set,
         model=model,
         known=known,
         gains=gains,

@@ -167,8 +167,8 @@ def path_of(loop: ClosedLoopProblem, record: Record, V: Array) -> ReducedTraject
     x = record.acted_from @ V
     features = np.hstack([x[:, : K.shape[1]], np.full((len(x), 1), loop.constant_feature)])
     free = None
-    if loop.action_limit:
-        free = (np.abs(record.actions) < loop.action_limit).astype(np.float64)
+    if loop.action_set.bounded:
+        free = loop.action_set.inside(record.actions).astype(np.float64)
     return ReducedTrajectory(x, record.actions, features, K, free)
 
 

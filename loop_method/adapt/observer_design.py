@@ -123,7 +123,7 @@ def _of_readings(
         loop.state_weight,
         loop.action_weight,
         loop.horizon,
-        loop.action_limit,
+        loop.action_set,
         model=model,
         noise=loop.noise,
     )

@@ -85,7 +85,7 @@ class Proposer:
             context.state_weight,
             context.action_weight,
             context.horizon,
-            context.action_limit,
+            context.action_set,
         )
         # Few readings cannot be denoised; the fits to them account for the noise.
         self._noise = 0.0 if context.sensors else context.noise

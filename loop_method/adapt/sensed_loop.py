@@ -257,7 +257,7 @@ def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
         context.state_weight * model.sensors / model.n_z,
         context.action_weight,
         context.horizon,
-        context.action_limit,
+        context.action_set,
         model=model,
         noise=model.noise,
         law=context.law,

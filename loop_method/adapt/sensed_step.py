@@ -87,7 +87,7 @@ class SensedProposals:
             loop.state_weight * sensors / n,
             loop.action_weight,
             loop.horizon,
-            loop.action_limit,
+            loop.action_set,
             model=sensed_model(shared, sensors, self._actuators, reach * largest, settings),
             noise=self._noise,
         )

@@ -35,6 +35,6 @@ def believe_in_noise(
         # E without another noise is no measure for E with it.
         better_than=np.inf if declared else error,
         declared=declared,
-        action_limit=context.action_limit,
+        action_set=context.action_set,
     )
     return None if found is None else (Belief(found[0].model, found[0].error, 1), found[1])

@@ -58,7 +58,7 @@ def whole_field_law(
             loop.state_weight,
             loop.action_weight,
             loop.horizon,
-            loop.action_limit,
+            loop.action_set,
             model=loop.model,
         )
 

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
@@ -128,7 +129,7 @@ def _cost(cost: float) -> str:
 def best_model(
     trajectories: Sequence[Trajectory],
     target: Array,
-    action_limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
     settings: IdentificationSettings = DEFAULTS,
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
@@ -144,9 +145,7 @@ def best_model(
     if len(target) > settings.field_largest:
         return None, 0.0
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
-    whole = fit_field_model(
-        rollouts, target, action_limit=action_limit, noise=noise, settings=models
-    )
+    whole = fit_field_model(rollouts, target, action_set=action_set, noise=noise, settings=models)
     error = np.inf if whole is None else whole.error
     misjudged = fit_undeclared_noise(
         rollouts,
@@ -155,14 +154,14 @@ def best_model(
         most=settings.field_error,
         better_than=np.inf if noise else error,
         declared=noise,
-        action_limit=action_limit,
+        action_set=action_set,
     )
     if misjudged is not None:
         return misjudged
     if error <= settings.field_error:
         return whole, 0.0
     parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
-    found = fit_field_model(parts, target, action_limit=action_limit, noise=noise, settings=models)
+    found = fit_field_model(parts, target, action_set=action_set, noise=noise, settings=models)
     return (found if found is not None and found.error < error else whole), 0.0
 
 
@@ -174,7 +173,7 @@ def field_law(
     state_weight: float,
     action_weight: float,
     cost: Cost | None = None,
-    action_limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
     noise: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
     models: FieldModelSettings = MODEL_DEFAULTS,
@@ -193,8 +192,8 @@ def field_law(
         q and r.
     cost : Cost, optional
         In place of them.
-    action_limit : float
-        Magnitude at which actions saturate, in the data and under both laws; 0: none.
+    action_set : ActionSet
+        Admissible actions, in the data and under both laws.
     noise : float
         Standard deviation of the noise on every number of the states; 0: none.
     settings : IdentificationSettings
@@ -202,7 +201,7 @@ def field_law(
     models : FieldModelSettings
         How models are fitted and one is chosen.
     """
-    fitted, found = best_model(trajectories, target, action_limit, settings, noise, models)
+    fitted, found = best_model(trajectories, target, action_set, settings, noise, models)
     if fitted is None or found or fitted.error > settings.field_error:
         return FieldLaw(fitted, noise=found)
     model, n_s = fitted.model, other.U.shape[1]
@@ -223,8 +222,8 @@ def field_law(
     fields = [states[0] for states, _ in trajectories]
     if noise:
         fields = list(smoothed(np.stack(fields), noise))
-    best = saturated(affine_law(K, b - K @ target), action_limit)
-    none = affine_law(np.zeros_like(K), np.zeros_like(b))
+    best = saturated(affine_law(K, b - K @ target), action_set)
+    none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
     U = _basis(
         K, np.concatenate(visited)[:: settings.field_thinning], target, n_s, settings.field_room
@@ -237,7 +236,7 @@ def field_law(
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
 
     def predicted_cost(rows: ModelRows) -> float:
-        law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_limit)
+        law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_set)
         total = 0.0
         for states in states_under(model, law, fields, horizon):
             if len(states) < horizon:

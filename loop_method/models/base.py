@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 
@@ -101,13 +102,13 @@ def affine_law(K: Array, b: Array) -> Law:
     return law
 
 
-def saturated(law: Law, limit: float) -> Law:
-    """The law with actions of at most this magnitude; 0: as it is."""
-    if not limit:
+def saturated(law: Law, action_set: ActionSet) -> Law:
+    """The law with the nearest admissible actions."""
+    if not action_set.bounded:
         return law
 
     def limited(k: int, states: Array) -> Array:
-        return np.clip(law(k, states), -limit, limit)
+        return action_set.project(law(k, states))
 
     return limited
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
@@ -51,7 +52,7 @@ def fit_field_model(
     settings: FieldModelSettings = DEFAULTS,
     components: int = 1,
     noise: float = 0.0,
-    action_limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
     first: str | None = None,
     line: bool = True,
     shape: tuple[int, ...] = (),
@@ -72,8 +73,8 @@ def fit_field_model(
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
         the error beyond what it explains, and kinds that know of noise are fitted as `noisy_fit` says.
-    action_limit : float
-        Magnitude at which actions saturate; 0 for none.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
     first : str, optional
         Kind to be tried first, that of the last choice.
     line : bool
@@ -83,7 +84,7 @@ def fit_field_model(
     knows_noise : bool
         Try only the kinds that are fitted for noise.
     """
-    rollouts = [limited(rollout, action_limit) for rollout in rollouts]
+    rollouts = [limited(rollout, action_set) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
     if noise:
@@ -168,13 +169,13 @@ def _fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> Fie
         return None
 
 
-def limited(rollout: Measured, limit: float) -> Measured:
-    """With the actions that act where they saturate."""
-    if not limit:
+def limited(rollout: Measured, action_set: ActionSet) -> Measured:
+    """With the actions that are applied."""
+    if not action_set.bounded:
         return rollout
     law = rollout.law
     return replace(
         rollout,
-        actions=np.clip(rollout.actions, -limit, limit),
-        law=None if law is None else saturated(law, limit),
+        actions=action_set.project(rollout.actions),
+        law=None if law is None else saturated(law, action_set),
     )

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured
@@ -41,7 +42,7 @@ def fit_undeclared_noise(
     most: float,
     better_than: float = np.inf,
     declared: float = 0.0,
-    action_limit: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
 ) -> tuple[FittedModel, float] | None:
     """An equation fitted for measurement noise, and the noise; None where there is no such noise.
 
@@ -60,8 +61,8 @@ def fit_undeclared_noise(
     declared : float
         Noise that was declared; another one is looked for only if it is `noise_misjudged` times as
         large, or as small.
-    action_limit : float
-        Magnitude at which actions saturate; 0 for none.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
     """
     states = [np.asarray(rollout.states) for rollout in rollouts]
     noise = noise_level(states)
@@ -77,12 +78,12 @@ def fit_undeclared_noise(
         target,
         settings=settings,
         noise=noise,
-        action_limit=action_limit,
+        action_set=action_set,
         knows_noise=True,
     )
     if found is None or found.error > most or not found.error < better_than:
         return None
-    known = with_clean([limited(rollout, action_limit) for rollout in rollouts], noise)
+    known = with_clean([limited(rollout, action_set) for rollout in rollouts], noise)
     with one_thread():
         left = innovations(found.model, known, noise, settings)
     if left is None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
@@ -35,6 +36,7 @@ class BatchPlant(ABC):
     """
 
     instruments = Instruments()
+    action_set: ActionSet = ANY_ACTION
     parallel: ParallelStep | None = None
     forced = slice(None)
     supports: Array | None = None

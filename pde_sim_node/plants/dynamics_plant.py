@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from loop_interfaces.one_thread import one_thread
 from loop_interfaces.own_code import OwnCodeError, called
-from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
 from pde_sim_node.dynamics import Dynamics, refuse_misspelt
@@ -60,7 +60,7 @@ class DynamicsPlant(BatchPlant):
             for name, number in zip(WEIGHTS, cost.size, strict=True):
                 given[name] = number
             super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
-            self.allowed = ActionSet(
+            self.action_set = ActionSet(
                 self.n_a, dynamics.action_low, dynamics.action_high, dynamics.zero_mean
             )
         except ValueError as error:
@@ -178,7 +178,7 @@ class DynamicsPlant(BatchPlant):
     def applied(self, actions: Array) -> Array:
         """The actions that actuators apply for requested ones (M, n_a)."""
         if type(self.dynamics).actuated is Dynamics.actuated:
-            return actions if self.allowed.everything else self.allowed.project(actions)
+            return self.action_set.project(actions)
         taken = [float_array("it", self._call("actuated", a.copy())) for a in actions]
         held = np.stack(taken) if {a.shape for a in taken} == {(self.n_a,)} else np.zeros(0)
         if held.shape != actions.shape or not np.isfinite(held).all():

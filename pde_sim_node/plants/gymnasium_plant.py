@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
 from loop_interfaces.long_calls import LONG_CALLS
@@ -137,6 +138,9 @@ class GymnasiumPlant(BatchPlant):
         self.termination, self._said = termination, False
         n_a = int(np.prod(acted))
         super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, **settings)
+        space: Any = self._space
+        low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
+        self.action_set = ActionSet(n_a, low, high)
 
     def __repr__(self) -> str:
         return (
@@ -230,8 +234,7 @@ class GymnasiumPlant(BatchPlant):
         return numbers.ravel()
 
     def _advance(self) -> None:
-        low, high = (np.ravel(bound).astype(np.float64) for bound in self._bounds)
-        np.clip(self.actions, low, high, out=self.actions)
+        self.action_set.project(self.actions, out=self.actions)
         for m in np.flatnonzero(self.diverged_step < 0):
             over = self._terminated[m] >= 0
             if over and not self.quadratic:
@@ -286,11 +289,6 @@ class GymnasiumPlant(BatchPlant):
                 f"which {meaning}; termination='{other}' takes it for a {other}"
             )
         return failed
-
-    @property
-    def _bounds(self) -> tuple[Any, Any]:
-        space: Any = self._space
-        return space.low, space.high
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
         raise ValueError(f"{self!r} cannot step from a given state: its state cannot be set")

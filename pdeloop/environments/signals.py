@@ -18,9 +18,19 @@ def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
     """The spaces of an observation (state_size,) and of an action (n_a,)."""
     own = plant.instruments
     bound = np.inf if own.measurement_noise or own.sensors else plant.divergence_bound
-    limit = own.action_limit or action_scale(plant)
+    low, high = (np.broadcast_to(b, plant.n_a).copy() for b in bounds_of(plant))
     observation = Box(-bound, bound, (plant.state_size,), np.float64)
-    return observation, Box(-limit, limit, (plant.n_a,), np.float64)
+    return observation, Box(low, high, (plant.n_a,), np.float64)
+
+
+def bounds_of(plant: Plant) -> tuple[Array, Array]:
+    """The actuators' bounds; where there are none, `action_scale` from 0 or the other bound."""
+    low, high = plant.action_set.low, plant.action_set.high
+    if np.isfinite([low, high]).all():
+        return low, high
+    scale = action_scale(plant)
+    least = np.where(np.isfinite(low), low, np.minimum(high, 0.0) - scale)
+    return least, np.where(np.isfinite(high), high, np.maximum(low, 0.0) + scale)
 
 
 def action_scale(plant: Plant) -> float:

@@ -21,7 +21,7 @@ from pdeloop.environments.signals import one, spaces, told
 class Environment(Specified, gymnasium.Env[Array, Array]):
     """One plant.
 
-    The action space is bounded by the plant's `action_limit`. Without one the plant takes any action,
+    The action space is bounded as the plant's actions are. Without bounds the plant takes any action,
     and the space is bounded by the magnitude at which all n_a actions cost as much as the error of the
     mean initial field, so that algorithms which need a bounded space have one of a useful size.
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.array_files import checked_array, read_arrays
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
@@ -255,7 +256,7 @@ def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) 
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     used = [models.get(name, data.models[data.shown]) for name in policies]
     laws = laws_of(law_kind(values["law"], values), used, values["horizon"], values.get("cost", ()))
-    law = LawBatch(laws, plant.target, values["action_limit"])
+    law = LawBatch(laws, plant.target, ActionSet.of(values))
     count = len(policies)
     law.set(np.stack([*policies.values()]), np.arange(count))
     starts, noise = np.full(count, field), np.full(count, noise_seed, dtype=np.int64)

@@ -14,6 +14,7 @@ from benchmarks.bounds import best_inputs, inputs_cost
 from benchmarks.families.cases import Case
 from benchmarks.families.plants import CoupledPendulums, RandomLinear
 from benchmarks.true_model import TrueModel
+from loop_interfaces.action_set import ActionSet
 from loop_method.adapt.closed_loop import ClosedLoop
 from pde_sim_node.plants.loading import as_plant
 from tests.support.small import SMALL
@@ -55,7 +56,7 @@ def test_saturating_inputs_cost_more_and_no_more_than_the_law() -> None:
     free = loop_on(RandomLinear(), 4, 6)
     fields = np.random.default_rng(1).standard_normal((2, 64))
     theta = -0.05 * np.eye(4, 5)
-    limited = replace(free, action_limit=0.1)
+    limited = replace(free, action_set=ActionSet(limit=0.1))
     cost, _ = best_inputs(limited, theta, fields)
     assert (cost > best_inputs(free, theta, fields)[0]).all()
     assert (cost < limited.costs(theta, fields)).all()

@@ -10,6 +10,7 @@ import pytest
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
@@ -49,7 +50,9 @@ def test_a_state_beyond_the_last_one_does_not_count_for_one_that_was_lost(respon
 
 
 def test_the_actions_of_an_exploration_are_limited_as_those_of_the_law():
-    free, limited = (Responder(replace(SETTINGS, action_limit=limit)) for limit in (0.0, 0.05))
+    free, limited = (
+        Responder(replace(SETTINGS, action_set=ActionSet(limit=limit))) for limit in (0.0, 0.05)
+    )
     for made in (free, limited):
         made.target(target())
         made.start(start(1, (1, 2, 0.1, 0)))

@@ -8,6 +8,7 @@ import pytest
 
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.own_code import OwnCodeError
@@ -33,7 +34,7 @@ def models(count: int) -> list[ModelRows]:
 
 
 def made(kind: type[Law], limit: float = 0.0, count: int = 2) -> LawBatch:
-    return LawBatch(laws_of(kind, models(count), T), TARGET, limit)
+    return LawBatch(laws_of(kind, models(count), T), TARGET, ActionSet(limit=limit))
 
 
 def episode(kind: type[Law], M: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

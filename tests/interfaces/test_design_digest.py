@@ -22,7 +22,7 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     assert design_digest(known | {name: other}) != design_digest(known)
     # An action has the first of these, D the second, the third and the fourth count where they are not
     # empty, and the last two with another law than the affine one.
-    own = {"n_a", "action_limit", "measurement_noise", "cost", "constants", "law", "horizon"}
+    own = {"n_a", "action_set", "measurement_noise", "cost", "constants", "law", "horizon"}
     assert {*DESIGN, *own} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
 

@@ -11,6 +11,7 @@ import pytest
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.signature import design_digest
@@ -80,7 +81,7 @@ class Loop:
 
     def controller_told(self, limit: float = 0.0, order: int = N_S, **others: object) -> Responder:
         """A controller that was told of the episode what the tuner published, but for `others`."""
-        made = Responder(DesignSettings(N_A, order, 1.0, 1.0, action_limit=limit))
+        made = Responder(DesignSettings(N_A, order, 1.0, 1.0, action_set=ActionSet(limit=limit)))
         handlers = {
             TARGET: made.target, MODEL: made.model, POLICY: made.policy, START: made.start,
         }  # fmt: skip

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loop_interfaces.action_set import ActionSet
 from loop_method.adapt import ModelBased
 from loop_method.adapt.estimated_loop import (
     UNPREDICTED,
@@ -115,7 +116,7 @@ def test_it_has_no_derivative_to_be_trained_with() -> None:
 @pytest.mark.parametrize("limit", [0.0, 0.2])
 def test_its_simulation_is_what_the_law_does_on_the_model(limit: float) -> None:
     loop, law = loop_of(replace(CUBIC, noise=0.0))
-    loop = replace(loop, action_limit=limit)
+    loop = replace(loop, action_set=ActionSet(limit=limit))
     theta = law.theta_of(
         0.05 * np.random.default_rng(5).standard_normal((N_A, 64)),
         np.full(N_A, 0.1),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from controller_node.identification import DesignSettings, design, design_each, designed
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.model_rows import ModelRows, unpack
 from loop_method.design.field_law import FieldLaw, field_law, states_under
 from loop_method.design.finite_horizon import finite_horizon
@@ -101,7 +102,7 @@ def test_actions_that_saturate_are_known_as_such() -> None:
         states.append(true.step(states[-1][None], a[None])[0])
     other = design([(np.array(states), asked)], target, settings("regression"))
     given = [(np.array(states), asked)], target, other
-    found = field_law(*given, state_weight=Q, action_weight=R, action_limit=limit)
+    found = field_law(*given, state_weight=Q, action_weight=R, action_set=ActionSet(limit=limit))
     without = field_law(*given, state_weight=Q, action_weight=R)
     assert found.fitted is not None and found.fitted.error < 1e-4
     assert without.fitted is None or without.fitted.error > 100 * found.fitted.error

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.families import equations, plants
+from loop_interfaces.action_set import ActionSet
 from loop_method.models import FieldModelSettings, Measured, fit_field_model
 from loop_method.models.kinds import NEAR_RIDGES, kinds_of
 from loop_method.models.prediction import errors
@@ -189,7 +190,7 @@ def test_saturated_actions_are_known_by_their_limit():
         replace(r, actions=r.actions * np.where(np.abs(r.actions) < 0.3, 1, 9)) for r in rollouts
     ]
     limited = [replace(r, actions=np.clip(r.actions, -0.3, 0.3)) for r in beyond]
-    found = fit_field_model(beyond, target, action_limit=0.3)
+    found = fit_field_model(beyond, target, action_set=ActionSet(limit=0.3))
     assert found.error == fit_field_model(limited, target).error
 
 

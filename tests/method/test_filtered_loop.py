@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loop_interfaces.action_set import ActionSet
 from loop_method.adapt.estimated_loop import simulate_estimated
 from loop_method.adapt.filtered_loop import FilteredLoop, improve_through_filter
 from loop_method.adapt.progress import Progress
@@ -40,7 +41,7 @@ def law_vector(law: ExtendedKalman, gains: np.ndarray) -> np.ndarray:
 def filtered(limit: float = 0.0, count: int = 6) -> tuple[FilteredLoop, np.ndarray, np.ndarray]:
     """The loop with the gains of a law, that law, and initial fields."""
     loop, law = uncertain()
-    loop = replace(loop, action_limit=limit)
+    loop = replace(loop, action_set=ActionSet(limit=limit))
     theta = 0.05 * np.random.default_rng(5).standard_normal((N_A, 6))
     begin, gains = fields(count), []
     simulate_estimated(loop, law, law_vector(law, theta), begin, gains)
@@ -50,7 +51,7 @@ def filtered(limit: float = 0.0, count: int = 6) -> tuple[FilteredLoop, np.ndarr
         loop.state_weight,
         loop.action_weight,
         T,
-        limit,
+        ActionSet(limit=limit),
         model=loop.model,
         known=filter_of(CUBIC),
         gains=gains,

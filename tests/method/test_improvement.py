@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from loop_interfaces.action_set import ActionSet
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO
 from loop_method.adapt.improve import curvature_of, improve
@@ -40,7 +41,7 @@ def bent() -> SpectralModel:
 def loop(limit: float = 0.0) -> ClosedLoop:
     rng = np.random.default_rng(1)
     U = np.linalg.qr(rng.normal(size=(N_Z, N_S)))[0]
-    return ClosedLoop(U, rng.normal(size=N_Z), 1.5, 0.4, T, limit, model=bent())
+    return ClosedLoop(U, rng.normal(size=N_Z), 1.5, 0.4, T, ActionSet(limit=limit), model=bent())
 
 
 def fields(count: int) -> np.ndarray:

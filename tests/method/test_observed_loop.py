@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
@@ -48,7 +49,13 @@ WEIGHTS = np.array([0.1, 0.4, 0.3, 0.2])
 
 def loop_of(rows: ModelRows = ROWS, **others: object) -> ObservedLoop:
     law = Observer(rows, T)
-    given = {"model": PLANT, "law": law, "noise": 0.2, "action_limit": LIMIT, **others}
+    given = {
+        "model": PLANT,
+        "law": law,
+        "noise": 0.2,
+        "action_set": ActionSet(limit=LIMIT),
+        **others,
+    }
     return ObservedLoop(rows.U, TARGET, 1.0, 0.5, T, **given)
 
 
@@ -83,7 +90,7 @@ def test_it_is_the_law_that_answers_with_its_memory_and_saturation() -> None:
 @pytest.mark.parametrize("any_cost", [False, True])
 def test_the_gradient_agrees_with_differences(limit: float, any_cost: bool) -> None:
     cost = Cost(N_Z, N_A, T, state_weight=2.0, action_target=0.1, terminal_weight=3.0)
-    loop = loop_of(action_limit=limit, cost=cost if any_cost else None)
+    loop = loop_of(action_set=ActionSet(limit=limit), cost=cost if any_cost else None)
     theta = some(loop)
     value, gradient = loop.gradient(theta, FIELDS, WEIGHTS)
     assert value == pytest.approx(WEIGHTS @ loop.costs(theta, FIELDS))
@@ -95,7 +102,7 @@ def test_the_gradient_agrees_with_differences(limit: float, any_cost: bool) -> N
 
 def test_without_a_filter_it_is_the_loop_of_the_affine_law() -> None:
     rows = ModelRows(ROWS.A, ROWS.B, U, K_a, K_b, ROWS.s_r)
-    loop = loop_of(rows, noise=0.0, action_limit=0.0)
+    loop = loop_of(rows, noise=0.0, action_set=ActionSet(limit=0.0))
     affine = ClosedLoop(U, TARGET, 1.0, 0.5, T, model=PLANT)
     np.testing.assert_allclose(
         loop.costs(loop.theta(loop.law.theta_start), FIELDS),

@@ -28,7 +28,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     rng = np.random.default_rng(0)
     states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
     records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
-    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24)
     proposals = SensedProposals(
         loop, equally_spaced(2), noise=0.0, largest_cost=np.inf, settings=FEW_ITERATIONS
     )
@@ -39,7 +39,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
 
 @pytest.mark.parametrize("n_a", [2, 12])
 def test_a_checkpoint_of_the_first_terms_alone_is_continued(n_a: int) -> None:
-    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24)
     proposals = SensedProposals(loop, equally_spaced(n_a), noise=0.0, largest_cost=np.inf)
     older = np.arange(1.0, unknowns(n_a) - EQUATION + len(FIRST) + 1)
     proposals.restore({"equation": older})

@@ -11,6 +11,7 @@ import pytest
 
 import pdeloop
 from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.grid import Grid
 from loop_interfaces.parameters import measured_size
@@ -202,7 +203,7 @@ def test_actions_saturate_in_the_field_and_in_the_cost() -> None:
 def test_the_law_and_the_exploration_saturate_and_change_nothing_inside() -> None:
     rng = np.random.default_rng(0)
     U, z_r = np.linalg.qr(rng.standard_normal((10, 3)))[0], rng.standard_normal(10)
-    free, limited = ProjectedLaw([U], z_r), ProjectedLaw([U], z_r, 0.7)
+    free, limited = ProjectedLaw([U], z_r), ProjectedLaw([U], z_r, ActionSet(limit=0.7))
     policies, states = rng.standard_normal((5, 4, 6)), rng.standard_normal((5, 10))
     free.set(policies)
     limited.set(policies)
@@ -212,7 +213,7 @@ def test_the_law_and_the_exploration_saturate_and_change_nothing_inside() -> Non
     assert same_bits(held[inside], a[inside])
     assert same_bits(held[~inside], 0.7 * np.sign(a[~inside]))
     drawn = excitation(1, 2, 200, 1.0)
-    assert same_bits(excitation(1, 2, 200, 1.0, 0.3), np.clip(drawn, -0.3, 0.3))
+    assert same_bits(excitation(1, 2, 200, 1.0, ActionSet(limit=0.3)), np.clip(drawn, -0.3, 0.3))
 
 
 # Sensors

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.spec import ParameterError
 from loop_method.design.finite_horizon import finite_horizon_of
 from loop_method.design.tracking import track_horizon
 from loop_method.laws.calls import laws_of
 from loop_method.laws.feedforward import FeedForward
-from pde_sim_node.action_set import ActionSet
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
 from tests.support.small import FEW_FITS

@@ -16,6 +16,7 @@ from controller_node.fast_path import ControllerFastPath
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces import model_rows
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, STATE
 from pde_sim_node.fast_path import PlantFastPath
@@ -68,7 +69,7 @@ class Controller:
             reduced_order=N_S,
             state_weight=1.0,
             action_weight=1.0,
-            action_limit=limit,
+            action_set=ActionSet(limit=limit),
         )
         self.batch = batch
         self.responder, self.judge = Responder(self.settings), Responder(self.settings)

@@ -18,6 +18,7 @@ import pytest
 
 from controller_node.law_batch import LawBatch
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.spec import ParameterError
 from loop_method.laws.extended_kalman import ExtendedKalman
@@ -150,7 +151,7 @@ def test_the_law_in_c_is_the_law_of_the_loop(
         assert (np.abs(expected) > limit).any()
         expected = np.clip(expected, -limit, limit)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
-    loop = ProjectedLaw([model.U], np.linalg.pinv(model.U.T) @ model.s_r, limit)
+    loop = ProjectedLaw([model.U], np.linalg.pinv(model.U.T) @ model.s_r, ActionSet(limit=limit))
     loop.set(np.repeat(gains[np.newaxis], 20, axis=0), np.zeros(20, dtype=np.int64))
     np.testing.assert_allclose(found, loop.actions(states), rtol=1e-12, atol=1e-13)
 
@@ -178,7 +179,11 @@ def test_a_law_with_a_linear_filter_in_c_is_that_of_the_loop(tmp_path: Path) -> 
 
 def assert_c_is(source: Path, law: Any, theta: Any) -> None:
     """Assert that an exported law gives the actions of the loop's, in two episodes."""
-    function, loop, found = compiled(source), LawBatch([law], np.zeros(8), LIMIT), np.empty(law.n_a)
+    function, loop, found = (
+        compiled(source),
+        LawBatch([law], np.zeros(8), ActionSet(limit=LIMIT)),
+        np.empty(law.n_a),
+    )
     readings = np.random.default_rng(0).normal(size=(law.horizon, 8))
     for _ in range(2):
         memory = ctypes.create_string_buffer(8 * (1 + len(law.model.A)))

@@ -19,6 +19,7 @@ OWN: dict[str, Any] = {
     "measurement_noise": 0.02,
     "process_noise": 0.01,
     "action_limit": 0.8,
+    "action_bounds": [-0.3, -1.0, 1.0, 0.5, 0.0],
     "sensors": 6,
     "sensor_delays": 1,
     # A problem so small that a step of Gauss-Newton takes no time.
