@@ -224,7 +224,7 @@ def identify_bag(
         raise BagError(f"the chosen episodes have no environment {environment}")
     told = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
     known = {name: value for name, value in recorded_values(told).items() if name in told}
-    return _identified(trajectories, target, sources, known, given)
+    return _identified(trajectories, target, sources, known, given, remarks=tuple(bag.damage))
 
 
 def _identified(

@@ -17,7 +17,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.documents import parse_json
 from loop_interfaces.files import read_json
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
-from pdeloop.bags.mcap_messages import CONVERTED, Message, files, finished, read, text_of
+from pdeloop.bags.mcap_messages import CONVERTED, Message, files, in_time, text_of
 from pdeloop.bags.metadata import Findings, check, read_metadata, repeated
 from pdeloop.bags.survey import Survey, by_run, survey
 from recorder_node.bag import METADATA, BagError
@@ -44,12 +44,13 @@ class Bag:
                 raise BagError(f"{path} is a run without a bag; pdeloop train --record records one")
             raise BagError(f"no bag in {path}: there is no .mcap file")
         self.path = path
-        self.files = _in_time(found)
+        self.files = found
 
     @property
     def finished(self) -> bool:
         """True if it was closed properly."""
-        return all(map(finished, self.files)) and (self.path / METADATA).exists()
+        closed = all(file.file.finished for file in self.survey.files)
+        return closed and (self.path / METADATA).exists()
 
     @cached_property
     def survey(self) -> Survey:
@@ -57,9 +58,8 @@ class Bag:
         return survey(self.files)
 
     def messages(self) -> Iterator[Message]:
-        """The messages in the order in which they were written."""
-        for file in self.files:
-            yield from read(file)
+        """The messages by the times at which they arrived, whatever their order in the files."""
+        return in_time([file.file for file in self.survey.files])
 
     def target(self) -> Array | None:
         """The target z_r; None if the bag has none."""
@@ -70,7 +70,18 @@ class Bag:
         told = read_metadata(self.path)
         found = Findings() if told is None else check(self.path, told, self.survey)
         found.differences += repeated(self.survey)
+        found.missing += self.damage
         return found
+
+    @property
+    def damage(self) -> list[str]:
+        """What of its files cannot be read, in words."""
+        return [
+            f"what is damaged of {file.name} ({text}); what is whole is read, and mcap recover "
+            f"{file.name} -o FILE writes it to a file for other tools"
+            for file in self.survey.files
+            for text in file.file.damage
+        ]
 
     def parameters(self) -> dict[int, dict[str, Any]]:
         """The nodes' parameters by run, where the bag or its source has them.
@@ -122,18 +133,6 @@ def bags_of(path: Path) -> list[Bag]:
     if not numbered or files(path):
         return [Bag(path)]
     return [Bag(p) for p in sorted(numbered, key=lambda p: (len(p.name), p.name))]
-
-
-def _in_time(found: list[Path]) -> list[Path]:
-    """The files of a bag by the times of their first messages; by their names where these are equal."""
-    if len(found) < 2:
-        return found
-    times = {}
-    for path in found:
-        times[path] = 0
-        with suppress(BagError, StopIteration):  # what is wrong with it is said when it is read
-            times[path] = next(read(path)).when
-    return sorted(found, key=lambda path: times[path])
 
 
 def _beside(path: Path) -> dict[int, dict[str, Any]]:

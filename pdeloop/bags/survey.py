@@ -14,7 +14,7 @@ from typing import Any
 from loop_interfaces.arrays import Array
 from loop_interfaces.documents import parse_json
 from loop_interfaces.topics import TARGET
-from pdeloop.bags.mcap_messages import Message, finished, read
+from pdeloop.bags.mcap_messages import McapFile, Message, unreadable
 from recorder_node.bag import BagError
 from recorder_node.sources import PARAMETERS_TOPIC, source_of
 
@@ -24,13 +24,9 @@ MAX_PARAMETERS = 10_000_000
 
 @dataclass
 class FileSurvey:
-    """One file: messages by topic and type, the first and the last time (ns), a digest of all of it.
+    """One file: messages by topic and type, the first and the last time (ns), a digest of all of it."""
 
-    finished: whether its recorder came to its end.
-    """
-
-    path: Path
-    finished: bool = False
+    file: McapFile
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     first: int | None = None
     last: int | None = None
@@ -38,7 +34,7 @@ class FileSurvey:
 
     @property
     def name(self) -> str:
-        return self.path.name
+        return self.file.path.name
 
     @property
     def messages(self) -> int:
@@ -72,31 +68,46 @@ class Survey:
 
 
 def survey(files: Sequence[Path]) -> Survey:
-    """Look through the files once. BagError where one is damaged."""
+    """Look through the files once; they come by the times of their first messages.
+
+    BagError where nothing can be read because of damages.
+    """
     found, known = Survey(), cache(source_of)
+    noted: dict[int, int] = {}
     for path in files:
-        file, digest = FileSurvey(path), hashlib.blake2b()
-        for message in read(path):
+        file, digest = FileSurvey(McapFile(path)), hashlib.blake2b()
+        for message in file.file.messages():
             file.counts[message.topic, message.type] += 1
             file.first = message.when if file.first is None else min(file.first, message.when)
             file.last = message.when if file.last is None else max(file.last, message.when)
             digest.update(message.data)
             if message.topic == PARAMETERS_TOPIC:
-                _take_parameters(found.parameters, message, path)
+                _take_parameters(found.parameters, noted, message, path)
             source = None if found.target is not None else known(message.topic)
             if source is not None and source.array is TARGET:
                 found.target = source.codec.decode(message.data).values
-        file.digest, file.finished = digest.digest(), finished(path)
+        file.digest = digest.digest()
         found.files.append(file)
+    damaged = [file.file for file in found.files if file.file.damage]
+    if damaged and not found.counts:
+        raise unreadable(damaged[0])
+    found.files.sort(key=lambda file: file.first or 0)
     return found
 
 
-def _take_parameters(known: dict[int, dict[str, Any]], message: Message, path: Path) -> None:
-    """Take the recorder's notes of a run's parameters; the latest note has all of them."""
+def _take_parameters(
+    known: dict[int, dict[str, Any]], noted: dict[int, int], message: Message, path: Path
+) -> None:
+    """Take the recorder's notes of a run's parameters; the latest note has all of them.
+
+    noted: the times of the known ones (ns).
+    """
     try:
         if len(message.data) > MAX_PARAMETERS:
             raise ValueError(f"they have more than {MAX_PARAMETERS} bytes")
-        known |= by_run(parse_json(message.data[8:].rstrip(b"\0")))
+        for run, values in by_run(parse_json(message.data[8:].rstrip(b"\0"))).items():
+            if message.when >= noted.get(run, message.when):
+                known[run], noted[run] = values, message.when
     except ValueError as error:
         raise BagError(f"the parameters in {path} cannot be read: {error}") from error
 

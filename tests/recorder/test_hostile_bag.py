@@ -126,20 +126,20 @@ def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, length):
 @pytest.mark.parametrize("name", ["/\x1b]0;title\x07", "/two\nlines", "/" + "x" * 300])
 def test_a_name_that_is_not_to_be_printed_is_refused(tmp_path, name):
     topic = McapChannel(id=1, topic=name, message_encoding="cdr", metadata={}, schema_id=0)
-    with pytest.raises(BagError, match=r"damaged: a topic's name or type is '[ -~]+'; expected"):
+    with pytest.raises(BagError, match=r"damaged: .* a topic's name or type is '[ -~]+'; exp"):
         describe(crafted(tmp_path / "topic", record_bytes(topic)))
 
 
 def test_the_records_of_a_chunk_are_read_one_by_one(tmp_path):
-    """Those before one that is cut off have come when that is reached."""
+    """Those before one that is cut off are read; its absence is named."""
     topic = McapChannel(id=1, topic="/a", message_encoding="cdr", metadata={}, schema_id=0)
     message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 1, 1)
     content = record_bytes(topic) + message * 2 + message[:5]
     cut = record_bytes(chunk(zstandard.compress(content), len(content)))
-    messages = Bag(crafted(tmp_path / "bag", cut)).messages()
-    assert [next(messages).topic for _ in range(2)] == ["/a", "/a"]
-    with pytest.raises(BagError, match="damaged"):
-        next(messages)
+    bag = Bag(crafted(tmp_path / "bag", cut))
+    assert [message.topic for message in bag.messages()] == ["/a", "/a"]
+    (damage,) = bag.findings().missing
+    assert damage.startswith("what is damaged of x.mcap (the chunk at byte ")
 
 
 def test_a_damaged_chunk_is_noticed_by_its_checksum(tmp_path):

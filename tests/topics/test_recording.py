@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import pack
-from pdeloop.bags.mcap_messages import files, finished
+from pdeloop.bags.mcap_messages import files
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
@@ -157,8 +157,7 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
     run.send_signal(signal.SIGHUP)  # as a terminal that is closed does
     loop.wait(run, LIMIT, code=130)
-    bags = files(out / "bag")
-    assert bags and all(map(finished, bags))
+    assert files(out / "bag") and Bag(out / "bag").finished
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
     assert_same_training(out, in_process(iterations=iterations))
     second = verify(out / "bag-2")
