@@ -17,9 +17,11 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -308,14 +310,29 @@ def refuse_while_executed(what: str) -> None:
 def _being_executed(path: Path) -> Iterator[None]:
     """Meanwhile it finds modules next to it, after all installed ones, which they cannot hide."""
     _executing.append(path)
-    folder, before = str(path.parent), list(sys.path)
-    sys.path.append(folder)
+    finder = _Beside(str(path.parent))
+    sys.meta_path.append(finder)
     try:
         yield
     finally:
         _executing.pop()
-        if folder not in before:
-            sys.path.remove(folder)
+        sys.meta_path.remove(finder)
+
+
+class _Beside(MetaPathFinder):
+    """Finds modules in a folder once no other finder has, those of editable packages among them.
+
+    At the end of `sys.path` the folder would come before those: one that holds a checkout has a
+    folder `pdeloop`, which Python takes for a package without content.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return PathFinder.find_spec(name, [self._folder]) if path is None else None
 
 
 def _reduced(thing: Any) -> tuple[Any, ...]:

@@ -126,8 +126,9 @@ def check(folder: Path, told: Metadata, found: Survey) -> Findings:
             findings.differences.append(f"{name} is in {folder}, but {METADATA} does not name it")
     listed = [name for name in dict.fromkeys(told.files) if name in files]
     order = [name for name in files if name in listed]
-    times = [(files[name].first or 0, files[name].last or 0) for name in listed]
-    if any(last < first for (first, _), (_, last) in pairwise(times)):  # others have no order
+    pairs = pairwise(files[name] for name in listed)
+    # Files that overlap in time have no order.
+    if any((later.last or 0) < (earlier.first or 0) for earlier, later in pairs):
         findings.differences.append(
             f"{METADATA} lists its files in the order {', '.join(listed[:NAMED])}, but their "
             f"messages are in the order {', '.join(order[:NAMED])}"
