@@ -1,6 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Backstepping laws of the boundary-controlled plants: a = sum_i k_i u_i, from the kernels' equations.
 
+Those of PDEControlGym's notebooks, `source_...`, are discretised as there, with rectangles and shifted
+points.
+
 References
 ----------
 Krstic, Smyshlyaev, "Boundary Control of PDEs", SIAM 2008, chapters 4 and 9.
@@ -11,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from pde_sim_node.plants.boundary import BoundaryControlled
 
 
 def transport_gain(beta: Array) -> Array:
@@ -46,6 +50,33 @@ def reaction_gain(beta: Array) -> Array:
         around = k[i, 2 : i + 1] + k[i, 0 : i - 1]
         k[i + 1, inside] = -k[i - 1, inside] + around * (1.0 + 0.5 * h**2 * beta[inside])
     return _trapezoidal(k[n])
+
+
+def source_transport_gain(plant: BoundaryControlled) -> Array:
+    """As in HyperbolicPDEExample.ipynb: 100 points, h = 0.01."""
+    n = plant.grid.size
+    h = 1.0 / n
+    theta = plant.strength * np.cos(plant.rate * np.arccos(np.linspace(h, 1.0, n + 1)))
+    kappa = -theta
+    for i in range(2, n + 1):
+        kappa[i] = h * (kappa[i - 1 : 0 : -1] @ theta[1:i]) - theta[i]
+    gain: Array = h * kappa[n:0:-1]
+    return gain
+
+
+def source_reaction_gain(plant: BoundaryControlled) -> Array:
+    """As in ParabolicPDEExample.ipynb: 201 points, of which the last has no part."""
+    n = plant.grid.size - 1
+    h = 1.0 / n
+    beta = plant.strength * np.cos(plant.rate * np.arccos(np.linspace(h, 1.0, n)))
+    k = np.zeros((n, n))
+    k[1, 1] = -0.25 * h * (beta[1] + beta[0])
+    for i in range(1, n - 1):
+        k[i + 1, i + 1] = k[i, i] - 0.25 * h * (beta[i - 1] + beta[i])
+        k[i + 1, i] = k[i, i] - 0.5 * h * beta[i]
+        around = k[i, 2 : i + 1] + k[i, 0 : i - 1]
+        k[i + 1, 1:i] = -k[i - 1, 1:i] + around * (1.0 + 0.5 * h**2 * beta[1:i])
+    return np.append(h * k[-1], 0.0)
 
 
 def _trapezoidal(values: Array) -> Array:

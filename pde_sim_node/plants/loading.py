@@ -25,6 +25,8 @@ from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.interval import Interval
+from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
+from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
 from pde_sim_node.plants.reactions import (
     Brusselator,
     ComplexGinzburgLandau,
@@ -43,6 +45,8 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
         "kolmogorov": Kolmogorov,
         "transport": Transport,
         "reaction-diffusion": ReactionDiffusionBoundary,
+        "kuramoto-sivashinsky-eight": KuramotoSivashinskyEight,
+        "kuramoto-sivashinsky-four": KuramotoSivashinskyFour,
         "plate": Plate,
         "gray-scott": GrayScott,
         "brusselator": Brusselator,
