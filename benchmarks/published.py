@@ -9,12 +9,14 @@ from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, TypeAlias
 
 import pdeloop
-from benchmarks.tasks import boundary, convection, lid
+from benchmarks.tasks import boundary, convection, falling_film, kuramoto_sivashinsky, lid
 from benchmarks.tasks.common import Row
 
 __all__ = ["run", "text"]
 
-Name: TypeAlias = Literal["reaction-diffusion", "transport", "lid", "convection"]
+Name: TypeAlias = Literal[
+    "reaction-diffusion", "transport", "kuramoto-sivashinsky", "lid", "film", "convection"
+]
 
 
 class Task(NamedTuple):
@@ -29,7 +31,9 @@ class Task(NamedTuple):
 TASKS: dict[str, Task] = {
     "reaction-diffusion": Task(boundary.reaction_diffusion, "PDEControlGym, notebook", 2),
     "transport": Task(boundary.transport, "PDEControlGym, notebook", 1),
+    "kuramoto-sivashinsky": Task(kuramoto_sivashinsky.rows, "DA-RL, eight actuators", 20),
     "lid": Task(lid.rows, "PDEControlGym, NavierStokes", 3),
+    "film": Task(falling_film.rows, "beacon, shkadov-v0", 2),
     "convection": Task(convection.rows, "beacon, rayleigh-v0", 12),
 }
 

@@ -9,7 +9,8 @@ declares, and measured by the return.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,13 +67,13 @@ def rows(task: str, budgets: list[int], seeds: int) -> Iterator[Row]:
     """The table of a task."""
     known, measure = plant_of(task), Measure(plant_of(task))
     for name, *figures, episodes in SOURCE[task]:
-        yield _row(name, *(f"{value:.2f}" for value in figures), episodes, "PDEControlGym")
+        yield _row(name, [f"{value:.2f}" for value in figures], episodes, "PDEControlGym")
 
     def row(name: str, laws: list[Law], spent: Any, clipped: bool = True) -> Row:
         found = np.array([measure(law, clipped) for law in laws])
         worst = [np.min] * 3 + [np.max] * 2
-        values = (shown(found[:, i], worst[i], 6) for i in range(5))
-        return _row(name, *values, spent, "here")
+        values = [shown(found[:, i], worst[i], 6) for i in range(5)]
+        return _row(name, values, spent, "here")
 
     yield row("none", [lambda k, z: np.zeros((len(z), 1))], 0)
     gain = source_transport_gain if task == "transport" else source_reaction_gain
@@ -89,19 +90,14 @@ def rows(task: str, budgets: list[int], seeds: int) -> Iterator[Row]:
     yield row("exact LQR of the horizon", [lambda k, z: z @ K[k].T], "")
     if task == "reaction-diffusion":
         bounds = [f"{most(known, c):.6g}" for c in (1.0, 10.0)]
-        yield _row("limit of any inputs", "", *bounds, "", "", "", "here")
+        yield _row("limit of any inputs", ["", *bounds, "", ""], "", "here")
 
 
-def _row(
-    name: str, mean: str, low: str, high: str, near: str, far: str, spent: Any, by: str
-) -> Row:
+def _row(name: str, figures: Sequence[str], spent: Any, by: str) -> Row:
+    heads = ("return", "from 1", "from 10", "Σ norms from 1", "from 10 ")
     return {
         "controller": name,
-        "return": mean,
-        "from 1": low,
-        "from 10": high,
-        "Σ norms from 1": near,
-        "from 10 ": far,
+        **dict(zip(heads, figures, strict=True)),
         "episodes": spent,
         "by": by,
     }
@@ -173,4 +169,4 @@ def most(known: BoundaryControlled, c: float) -> float:
         a = min(bound, needed / share)
         spent, needed, k = spent + a, needed - share * a, k + 1
     assert 0.1 * growth ** (k - T) / effect < 1.0 / np.linalg.norm(left), "a rest would pay"
-    return c * np.sqrt(known.grid.size) + 300.0 - 0.1 * spent - c / 1000.0
+    return c * math.sqrt(known.grid.size) + 300.0 - 0.1 * spent - c / 1000.0

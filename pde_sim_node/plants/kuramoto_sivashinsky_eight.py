@@ -100,7 +100,8 @@ class KuramotoSivashinskyEight(Dynamics):
         u -= u.mean()
         for _ in range(self.burn_in):
             u = self.step(u, np.zeros((1, self.n_a)))
-        return u[0]
+        start: Array = u[0]
+        return start
 
     def mean_state(self) -> Array:
         """One field of the attractor, as the mean of them is no field of it."""

@@ -88,14 +88,16 @@ class KuramotoSivashinskyFour(Dynamics):
         x = self.grid.axes[0].points
         far = np.abs(x[:, None] - length * np.arange(self.n_a) / self.n_a)
         far = np.minimum(far, length - far) if wrapped else far
-        self.supports = np.exp(-0.5 * (far / _SIGMA) ** 2) / math.sqrt(2 * math.pi * _SIGMA)
+        self._shapes = np.exp(-0.5 * (far / _SIGMA) ** 2) / math.sqrt(2 * math.pi * _SIGMA)
+        self.supports = self._shapes
 
     def initial_state(self, rng: np.random.Generator) -> Array:
         """A field of the attractor: what becomes of a random one without control."""
         u = rng.uniform(-0.4, 0.4, (1, self.grid.size))
         for _ in range(self.burn_in):
             u = self.step(u, np.zeros((1, self.n_a)))
-        return u[0]
+        start: Array = u[0]
+        return start
 
     def mean_state(self) -> Array:
         """One field of the attractor, as the mean of them is no field of it."""
@@ -111,7 +113,7 @@ class KuramotoSivashinskyFour(Dynamics):
         for m in range(len(z)):
             forcing = np.zeros(self.grid.size)
             for j in range(self.n_a):  # in this order for every batch
-                forcing += a[m, j] * self.supports[:, j]
+                forcing += a[m, j] * self._shapes[:, j]
             dt, dx = self.sample_time / self.substeps, self.grid.axes[0].spacing
             squares[m] = advance(new[m], forcing, dt, dx, self.substeps)
         return new, squares

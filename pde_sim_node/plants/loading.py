@@ -24,6 +24,7 @@ from pde_sim_node.plants import fmu
 from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
+from pde_sim_node.plants.falling_film import FallingFilm
 from pde_sim_node.plants.interval import Interval
 from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
 from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
@@ -47,6 +48,7 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
         "reaction-diffusion": ReactionDiffusionBoundary,
         "kuramoto-sivashinsky-eight": KuramotoSivashinskyEight,
         "kuramoto-sivashinsky-four": KuramotoSivashinskyFour,
+        "falling-film": FallingFilm,
         "plate": Plate,
         "gray-scott": GrayScott,
         "brusselator": Brusselator,

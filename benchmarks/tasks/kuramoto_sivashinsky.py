@@ -1,0 +1,76 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""DA-RL's Kuramoto-Sivashinsky equation with eight actuators, the whole field measured.
+
+The return of an episode of 1,000 actions is the sum of -|u|_2 / sqrt(64) - 0.2 |a|_2 over new
+states, not squared. Laws are designed for the plant's quadratic cost, and measured by the return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from benchmarks.tasks.common import Row, name_of, shown, trained
+from loop_interfaces.arrays import Array
+from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
+from pdeloop.episode import Law
+
+STARTS = np.arange(2000, 2020)
+"""Seeds of the twenty initial states."""
+EFFORT = 0.2
+"""Factor of |a| in the return."""
+ORDER = 16
+
+
+def rows(budgets: list[int], seeds: int) -> Iterator[Row]:
+    """The table of the whole field."""
+    known = KuramotoSivashinskyEight()
+    starts = np.stack([known.initial_state(np.random.default_rng(s)) for s in STARTS])
+
+    def row(name: str, laws: list[Law], spent: Any) -> Row:
+        found = np.array([returns(known, law, starts) for law in laws])
+        kinds = found.mean(axis=1), np.median(found, axis=1), found.min(axis=1)
+        return _row(name, [shown(kind, np.min) for kind in kinds], spent, "here")
+
+    yield _row("DDPG", ["-145.5", "", ""], 200, "DA-RL, printed")
+    yield row("none", [lambda k, z: np.zeros((len(z), known.n_a))], 0)
+    for budget in budgets:
+        how = {"reduced_order": ORDER}
+        made = [trained(KuramotoSivashinskyEight, seed, budget, **how) for seed in range(seeds)]
+        yield row(name_of(budget), [law for law, _ in made], max(count for _, count in made))
+    K = told(known)
+    yield row("LQR of the equation told", [lambda k, z: z @ K.T], "")
+
+
+def returns(known: KuramotoSivashinskyEight, law: Law, starts: Array) -> Array:
+    """The return from each start."""
+    z, total = starts.copy(), np.zeros(len(starts))
+    for k in range(known.horizon):
+        a = np.clip(law(k, z), known.action_low, known.action_high)
+        z = known.step(z, a)
+        total -= np.sqrt(np.mean(z**2, axis=1)) + EFFORT * np.linalg.norm(a, axis=1)
+    return total
+
+
+def told(known: KuramotoSivashinskyEight) -> Array:
+    """The gains of LQR on the plant's linearisation at rest."""
+    small, n = 1e-7, known.grid.size
+    A = known.step(small * np.eye(n), np.zeros((n, known.n_a))).T / small
+    B = known.step(np.zeros((known.n_a, n)), small * np.eye(known.n_a)).T / small
+    R = known.action_weight * np.eye(known.n_a)
+    P = scipy.linalg.solve_discrete_are(A, B, known.state_weight * np.eye(n), R)
+    gains: Array = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    return gains
+
+
+def _row(name: str, figures: Sequence[str], spent: Any, by: str) -> Row:
+    heads = ("mean return", "median", "worst start")
+    return {
+        "controller": name,
+        **dict(zip(heads, figures, strict=True)),
+        "episodes": spent,
+        "by": by,
+    }
