@@ -80,7 +80,7 @@ def rows(task: str, budgets: list[int], seeds: int) -> Iterator[Row]:
     b = gain(known)
     yield row("backstepping, which knows the PDE", [lambda k, z: z @ b[:, None]], 0, clipped=False)
     for budget in budgets:
-        how = {"reduced_order": ORDER}
+        how = {"reduced_order": ORDER, "identification": "regression"}
         laws = [trained(lambda: plant_of(task), seed, budget, **how) for seed in range(seeds)]
         yield row(name_of(budget), [law for law, _ in laws], max(count for _, count in laws))
         if budget == 1 and task == "reaction-diffusion":
