@@ -9,13 +9,26 @@ from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, TypeAlias
 
 import pdeloop
-from benchmarks.tasks import boundary, convection, falling_film, kuramoto_sivashinsky, lid
+from benchmarks.tasks import (
+    boundary,
+    convection,
+    falling_film,
+    kuramoto_sivashinsky,
+    kuramoto_sivashinsky_four,
+    lid,
+)
 from benchmarks.tasks.common import Row
 
 __all__ = ["run", "text"]
 
 Name: TypeAlias = Literal[
-    "reaction-diffusion", "transport", "kuramoto-sivashinsky", "lid", "film", "convection"
+    "reaction-diffusion",
+    "transport",
+    "lid",
+    "kuramoto-sivashinsky-eight",
+    "kuramoto-sivashinsky-four",
+    "film",
+    "convection",
 ]
 
 
@@ -29,10 +42,11 @@ class Task(NamedTuple):
 
 
 TASKS: dict[str, Task] = {
-    "reaction-diffusion": Task(boundary.reaction_diffusion, "PDEControlGym, notebook", 2),
-    "transport": Task(boundary.transport, "PDEControlGym, notebook", 1),
-    "kuramoto-sivashinsky": Task(kuramoto_sivashinsky.rows, "DA-RL, eight actuators", 20),
+    "reaction-diffusion": Task(boundary.reaction_diffusion, "PDEControlGym, notebook", 30),
+    "transport": Task(boundary.transport, "PDEControlGym, notebook", 5),
     "lid": Task(lid.rows, "PDEControlGym, NavierStokes", 3),
+    "kuramoto-sivashinsky-eight": Task(kuramoto_sivashinsky.rows, "DA-RL, whole field", 30),
+    "kuramoto-sivashinsky-four": Task(kuramoto_sivashinsky_four.rows, "Werner and Peitz", 30),
     "film": Task(falling_film.rows, "beacon, shkadov-v0", 2),
     "convection": Task(convection.rows, "beacon, rayleigh-v0", 12),
 }

@@ -16,6 +16,7 @@ import scipy.linalg
 from benchmarks.tasks.common import Row, name_of, shown, trained
 from loop_interfaces.arrays import Array
 from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
+from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
 from pdeloop.episode import Law
 
 STARTS = np.arange(2000, 2020)
@@ -55,7 +56,7 @@ def returns(known: KuramotoSivashinskyEight, law: Law, starts: Array) -> Array:
     return total
 
 
-def told(known: KuramotoSivashinskyEight) -> Array:
+def told(known: KuramotoSivashinskyEight | KuramotoSivashinskyFour) -> Array:
     """The gains of LQR on the plant's linearisation at rest."""
     small, n = 1e-7, known.grid.size
     A = known.step(small * np.eye(n), np.zeros((n, known.n_a))).T / small
