@@ -28,7 +28,7 @@ from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
-from pdeloop.episode import Law, projected_law, rollout
+from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from pdeloop.in_process import LocalPair, train
 from pdeloop.study.training import require_environment
 from tuner_node.build import build_training
@@ -38,6 +38,8 @@ Method = Callable[..., tuple[LocalPair, Law, int]]
 """(resolved parameters, constants) -> (pair, law, rollouts paid)."""
 FIRST_FIELD = 1000
 """Index of the first initial field beyond those that a training explores from."""
+DIVERGED = 1e3
+"""Each residual of a diverged rollout."""
 
 
 def measure(
@@ -92,55 +94,110 @@ def lqt_law(values: Values) -> tuple[LocalPair, Law, int]:
     return pair, law, int(training.budget.paid[0])
 
 
+class Gains:
+    """The gains of the law a = K_a s + b as numbers x, 0 for those of LQ tracking, and what they cost.
+
+    The coordinates X = [K_a b] F^(1/2), F the second moments of [s; 1] in the rollouts of the check,
+    have the unit of an action.
+    """
+
+    def __init__(self, values: Values) -> None:
+        self.values, self.pair = values, LocalPair(values)
+        training = warm_start(values, self.pair)
+        assert training.models is not None
+        self.U = unpack(training.models[0], values["n_a"]).U
+        self.s_r = self.U.T @ self.pair.plant.target
+        rows = np.vstack([known.states @ self.U for known in training.measured[0]])
+        rows = np.column_stack([rows, np.ones(len(rows))])
+        F = rows.T @ rows / len(rows)
+        F += 1e-3 * np.trace(F) / len(F) * np.eye(len(F))
+        self._to_gains = linalg.inv(linalg.cholesky(F, lower=True))
+        self._start, self.paid = training.starts()[0], int(training.budget.paid[0])
+        self.size = values["n_a"] * len(F)
+
+    @property
+    def left(self) -> int:
+        """Rollouts that are left of the budget."""
+        return int(self.values["rollouts"]) - self.paid
+
+    def policy(self, x: Array) -> Array:
+        """The gains at distance x from the first ones; of the K_b with K_b s_r = b the least."""
+        n_s = len(self.s_r)
+        step = x.reshape(-1, n_s + 1) @ self._to_gains
+        b = np.outer(step[:, n_s], self.s_r) / (self.s_r @ self.s_r)
+        gains: Array = self._start + np.hstack([step[:, :n_s], b])
+        return gains
+
+    def law(self, *points: Array) -> Law:
+        """The law of one x, or of one for each environment."""
+        gains = np.stack([self.policy(x) for x in points])
+        return projected_law(self.pair.plant, self.U, gains[0] if len(points) == 1 else gains)
+
+    def episode(self, points: list[Array], index: int, *, keep: bool) -> EpisodeRecord:
+        """A paid rollout of each of some x, from one initial field."""
+        self.paid += len(points)
+        fields = [training_field(self.values, index)] * len(points)
+        return rollout(self.pair.plant, self.law(*points), fields, keep=keep)
+
+
 def cma_es(
     values: Values, *, sigma: float, population: int, separable: bool = False
 ) -> tuple[LocalPair, Law, int]:
-    """CMA-ES on the gains of the law a = K_a s + b, from those of LQ tracking.
+    """CMA-ES on `Gains`, with the first standard deviation `sigma`.
 
-    A generation shares one initial field, and the mean of the last one is the result. The
-    coordinates X = [K_a b] F^(1/2), F the second moments of [s; 1] in the rollouts of the check, have
-    the unit of an action, of which `sigma` is the first standard deviation. `separable` adapts
-    variances alone. Hansen, "The CMA evolution strategy: a tutorial",
-    arXiv:1604.00772; Ros, Hansen, "A simple modification in CMA-ES achieving linear time and space
-    complexity", PPSN 2008.
+    A generation shares one initial field, and the mean of the last one is the result. `separable`
+    adapts variances alone. Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772; Ros,
+    Hansen, "A simple modification in CMA-ES achieving linear time and space complexity", PPSN 2008.
     """
     from cmaes import CMA, SepCMA
 
-    pair = LocalPair(values)
-    training = warm_start(values, pair)
-    assert training.models is not None
-    U, plant = unpack(training.models[0], values["n_a"]).U, pair.plant
-    n_s = U.shape[1]
-    s_r = U.T @ plant.target
-    rows = np.vstack([known.states @ U for known in training.measured[0]])
-    rows = np.column_stack([rows, np.ones(len(rows))])
-    F = rows.T @ rows / len(rows)
-    F += 1e-3 * np.trace(F) / len(F) * np.eye(len(F))
-    to_gains = linalg.inv(linalg.cholesky(F, lower=True))
-    start = training.starts()[0]
-
-    def policy(x: Array) -> Array:
-        """The gains at distance x from the first ones; of the K_b with K_b s_r = b the least."""
-        step = x.reshape(values["n_a"], n_s + 1) @ to_gains
-        b = np.outer(step[:, n_s], s_r) / (s_r @ s_r)
-        gains: Array = start + np.hstack([step[:, :n_s], b])
-        return gains
-
-    search: Any = (SepCMA if separable else CMA)(
-        np.zeros(values["n_a"] * (n_s + 1)),
-        sigma,
-        seed=values["seed"],
-        population_size=population,
-    )
-    paid, generation = int(training.budget.paid[0]), 0
-    while paid + population <= values["rollouts"]:
+    gains = Gains(values)
+    kind: Any = SepCMA if separable else CMA
+    search = kind(np.zeros(gains.size), sigma, seed=values["seed"], population_size=population)
+    generation = 0
+    while gains.left >= population:
         asked = [search.ask() for _ in range(population)]
-        law = projected_law(plant, U, np.stack([policy(x) for x in asked]))
-        fields = [training_field(values, generation)] * population
-        costs = rollout(plant, law, fields, keep=False).costs.mean
+        costs = gains.episode(asked, generation, keep=False).costs.mean
         search.tell([(x, float(cost)) for x, cost in zip(asked, costs, strict=True)])
-        paid, generation = paid + population, generation + 1
-    return pair, projected_law(plant, U, policy(search.mean)), paid
+        generation += 1
+    return gains.pair, gains.law(search.mean), gains.paid
+
+
+def dfo_ls(values: Values, *, radius: float, directions: int) -> tuple[LocalPair, Law, int]:
+    """DFO-LS on `Gains`, from one initial field: derivative-free Gauss-Newton on the whole rollout.
+
+    The residuals are those whose squares add up to the cost, weighted errors and actions of all steps.
+    `radius` is that of the first trust region, whose model has so many `directions` at first.
+    Cartis, Fiala, Marteau, Roberts, "Improving the flexibility and robustness of model-based
+    derivative-free optimization solvers", ACM Trans. Math. Softw. 45(3), 2019.
+    """
+    import dfols
+
+    gains = Gains(values)
+    plant, T = gains.pair.plant, values["horizon"]
+    weights = [np.sqrt(values[name] / T) for name in ("state_weight", "action_weight")]
+
+    def residuals(x: Array) -> Array:
+        episode = gains.episode([x], 0, keep=True)
+        if not episode.whole:
+            return np.full(T * (plant.n_z + plant.n_a), DIVERGED)
+        error = weights[0] * (episode.fields[:-1, 0] - plant.target)
+        return np.concatenate([error.ravel(), weights[1] * episode.actions[:, 0].ravel()])
+
+    np.random.seed(values["seed"])  # the library's generator
+    found = dfols.solve(
+        residuals,
+        np.zeros(gains.size),
+        rhobeg=radius,
+        rhoend=1e-4 * radius,
+        maxfun=gains.left,
+        user_params={
+            "growing.ndirs_initial": directions,
+            "init.random_initial_directions": True,
+            "logging.save_diagnostic_info": False,
+        },
+    )
+    return gains.pair, gains.law(found.x), gains.paid
 
 
 class Predictive:
@@ -308,6 +365,7 @@ METHODS: dict[str, Method] = {
     "lqt-again": lqt_again,
     "mpc": mpc,
     "cma-es": cma_es,
+    "dfo-ls": dfo_ls,
     "lqg": lqg,
     "true-model": true_model,
     "ppo": ppo,
@@ -316,6 +374,7 @@ METHODS: dict[str, Method] = {
 LIBRARIES = {
     "mpc": ("osqp", "bench"),
     "cma-es": ("cmaes", "bench"),
+    "dfo-ls": ("dfols", "rivals"),
     "ppo": ("stable_baselines3", "rl"),
     "sac": ("stable_baselines3", "rl"),
 }
