@@ -39,6 +39,8 @@ def rows(budgets: list[int], seeds: int) -> Iterator[Row]:
     yield _row("DDPG", ["-145.5", "", ""], 200, "DA-RL, printed")
     yield row("none", [lambda k, z: np.zeros((len(z), known.n_a))], 0)
     for budget in budgets:
+        if budget == 1:  # the first law is designed on a model that a training fits
+            continue
         how = {"reduced_order": ORDER}
         made = [trained(KuramotoSivashinskyEight, seed, budget, **how) for seed in range(seeds)]
         yield row(name_of(budget), [law for law, _ in made], max(count for _, count in made))

@@ -47,6 +47,8 @@ def rows(budgets: list[int], seeds: int) -> Iterator[Row]:
     K = told(known)
     yield row("LQR of the equation told, about rest", [lambda k, z: z @ K.T], "")
     for budget in budgets:
+        if budget == 1:  # the first law is designed on a model that a training fits
+            continue
         how = {"reduced_order": ORDER}
         made = [trained(KuramotoSivashinskyFour, seed, budget, **how) for seed in range(seeds)]
         yield row(name_of(budget), [law for law, _ in made], max(count for _, count in made))
