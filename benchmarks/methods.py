@@ -9,6 +9,7 @@ number of rollouts it has paid; `measure` makes a task of a study of it.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -185,18 +186,19 @@ def dfo_ls(values: Values, *, radius: float, directions: int) -> tuple[LocalPair
         return np.concatenate([error.ravel(), weights[1] * episode.actions[:, 0].ravel()])
 
     np.random.seed(values["seed"])  # the library's generator
-    found = dfols.solve(
-        residuals,
-        np.zeros(gains.size),
-        rhobeg=radius,
-        rhoend=1e-4 * radius,
-        maxfun=gains.left,
-        user_params={
-            "growing.ndirs_initial": directions,
-            "init.random_initial_directions": True,
-            "logging.save_diagnostic_info": False,
-        },
-    )
+    with warnings.catch_warnings():  # of a budget below the number of gains, which is the point
+        warnings.simplefilter("ignore", RuntimeWarning)
+        found = dfols.solve(
+            residuals,
+            np.zeros(gains.size),
+            rhobeg=radius,
+            rhoend=1e-4 * radius,
+            maxfun=gains.left,
+            user_params={
+                "growing.ndirs_initial": directions,
+                "init.random_initial_directions": True,
+            },
+        )
     return gains.pair, gains.law(found.x), gains.paid
 
 

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ import pdeloop
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
 from pdeloop.episode import Law
+from pdeloop.finished_run import FinishedRun
 
 Row = dict[str, Any]
 LEAST = 6
@@ -38,20 +37,37 @@ def first_law(plant: Dynamics, seed: int, **how: Any) -> Law:
     return pdeloop.projected_law(loop, model.U, gains.policy)
 
 
-def trained(plant: Callable[[], Dynamics], seed: int, rollouts: int, **how: Any) -> tuple[Law, int]:
-    """The law of a training, and how many rollouts it took; of one, that of the exploration."""
-    made = plant()
-    if rollouts == 1:
-        return first_law(made, seed, **how), 1
+def training(
+    plant: Callable[[], Dynamics], seed: int, rollouts: int, **how: Any
+) -> tuple[FinishedRun, int]:
+    """A training, and how many rollouts it took."""
     if rollouts < LEAST:
         how["optimizer_settings"] = {"judging": rollouts - LEAST + 3}
-    how["rollouts"] = rollouts
-    with tempfile.TemporaryDirectory() as folder:
-        found = pdeloop.train(
-            plant=made, seed=seed, evaluation_fields=1, out=Path(folder) / "run", **how
-        )
-        spent = sum(found.rollouts[0][part] for part in ("exploration", "check", "adaptation"))
-    return found.law(), spent
+    run = pdeloop.train(plant=plant(), seed=seed, rollouts=rollouts, evaluation_fields=1, **how)
+    return run, sum(run.rollouts[0][part] for part in ("exploration", "check", "adaptation"))
+
+
+def trained(plant: Callable[[], Dynamics], seed: int, rollouts: int, **how: Any) -> tuple[Law, int]:
+    """The affine law of a training, and how many rollouts it took; of one, that of the exploration."""
+    if rollouts == 1:
+        return first_law(plant(), seed, **how), 1
+    run, spent = training(plant, seed, rollouts, **how)
+    return pdeloop.projected_law(DynamicsPlant(plant()), run.models[0].U, run.policies[0]), spent
+
+
+def trainings(
+    plant: Callable[[], Dynamics], budgets: list[int], seeds: int, **how: Any
+) -> Iterator[tuple[str, list[Law], int]]:
+    """Name, laws and rollouts of the first law of a training, and of trainings with each budget.
+
+    Of a budget of one rollout there is none: the first law is designed on a model that a training fits.
+    """
+    for i, budget in enumerate(budget for budget in budgets if budget > 1):
+        made = [training(plant, seed, budget, **how) for seed in range(seeds)]
+        if i == 0:
+            explored = max(run.rollouts[0]["exploration"] for run, _ in made)
+            yield "its first law", [run.law("lqt") for run, _ in made], explored
+        yield name_of(budget), [run.law() for run, _ in made], max(spent for _, spent in made)
 
 
 def name_of(budget: int) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from benchmarks.tasks.common import Row, name_of, shown, trained
+from benchmarks.tasks.common import Row, shown, trainings
 from loop_interfaces.arrays import Array
 from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
 from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
@@ -38,12 +38,8 @@ def rows(budgets: list[int], seeds: int) -> Iterator[Row]:
 
     yield _row("DDPG", ["-145.5", "", ""], 200, "DA-RL, printed")
     yield row("none", [lambda k, z: np.zeros((len(z), known.n_a))], 0)
-    for budget in budgets:
-        if budget == 1:  # the first law is designed on a model that a training fits
-            continue
-        how = {"reduced_order": ORDER}
-        made = [trained(KuramotoSivashinskyEight, seed, budget, **how) for seed in range(seeds)]
-        yield row(name_of(budget), [law for law, _ in made], max(count for _, count in made))
+    for made in trainings(KuramotoSivashinskyEight, budgets, seeds, reduced_order=ORDER):
+        yield row(*made)
     K = told(known)
     yield row("LQR of the equation told", [lambda k, z: z @ K.T], "")
 

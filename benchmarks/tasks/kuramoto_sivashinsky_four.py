@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.tasks.common import Row, name_of, shown, trained
+from benchmarks.tasks.common import Row, shown, trainings
 from benchmarks.tasks.kuramoto_sivashinsky import told
 from loop_interfaces.arrays import Array
 from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
@@ -46,12 +46,8 @@ def rows(budgets: list[int], seeds: int) -> Iterator[Row]:
     yield row("none", [lambda k, z: np.zeros((len(z), known.n_a))], 0)
     K = told(known)
     yield row("LQR of the equation told, about rest", [lambda k, z: z @ K.T], "")
-    for budget in budgets:
-        if budget == 1:  # the first law is designed on a model that a training fits
-            continue
-        how = {"reduced_order": ORDER}
-        made = [trained(KuramotoSivashinskyFour, seed, budget, **how) for seed in range(seeds)]
-        yield row(name_of(budget), [law for law, _ in made], max(count for _, count in made))
+    for made in trainings(KuramotoSivashinskyFour, budgets, seeds, reduced_order=ORDER):
+        yield row(*made)
 
 
 def returns(known: KuramotoSivashinskyFour, law: Law, starts: Array) -> Array:
