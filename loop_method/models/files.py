@@ -10,6 +10,7 @@ from loop_method.models.coarse import CoarseModel
 from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
+from loop_method.models.polynomial import PolynomialModel
 from loop_method.models.readings import ReadingsModel
 from loop_method.models.sensed import SensedModel
 from loop_method.models.spectral import SpectralModel
@@ -20,6 +21,7 @@ FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
     "coarse": CoarseModel.from_arrays,
     "linear": LinearModel.from_arrays,
     "low-rank": LowRankModel.from_arrays,
+    "polynomial": PolynomialModel.from_arrays,
     "readings": ReadingsModel.from_arrays,
     "sensed": SensedModel.from_arrays,
 }

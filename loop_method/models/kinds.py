@@ -17,6 +17,7 @@ from loop_method.models.linear import fit_convolution, fit_linear
 from loop_method.models.low_rank import fit_low_rank
 from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.noisy_fit import fit_noisy
+from loop_method.models.polynomial import LARGEST_STATE, fit_polynomial
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.sparse_fit import fit_sparse
 from loop_method.models.spectral_fit import fit_spectral
@@ -95,7 +96,7 @@ def kinds_of(
         several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
         return kinds + _linear(n_z, settings) + several
     if not line:
-        return kinds + _linear(n_z, settings) + _sparse(n_z, settings)
+        return kinds + _linear(n_z, settings) + _sparse(n_z, settings) + _polynomial(n_z, settings)
     if components == 1 and n_z >= settings.fewest_points:
         kinds += [
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
@@ -108,7 +109,8 @@ def kinds_of(
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
         near += _neighbours(n_z, 2, settings, "two-")
-    return kinds + _linear(n_z, settings) + near + _sparse(n_z, settings)
+    kinds += _linear(n_z, settings) + near + _sparse(n_z, settings)
+    return kinds + _polynomial(n_z, settings)
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
@@ -181,6 +183,14 @@ def _sparse(n_z: int, settings: FieldModelSettings) -> list[Kind]:
         )
         for name, is_map in SPARSE.items()
     ]
+
+
+def _polynomial(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+    """Products of the leading modes and of actions, where nothing simpler describes the plant."""
+    if n_z > LARGEST_STATE:
+        return []
+    fit = partial(fit_polynomial, kind="polynomial")
+    return [Kind("polynomial", fit, (n_z + 1.0, 0), needed=settings.near_needed)]
 
 
 def _finite_difference(

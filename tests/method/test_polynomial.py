@@ -1,0 +1,91 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The polynomial model: products of state and action, units, its derivative, its file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.models import Measured, fit_field_model
+from loop_method.models.base import Samples
+from loop_method.models.files import model_of
+from loop_method.models.polynomial import PolynomialModel, fit_polynomial
+
+N_Z, N_A, T = 5, 2, 60
+
+
+def cooled_cell(units: np.ndarray | float = 1.0, rollouts: int = 6) -> list[Measured]:
+    """A cell that a current heats with I^2, cooled by a flow that carries its temperature."""
+    rng = np.random.default_rng(3)
+    A = 0.9 * np.eye(N_Z) + 0.05 * np.eye(N_Z, k=1)
+    found = []
+    for _ in range(rollouts):
+        z = rng.normal(size=N_Z)
+        states, actions = [z], 0.7 * rng.normal(size=(T, N_A))
+        for current, flow in actions:
+            z = A @ z
+            z[0] += 0.1 * current
+            z[-1] += 0.2 * current**2 - 0.1 * flow * states[-1][-1] - 0.02 * states[-1][0] ** 2
+            states.append(z)
+        found.append(Measured(np.array(states) * units, actions))
+    return found
+
+
+def fitted(units: np.ndarray | float = 1.0) -> PolynomialModel:
+    model = fit_polynomial(Samples.of(cooled_cell(units)), kind="polynomial")
+    assert model is not None
+    return model
+
+
+def test_products_of_state_and_action_are_found_and_linear_models_are_not_enough() -> None:
+    rollouts = cooled_cell()
+    model, new = fitted(), cooled_cell(rollouts=9)[-1]
+    change = new.states[1:] - new.states[:-1]
+    missed = model.step(new.states[:-1], new.actions) - new.states[1:]
+    assert np.sum(missed**2) < 1e-6 * np.sum(change**2)
+    chosen = fit_field_model(rollouts, np.zeros(N_Z), line=False)
+    assert chosen is not None and chosen.error < 1e-3
+    assert dict(chosen.candidates)["linear"] > 0.02
+
+
+def test_units_change_nothing() -> None:
+    units = np.array([1.0, 1e3, 1e-3, 50.0, 273.0])
+    plain, scaled = fitted(), fitted(units)
+    rng = np.random.default_rng(0)
+    z, a = rng.normal(size=(4, N_Z)), rng.normal(size=(4, N_A))
+    np.testing.assert_allclose(scaled.step(z * units, a), plain.step(z, a) * units, rtol=1e-6)
+
+
+def test_the_derivative_agrees_with_differences() -> None:
+    model = fitted()
+    rng = np.random.default_rng(1)
+    z, a, y = (rng.normal(size=(3, n)) for n in (N_Z, N_A, N_Z))
+    dz, da = 1e-6 * rng.normal(size=z.shape), 1e-6 * rng.normal(size=a.shape)
+    on_z, on_a = model.pull_back(z, a, y)
+    moved = 0.5 * (model.step(z + dz, a + da) - model.step(z - dz, a - da))
+    np.testing.assert_allclose(
+        (on_z * dz).sum(1) + (on_a * da).sum(1), (y * moved).sum(1), rtol=1e-6
+    )
+
+
+def test_rows_do_not_depend_on_each_other_and_a_file_gives_the_same_bits() -> None:
+    model = fitted()
+    again = model_of(model.arrays())
+    rng = np.random.default_rng(2)
+    z, a = rng.normal(size=(7, N_Z)), rng.normal(size=(7, N_A))
+    whole = model.step(z, a)
+    for i in range(7):
+        assert again.step(z[i : i + 1], a[i : i + 1]).tobytes() == whole[i : i + 1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("products", np.array([[0, 99]])),
+        ("action_scale", np.zeros(N_A)),
+        ("coefficients", np.zeros((2, N_Z))),
+    ],
+)
+def test_arrays_of_something_else_are_refused(name: str, value: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        model_of(fitted().arrays() | {name: value})
