@@ -300,7 +300,13 @@ class Training:
         for (m, rollout), measured in zip(self._check_rollouts(), results, strict=True):
             known = measured.trajectory
             if known is not None and not measured.diverged:
-                kept = Record(rollout.policy, measured.cost, known.states, known.actions)
+                kept = Record(
+                    rollout.policy,
+                    measured.cost,
+                    known.states,
+                    known.actions,
+                    field_seed=rollout.field_seed,
+                )
                 self.measured[m].append(kept)
         rows: list[dict[str, Any]] = []
         failed = []

@@ -102,6 +102,8 @@ class Record:
         What can be learned from: all of the episode, or its samples before it ran away.
     stamp : int
         Its number among the rollouts of the optimiser, from 0; -1: from before the optimisation.
+    field_seed : int
+        Seed of its initial field; -1: not known.
     """
 
     policy: Array
@@ -109,6 +111,7 @@ class Record:
     states: Array
     actions: Array
     stamp: int = -1
+    field_seed: int = -1
 
     @property
     def usable(self) -> bool:

@@ -149,6 +149,23 @@ class ClosedLoop(ClosedLoopProblem):
         """The initial field of each rollout, (n, n_z)."""
         return np.stack([record.states[0] for record in records])
 
+    def replays_of(self, records: Sequence[Record]) -> Array:
+        """Initial fields with which a simulation repeats measured rollouts under their own laws.
+
+        Rows [z_0, e_0, .., e_{T-1}], (n, n_z (T + 1)), with e_k = z_{k+1} - f(z_k, a_k); 0 where
+        nothing was measured, or the model is not finite.
+        """
+        found = np.zeros((len(records), self.horizon + 1, self.model.n_z))
+        for row, record in zip(found, records, strict=True):
+            steps = min(len(record.actions), len(record.states) - 1, self.horizon)
+            row[0] = record.states[0]
+            with np.errstate(all="ignore"):
+                after = self.model.step(record.states[:steps], record.actions[:steps])
+            row[1 : steps + 1] = np.nan_to_num(
+                record.states[1 : steps + 1] - after, nan=0.0, posinf=0.0, neginf=0.0
+            )
+        return found.reshape(len(records), -1)
+
     @property
     def memory_input(self) -> Array:
         """B of the memory, (n_p, n_a); n_p = 0: the law has none."""
@@ -250,8 +267,8 @@ class ClosedLoop(ClosedLoopProblem):
         return float(weights[counted] @ simulation.costs[counted]), gradient
 
     def _start(self, fields: Array) -> Array:
-        """The model's state at the beginning."""
-        return fields
+        """The model's state at the beginning; replayed rollouts have innovations after it."""
+        return fields[:, : self.model.n_z]
 
     def _outputs(self, k: int, z: Array, fields: Array) -> Array:
         """What U^T is applied to, and the target is of."""
@@ -262,7 +279,10 @@ class ClosedLoop(ClosedLoopProblem):
         return by_outputs
 
     def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
-        return self.model.step(z, a)
+        after, n_z = self.model.step(z, a), self.model.n_z
+        if fields.shape[1] > n_z:
+            after = after + fields[:, n_z * (k + 1) : n_z * (k + 2)]
+        return after
 
     def _add_stage(self, costs: Array, z: Array, outputs: Array, a: Array, k: int) -> None:
         """Add the stage costs of step k, which are of z, or of the outputs that have a target."""

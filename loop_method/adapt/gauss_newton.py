@@ -240,7 +240,8 @@ class GaussNewton(Optimizer):
         return Rollout(policy.copy(), field_seed(self._seed, int(self._now.fields[slot])))
 
     def _add(self, policy: Array, result: RolloutResult) -> Record:
-        return self._records.add(policy, result, self._now.referred)
+        rollout = Rollout(policy, -1)
+        return self._records.add(rollout, result, self._now.referred)
 
     def _mean_cost(self, stamps: Stamps) -> float:
         return float(np.mean([self._records[int(stamp)].cost for stamp in stamps]))

@@ -3,10 +3,11 @@
 
     stage       rollouts                                    afterwards
     renewing    the current law, each on a fresh field      a model is fitted to all rollouts and the
-                                                            law improved on it (`renewal`); at last
-                                                            judging, or a search without such a model
-    judging     the final law, each on a fresh field        first law, final law or none (`verdict`)
-    searching   local steps (`local_search`)                the better one
+                                                            law improved on it (`renewal`)
+    judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
+
+Where no model predicts the rollouts, laws are steps along measured ones (`replay`), each rolled out on
+the fields of the first law, and compared with no control as well; then rollouts alone decide.
 
 Sources and equations: docs/optimizers.md.
 """
@@ -31,22 +32,39 @@ from loop_method.adapt.base import (
     State,
     checked_policy,
     checked_theta,
-    part_of,
     require_positive,
     require_results,
 )
 from loop_method.adapt.belief import Belief, also_in_pieces, also_near, believe, largest_error
+from loop_method.adapt.estimate import Estimate
 from loop_method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
-from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
-from loop_method.adapt.local_search import LocalSearch
-from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, SEARCHING, Progress
+from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, Progress
 from loop_method.adapt.renewal import renew, renew_from_states
+from loop_method.adapt.replay import (
+    FIRST_TRUST,
+    GROWS,
+    LARGEST_TRUST,
+    SHRINKS,
+    best_on_same_fields,
+    costs_by_field,
+    step,
+)
 from loop_method.adapt.schedule import Schedule
 from loop_method.adapt.sensed_loop import can_be_sensed
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import Records, cleaned
 from loop_method.adapt.undeclared_noise import believe_in_noise
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, beats_no_control, choose, evidence_of
+from loop_method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    beats_no_control,
+    choose,
+    earlier_law,
+    evidence_of,
+    evidence_of_rollouts,
+    measured_change,
+)
 from loop_method.laws.observer import Observer
 from loop_method.seeds import field_seed
 
@@ -56,7 +74,8 @@ _REACH = 3.0
 """Magnitude of the states that a model must describe, in terms of the largest one measured before."""
 _REMEMBERED = 10**6
 """Rollouts, more than there ever are: the law is not renewed any more once it knows enough fields."""
-_LOCAL = "local."
+_NONE_ROLLOUTS = 2
+"""Rollouts without control on fields of the first law, where no model tells what they cost."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
@@ -116,7 +135,6 @@ class ModelBased(Optimizer):
         self._reach = _REACH * max(float(np.abs(known.states).max()) for known in self._before)
         self._records = Records(_REMEMBERED, self._reach)
         self._progress = Progress(self._first.copy())
-        self._local: LocalSearch | None = None
 
     @classmethod
     def for_context(cls, context: Context) -> type[Optimizer]:
@@ -151,18 +169,42 @@ class ModelBased(Optimizer):
 
     def ask(self) -> list[Rollout]:
         """The rollouts of the current stage, at once where they do not depend on each other."""
-        own = self._records.count
-        if self._progress.stage == RENEWING:
-            laws = [self._progress.policy] * (self._next_renewal() - own)
-        elif self._progress.stage == JUDGING:
-            laws = [self._progress.policy] * (self._schedule.judging - self._progress.none_is_close)
-            laws += [self._none] * self._progress.none_is_close
-        elif self._progress.stage == SEARCHING:
-            assert self._local is not None
-            return self._local.ask()
-        else:
+        own, progress = self._records.count, self._progress
+        if progress.stage == ENDED:
             return []
+        if progress.replayed:
+            return self._on_known_fields()
+        if progress.stage == RENEWING:
+            laws = [progress.policy] * (self._next_renewal() - own)
+        else:
+            laws = [progress.policy] * (self._schedule.judging - progress.none_is_close)
+            laws += [self._none] * progress.none_is_close
         return [self._rollout(law, own + i) for i, law in enumerate(laws)]
+
+    def _on_known_fields(self) -> list[Rollout]:
+        """Rollouts of a step along measured ones, on fields of the first law.
+
+        No control follows once, and the final law comes to fresh fields together with the first one.
+        """
+        progress, judging = self._progress, self._schedule.judging
+        known = list(costs_by_field(self._records.all(), self._first))
+        if progress.stage == RENEWING:
+            left = self._schedule.last - self._records.count
+            count = min(judging, left, len(known))
+            asked = [Rollout(progress.policy.copy(), seed) for seed in known[:count]]
+            if not costs_by_field(self._records.all(), self._none):
+                free = max(min(_NONE_ROLLOUTS, left - count), 0)
+                asked += [Rollout(self._none.copy(), seed) for seed in known[:free]]
+            return asked
+        own = costs_by_field(self._records.all(), progress.policy)
+        asked = [Rollout(progress.policy.copy(), seed) for seed in known if seed not in own]
+        asked, fresh = asked[:judging], self._records.count
+        while len(asked) < judging:
+            asked.append(self._rollout(progress.policy, fresh))
+            if len(asked) < judging and not np.array_equal(progress.policy, self._first):
+                asked.append(self._rollout(self._first, fresh))
+            fresh += 1
+        return asked
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts, and carry out the next stage."""
@@ -173,17 +215,14 @@ class ModelBased(Optimizer):
         self._progress.tells += 1
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         with one_thread():
-            if self._progress.stage == SEARCHING:
-                row = self._search(results)
             added = [
-                self._records.add(rollout.policy, result, set())
+                self._records.add(rollout, result)
                 for rollout, result in zip(asked, results, strict=True)
             ]
+            row = self._measured(added)
             if self._progress.stage == RENEWING:
-                row = self._measured(added)
                 self._renew(row)
-            elif self._progress.stage == JUDGING:
-                row = self._measured(added)
+            else:
                 self._judge(row)
         diverged = sum(not result.usable for result in results)
         return row | {"rollouts": self._records.count, "diverged": diverged}
@@ -198,6 +237,8 @@ class ModelBased(Optimizer):
     def _measured(self, added: Sequence[Record]) -> Row:
         """The mean cost of some rollouts, and the model's earlier prediction of it."""
         row: Row = {"role": self._progress.stage}
+        own = [r for r in added if np.array_equal(r.policy, self._progress.policy)]
+        added = own if self._progress.replayed else added
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
         predicted = self._predicted(added)
@@ -235,7 +276,7 @@ class ModelBased(Optimizer):
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._schedule.last
-        before, belief = self._progress.belief, self._believe()
+        belief = self._believe()
         known = self._measurements()
         other = believe_in_noise(self._context, known, belief, self._settings)
         if other is not None:
@@ -250,12 +291,10 @@ class ModelBased(Optimizer):
             if np.isfinite(belief.error):
                 row["mismatch"] = belief.error
         if belief is not None and self._is_believed(belief):
-            self._progress.belief = belief
+            self._progress.belief, self._progress.replayed = belief, False
             self._improve(belief, row, final)
-        elif before is not None:
-            row["reason"] = f"{self._unpredicted} any more; the law is kept"
         else:
-            self._without_model(row, final)
+            self._replay(belief, row, final)
         if final and self._progress.stage == RENEWING:
             self._begin_judging()
 
@@ -276,16 +315,30 @@ class ModelBased(Optimizer):
         """True if the law is improved on this model."""
         return belief.error <= largest_error(self._context, self._settings)
 
-    def _without_model(self, row: Row, final: bool) -> None:
-        """The continuation where no model was ever accepted: local steps, if possible."""
-        unknown = "its cost" if self._context.cost is not None else ""
-        unknown = "its law" if isinstance(self._context.law, Observer) else unknown
-        if unknown:
-            reason = f"{self._unpredicted}, and local steps do not support {unknown}"
-            self._end(row, f"{reason}: the first law is kept")
+    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
+        """A step along measured rollouts from the law that is best on fields of the first one."""
+        progress, records = self._progress, self._records.all()
+        laws = {record.policy.tobytes(): record.policy for record in records}
+        best = best_on_same_fields(records, list(laws.values()), self._first)
+        if progress.replayed:
+            good = np.array_equal(best, progress.policy)
+            progress.trust = min(progress.trust * (GROWS if good else SHRINKS), LARGEST_TRUST)
         else:
-            row["reason"] = f"{self._unpredicted}: local steps"
-            self._begin_search(row)
+            progress.replayed, progress.trust = True, FIRST_TRUST
+        progress.policy = best.copy()
+        row["reason"] = f"{self._unpredicted}: steps along measured ones"
+        if final:
+            return
+        found = None
+        if model is not None:
+            loop = model.loop(self._context)
+            usable = [record for record in records if record.usable]
+            if usable:
+                found = step(loop, loop.replays_of(usable), best, self._settings, progress.trust)
+        if found is None:
+            row["reason"] = f"{self._unpredicted}, and no step along them stays finite"
+        else:
+            progress.policy, row["steps"] = found
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         loop, fields = belief.loop(self._context), self._fields()
@@ -324,59 +377,70 @@ class ModelBased(Optimizer):
             row["predicted_change"], row["deviation"] = found.change.value, found.change.error
 
     def _judge(self, row: Row) -> None:
-        """Choose between the first law, the final one and no control."""
-        if self._progress.belief is None:
-            self._end(row, self._unpredicted)
-            return
+        """Choose between the first law, the final one, no control and all others that were measured."""
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
-        base = FIRST if self._progress.safe else NONE
-        known, fields = self._data()[len(self._context.every_exploration) :], self._fields()
-        loop = self._progress.belief.loop(self._context)
-        evidence = evidence_of(loop, laws, base, known, fields, self._progress.change)
+        base = self._decide(row, laws)
+        self._look_back(row, self._compared(laws, base), base)
+        early = "" if self._progress.replayed else _known_well(len(self._fields()))
+        self._end(row, str(row["reason"]), early)
+
+    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
+        """Which of the laws were compared with the one to stay with."""
+        return laws
+
+    def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
+        """Choose between the first law, the final one and no control; the name of that to stay with."""
+        progress, known = self._progress, self._rollouts()
+        base = FIRST if progress.safe or progress.replayed else NONE
+        if progress.replayed or progress.belief is None:
+            evidence = evidence_of_rollouts(laws, base, known)
+        else:
+            loop, fields = progress.belief.loop(self._context), self._fields()
+            evidence = evidence_of(loop, laws, base, known, fields, progress.change)
         verdict = choose(evidence, base, self._settings.confidence)
-        self._progress.policy = laws[verdict.chosen].copy()
-        row["chosen"] = verdict.chosen
+        progress.policy = laws[verdict.chosen].copy()
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
-        self._end(row, verdict.reason, f"more than {len(fields)} fields would not change the law")
+        return base
+
+    _model_compares = True
+    """Whether laws of earlier rollouts are compared on the model as well."""
+
+    def _look_back(self, row: Row, laws: Mapping[str, Array], base: str) -> None:
+        """Return another measured law in place of the chosen one where it is better beyond chance.
+
+        laws: that were compared, that to stay with as `base`.
+        """
+        progress, loop, known = self._progress, None, self._rollouts()
+        if progress.belief is not None and self._model_compares and not progress.replayed:
+            loop = progress.belief.loop(self._context)
+        confidence, fields = self._settings.confidence, self._fields()
+        found = earlier_law(loop, progress.policy, list(laws.values()), known, fields, confidence)
+        if found is None:
+            return
+        law, saved = found
+        name = FIRST if np.array_equal(law, self._first) else ADAPTED
+        size = f"{-saved.value:.4g} (standard error {saved.error:.2g})"
+        other = "the first law" if name == FIRST else "an earlier adapted law"
+        row["reason"] = f"{row['reason']}; {other} costs {size} less and is returned"
+        change = measured_change(known, law, laws[base])
+        if change is None:
+            change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))
+        row["chosen"], progress.policy = name, law.copy()
+        row["predicted_change"], row["deviation"] = change.value, change.error
+
+    def _rollouts(self) -> list[Record]:
+        """The rollouts of laws, denoised."""
+        return self._data()[len(self._context.every_exploration) :]
 
     def _end(self, row: Row, reason: str, early: str = "") -> None:
         row["reason"], self._progress.stage = reason, ENDED
         if self._records.count < self._budget:
             row["early"] = early or reason
 
-    def _begin_search(self, row: Row) -> None:
-        self._progress.begun = self._records.count
-        self._local = self._search_from(self._progress.begun)
-        self._progress.stage = SEARCHING
-        if not self._local.ask():
-            self._end(row, f"{row['reason']}, for which too few rollouts are left")
-
-    def _search_from(self, begun: int) -> LocalSearch:
-        """Local steps after this many rollouts of its own."""
-        return LocalSearch(
-            self._context,
-            self._first,
-            self._records.all()[:begun],
-            seed=self._seed,
-            rollouts=self._budget - begun,
-            settings=self._settings,
-        )
-
-    def _search(self, results: Sequence[RolloutResult]) -> Row:
-        assert self._local is not None
-        row = self._local.tell(results)
-        self._progress.policy = self._local.policy.copy()
-        if self._local.stage == LOCAL_ENDED:
-            self._progress.stage = ENDED
-            row["reason"] = f"{row['reason']}; steps were local, as {self._unpredicted}"
-        return row
-
     def state(self) -> State:
-        """The progress, all rollouts, and the state of local steps."""
-        arrays = self._progress.state() | self._records.state()
-        if self._local is not None:
-            arrays |= {_LOCAL + name: value for name, value in self._local.state().items()}
-        return arrays
+        """The progress and all rollouts."""
+        return self._progress.state() | self._records.state()
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
@@ -386,7 +450,8 @@ class ModelBased(Optimizer):
         if self._progress.belief is not None:
             self._progress.belief.check(self._context)
         self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
-        self._local = None
-        if local := part_of(state, _LOCAL):
-            self._local = self._search_from(self._progress.begun)
-            self._local.restore(local)
+
+
+def _known_well(fields: int) -> str:
+    """Why rollouts are left."""
+    return f"more than {fields} fields would not change the law"

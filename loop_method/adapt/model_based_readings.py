@@ -16,20 +16,16 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Row
 from loop_method.adapt.belief import Belief
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import curvature_of, improve
 from loop_method.adapt.model_based import ModelBased
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.replay import best_measured, step
 from loop_method.laws.extended_kalman import ExtendedKalman
-
-FEWEST = 2
-"""Rollouts of a law with which its mean cost counts."""
 
 
 class ModelBasedReadings(ModelBased):
     """`ModelBased` on a model of the readings (`replayed_loop`)."""
 
     _unpredicted = "no model of the readings predicts the rollouts"
+    _model_compares = False
 
     def _next_renewal(self) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
@@ -53,12 +49,9 @@ class ModelBasedReadings(ModelBased):
         """Always: the cost of a law is measured after every step."""
         return True
 
-    def _without_model(self, row: Row, final: bool) -> None:
+    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
         """More rollouts may determine a model."""
-        if final:
-            super()._without_model(row, final)
-        else:
-            row["reason"] = f"{self._unpredicted}; the law is kept"
+        row["reason"] = f"{self._unpredicted}; the law is kept"
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """A step from the law that measured best."""
@@ -66,7 +59,9 @@ class ModelBasedReadings(ModelBased):
         best = best_measured(own, self._first)
         if not self._is_linear(self._progress.policy):
             self._progress.policy = best.copy()
-        found = step(belief.loop(self._context), own, best, self._settings)
+        loop = belief.loop(self._context)
+        fields = loop.beginnings(own)
+        found = step(loop, fields, best, self._settings, self._settings.readings_trust)
         if found is None:
             row["reason"] = "the improved law does not stay finite on the model; the law is kept"
         else:
@@ -86,38 +81,3 @@ class ModelBasedReadings(ModelBased):
         """False of a law on an estimate of the field, which a model of the readings does not have."""
         law = self._context.law
         return not (isinstance(law, ExtendedKalman) and law.estimates(policy))
-
-
-def best_measured(records: Sequence[Record], first: Array) -> Array:
-    """The law with the least mean cost among those of at least `FEWEST` rollouts; else the first."""
-    costs: dict[bytes, list[float]] = {}
-    laws: dict[bytes, Array] = {}
-    for record in records:
-        laws.setdefault(record.policy.tobytes(), record.policy)
-        costs.setdefault(record.policy.tobytes(), []).append(record.cost)
-    means = {name: float(np.mean(own)) for name, own in costs.items() if len(own) >= FEWEST}
-    if not means or not np.isfinite(min(means.values())):
-        return first
-    return laws[min(means, key=lambda name: means[name])]
-
-
-def step(
-    loop: ClosedLoop, records: Sequence[Record], law: Array, settings: ModelBasedSettings
-) -> tuple[Array, int] | None:
-    """The law after a step on replayed rollouts of laws, and how many of L-BFGS that took.
-
-    None where it is not finite on the model.
-    """
-    fields = loop.beginnings(records)
-    weights = np.full(len(fields), 1.0 / len(fields))
-    found = improve(
-        loop,
-        loop.theta(law),
-        fields,
-        weights,
-        curvature_of(loop),
-        settings,
-        settings.first_gain,
-        settings.readings_trust,
-    )
-    return None if found is None else (loop.policy(found.theta, law), found.steps)

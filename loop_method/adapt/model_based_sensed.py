@@ -33,21 +33,20 @@ from loop_method.adapt.filtered_loop import improve_through_filter
 from loop_method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
-from loop_method.adapt.model_based_readings import FEWEST, ModelBasedReadings, best_measured
+from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.observer_design import compensators
 from loop_method.adapt.progress import JUDGING, RENEWING
+from loop_method.adapt.replay import FEWEST
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
-    NAMES,
     NONE,
     Verdict,
     choose,
     evidence_against_none,
     evidence_of_pairs,
-    size_of,
 )
 from loop_method.adapt.whole_field_law import whole_field_law
 from loop_method.laws.extended_kalman import ExtendedKalman
@@ -247,16 +246,28 @@ class ModelBasedSensed(ModelBasedReadings):
         self._progress.none_is_close &= self._sensed is None or not self._of(self._none)
 
     def _judge(self, row: Row) -> None:
-        """As on a model of the whole field, where there is one, if measured costs agree."""
+        """The law that measured best in place of the last one, if that is on a model of readings."""
         if self._sensed is None:
             super()._judge(row)
-            return
-        final = self._progress.policy
-        ModelBased._judge(self, row)
-        base, stays = self._base
-        if row["chosen"] in (base, ADAPTED) and not np.array_equal(final, stays):
+        else:
+            ModelBased._judge(self, row)
+
+    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
+        if self._sensed is None:
+            return laws
+        return {base: laws[base], ADAPTED: laws[ADAPTED]}
+
+    def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
+        """As on a model of the whole field, where there is one, if measured costs agree."""
+        base = super()._decide(row, laws)
+        stays, final = laws[base], laws[ADAPTED]
+        if (
+            self._sensed is not None
+            and row["chosen"] in (base, ADAPTED)
+            and not np.array_equal(final, stays)
+        ):
             self._compare_pairs(row, base, stays, final)
-        self._look_back(row, base, stays, final)
+        return base
 
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Decide between the final law and the one to stay with on the same fields."""
@@ -276,43 +287,6 @@ class ModelBasedSensed(ModelBasedReadings):
         measured = choose(evidence, base, self._settings.confidence)
         self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
         self._report(row, measured)
-
-    def _look_back(self, row: Row, base: str, stays: Array, final: Array) -> None:
-        """Return the law that measured best before the final one, if it is better than the chosen one.
-
-        Rollouts of one law tell little of the equation: the law may have been renewed for the worse.
-        """
-        last = row["chosen"] == ADAPTED and bool(np.isfinite(costs_of(self._of(final))).all())
-        chosen = final if last else stays
-        others = [
-            own
-            for own in self._records.all()
-            if not any(np.array_equal(own.policy, law) for law in (stays, final))
-        ]
-        earlier = best_measured(others, chosen)
-        own, known, before = (costs_of(self._of(law)) for law in (earlier, chosen, stays))
-        if len(known) < FEWEST or not np.isfinite(known).all():
-            return
-        change = mean_of(own) - mean_of(known)
-        if not change.is_negative(self._settings.confidence):
-            return
-        name, reason = self._name_of(earlier), ""
-        if last:
-            law = "an earlier adapted law" if name == ADAPTED else NAMES[name]
-            saved = f"{-change.value:.4g} (standard error {change.error:.2g})"
-            reason = f"{row['reason']}; {law} costs {saved} less than the last one and is returned"
-            if len(before) >= FEWEST and np.isfinite(before).all():
-                change = mean_of(own) - mean_of(before)
-            else:
-                change += Estimate(float(row["predicted_change"]), float(row["deviation"]))
-        self._progress.policy = earlier.copy()
-        size = change.value, change.error
-        self._report(row, Verdict(name, *size, reason or size_of(name, base, *size)))
-
-    def _name_of(self, law: Array) -> str:
-        """That of the first law, of no control, or of an adapted one."""
-        names = ((FIRST, self._first), (NONE, self._none), (ADAPTED, law))
-        return next(name for name, own in names if np.array_equal(own, law))
 
     @staticmethod
     def _report(row: Row, verdict: Verdict) -> None:

@@ -15,22 +15,22 @@ from loop_method.adapt.base import State
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.estimate import ZERO, Estimate
 
-RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
+RENEWING, JUDGING, ENDED = "renewing", "judging", "ended"
 LARGEST = 1e150
 """Largest change on fields that were left out."""
-_STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
+_STAGES = (RENEWING, JUDGING, ENDED)
 
 
 @dataclass(eq=False)
 class Progress:
-    """State of an optimisation that changes over time, apart from its rollouts and local steps.
+    """State of an optimisation that changes over time, apart from its rollouts.
 
     Attributes
     ----------
     policy : array
         The present law, and at the end the chosen one.
     stage : str
-        One of `renewing`, `judging`, `searching`, `ended`.
+        One of `renewing`, `judging`, `ended`.
     tells : int
         Number of calls of `tell`.
     belief : Belief or None
@@ -43,8 +43,10 @@ class Progress:
         How far the law moved from the first one at the last renewal.
     change : Estimate
         What it then cost more than that one on fields that did not make it.
-    begun : int
-        Rollouts before local steps began.
+    replayed : bool
+        True if the law was last improved along measured rollouts, as no model predicts them.
+    trust : float
+        Weight of the distance from a law in such a step.
     none_is_close : bool
         True if no control is judged as well.
     safe : bool
@@ -63,7 +65,8 @@ class Progress:
     parts: list[Array] = field(default_factory=list)
     fraction: float = 0.0
     change: Estimate = ZERO
-    begun: int = 0
+    replayed: bool = False
+    trust: float = 0.0
     none_is_close: bool = False
     safe: bool = True
     noise: float = 0.0
@@ -76,7 +79,8 @@ class Progress:
             "tells": np.array(self.tells),
             "policy": self.policy.copy(),
             "held_out": held_out(self.fraction, self.change),
-            "begun": np.array(self.begun),
+            "replayed": np.array(self.replayed),
+            "trust": np.array(self.trust),
             "none_is_close": np.array(self.none_is_close),
             "safe": np.array(self.safe),
             "noise": np.array(self.noise),
@@ -111,7 +115,8 @@ class Progress:
             parts=laws[1:],
             fraction=fraction,
             change=change,
-            begun=int(checked_array(state, "begun", "i", ())),
+            replayed=bool(checked_array(state, "replayed", "b", ())),
+            trust=float(checked_array(state, "trust", "f", ())),
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
             noise=noise_of(state),

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from loop_interfaces.array_files import Arrays, checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.one_thread import one_thread
-from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
+from loop_method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory
 from loop_method.models.denoising import cleaned_states
 from loop_method.reduce.snapshots import LARGE, factored
 
@@ -70,7 +70,11 @@ def is_kept(arrays: Arrays, name: str) -> bool:
 
 def record_arrays(name: str, record: Record) -> State:
     """A measured rollout as arrays of a checkpoint."""
-    own: State = {f"{name}.policy": record.policy, f"{name}.cost": np.array(record.cost)}
+    own: State = {
+        f"{name}.policy": record.policy,
+        f"{name}.cost": np.array(record.cost),
+        f"{name}.field_seed": np.array(record.field_seed),
+    }
     return own | trajectory_arrays(name, record)
 
 
@@ -85,8 +89,9 @@ def taken_record(
     """The rollout of that name with a policy of this shape, or a ValueError."""
     policy = checked_array(arrays, f"{name}.policy", "f", shape)
     cost = float(checked_array(arrays, f"{name}.cost", "f", (), finite=False))
+    field_seed = int(checked_array(arrays, f"{name}.field_seed", "i", ()))
     known = taken_trajectory(arrays, name, n_z, n_a)
-    return Record(policy, cost, known.states, known.actions, stamp)
+    return Record(policy, cost, known.states, known.actions, stamp, field_seed)
 
 
 class Records:
@@ -117,11 +122,13 @@ class Records:
         """Accept magnitudes up to three times those of a trajectory from the start."""
         self._limit = max(self._limit, 3.0 * float(np.abs(states).max()))
 
-    def add(self, policy: Array, result: RolloutResult, keep: set[int]) -> Record:
+    def add(self, rollout: Rollout, result: RolloutResult, keep: Collection[int] = ()) -> Record:
         """Remember a rollout; `keep` are the stamps that must not be forgotten."""
         states, actions = self.validated_samples(result)
         cost = float(result.cost) if result.usable else float("inf")
-        record = Record(np.array(policy), cost, states, actions, self.count)
+        record = Record(
+            np.array(rollout.policy), cost, states, actions, self.count, rollout.field_seed
+        )
         self._records[record.stamp] = record
         self.count += 1
         for stamp in list(self._records):

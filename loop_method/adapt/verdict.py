@@ -163,17 +163,8 @@ def evidence_of(
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
     held_out: change of the adapted law on fields that did not make it.
     """
-    if loop.replays:  # a rollout replayed is itself, so that measurements alone decide
-        measured = {
-            name: np.array([r.cost for r in records if np.array_equal(r.policy, law)])
-            for name, law in laws.items()
-            if name == base or not np.array_equal(law, laws[base])
-        }
-        return {
-            name: Evidence(ZERO, costs)
-            for name, costs in measured.items()
-            if len(costs) or name == base
-        }
+    if loop.replays:  # a rollout replayed is itself
+        return evidence_of_rollouts(laws, base, records)
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}
     for name, law in laws.items():
@@ -189,6 +180,102 @@ def evidence_of(
             change = mean_of(differences) if known else Estimate(np.inf)
         evidence[name] = Evidence(change, excess, (change,))
     return evidence
+
+
+def evidence_of_rollouts(
+    laws: Mapping[str, Array], base: str, records: Sequence[Record]
+) -> dict[str, Evidence]:
+    """The evidence of rollouts alone, except for `base` only for laws that were measured.
+
+    It is the mean difference on the initial fields that a law and the base share if there are two or
+    more, else the difference of their means.
+    """
+    costs: dict[str, dict[int, float]] = {}
+    for name, law in laws.items():
+        if name == base or not np.array_equal(law, laws[base]):
+            own = [r for r in records if np.array_equal(r.policy, law)]
+            # A rollout whose field is not known is on one of its own.
+            costs[name] = {
+                r.field_seed if r.field_seed >= 0 else -1 - i: r.cost for i, r in enumerate(own)
+            }
+    evidence = {}
+    for name, mine in costs.items():
+        values = np.array(list(mine.values()))
+        lost = values[np.isinf(values)]
+        if name == base:
+            evidence[name] = Evidence(ZERO, lost)
+        elif len(values):
+            evidence[name] = Evidence(_difference(mine, costs[base]), lost)
+    return evidence
+
+
+def _difference(own: Mapping[int, float], base: Mapping[int, float]) -> Estimate:
+    """The mean of some costs less that of others, by the seeds of their initial fields."""
+    finite, others = (
+        {seed: cost for seed, cost in costs.items() if np.isfinite(cost)} for costs in (own, base)
+    )
+    common = [seed for seed in finite if seed >= 0 and seed in others]
+    if len(common) > 1:
+        return mean_of(np.array([finite[seed] - others[seed] for seed in common]))
+    if not (finite and others):
+        return ZERO
+    return mean_of(np.array(list(finite.values()))) - mean_of(np.array(list(others.values())))
+
+
+def earlier_law(
+    loop: ClosedLoop | None,
+    chosen: Array,
+    others: Sequence[Array],
+    records: Sequence[Record],
+    fields: Array,
+    confidence: float,
+) -> tuple[Array, Estimate] | None:
+    """The measured law, of none that was compared before, that beats the chosen one beyond chance.
+
+    The difference is that of rollouts, and on a model that of its costs corrected by rollouts, as in
+    `evidence_of`; the estimate with the smaller error counts. A law that was measured is so never lost
+    to one that a model promised more of.
+
+    others: the laws that were compared; loop: of the model, or none; fields: as for `evidence_of`.
+
+    Returns
+    -------
+    law, its change against the chosen one, or None
+    """
+    laws = {record.policy.tobytes(): record.policy for record in records}
+    known = {law.tobytes() for law in (chosen, *others)}
+    found: tuple[Array, Estimate] | None = None
+    for law in (law for key, law in laws.items() if key not in known):
+        if sum(np.array_equal(record.policy, law) for record in records) < 2:
+            continue
+        estimates = [measured_change(records, law, chosen)]
+        if loop is not None:
+            pair = {"law": law, FIRST: chosen}
+            evidence = evidence_of(loop, pair, FIRST, records, fields, ZERO)
+            estimates.append(_change(evidence, "law", FIRST))
+        usable = [own for own in estimates if own is not None and np.isfinite(own.value)]
+        if usable:
+            change = min(usable, key=lambda own: own.error)
+            if change.is_negative(confidence) and (found is None or change.value < found[1].value):
+                found = law, change
+    return found
+
+
+def measured_change(records: Sequence[Record], law: Array, base: Array) -> Estimate | None:
+    """The change of a law against another by their rollouts; None where either lacks finite ones."""
+    evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records)
+    measured = any(np.array_equal(record.policy, base) for record in records)
+    return _change(evidence, "law", FIRST) if measured else None
+
+
+def _change(evidence: Mapping[str, Evidence], name: str, base: str) -> Estimate | None:
+    """The change of a law against another, corrected by rollouts; None where either lacks one."""
+    if name not in evidence or base not in evidence:
+        return None
+    own, other = evidence[name], evidence[base]
+    if np.isinf(own.excess).any():
+        return None
+    return own.change + _correction(own) - _correction(other)
 
 
 def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.adapt import field_step
+from loop_method.adapt import Rollout, field_step
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.trajectories import Records
 from loop_method.models.linear import LinearModel
@@ -22,7 +22,7 @@ def model(plant: Plant) -> LinearModel:
 def records(plant: Plant, policy: np.ndarray) -> Records:
     found = Records(40, 1e9)
     for seed in range(4):
-        found.add(policy, plant.run(policy, seed), set())
+        found.add(Rollout(policy, seed), plant.run(policy, seed))
     return found
 
 
