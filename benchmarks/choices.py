@@ -5,8 +5,7 @@ A few trainings of each case give laws and a model. What the first law, the frac
 the improved one and no control cost from many fields that made none of them is measured on the plant
 and on the model. From this table the choice is drawn again thousands of times: other fields for the
 rollouts of the training, from which the rules of the product (`choose_fraction`, `choose`) take a
-fraction and a law. The costs of all fields say whether that was right. After local steps pairs of
-rollouts are drawn (`local_choices`). Constants of the rules are
+fraction and a law. The costs of all fields say whether that was right. Constants of the rules are
 chosen on `--tuning` seeds.
 """
 
@@ -28,10 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pdeloop
-from benchmarks import local_choices
 from benchmarks.bounds import evaluation_seeds
 from benchmarks.families.cases import CASES, Case
-from benchmarks.local_choices import Pairs, pairs_of
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
 from loop_method.adapt.belief import Belief
@@ -169,12 +166,10 @@ def run(
     return {"rows": rows, "draws": draws, "fields": fields, "rollouts": rollouts}
 
 
-def judged(table: Table | Pairs | None, draws: int, seed: int) -> dict[str, Any]:
+def judged(table: Table | None, draws: int, seed: int) -> dict[str, Any]:
     """The choices drawn from a table, or that there is none."""
     if table is None:
         return {"error": NO_MODEL}
-    if isinstance(table, Pairs):
-        return local_choices.judge(table, draws, seed)
     return judge(table, draws, seed)
 
 
@@ -183,7 +178,7 @@ NO_MODEL = "no choice was left to the verdict"
 
 def measured(
     task: tuple[str, int], *, rollouts: int, fields: int, evaluation: int, folder: Path
-) -> Table | Pairs | None:
+) -> Table | None:
     """The table of a training; None where nothing was decided."""
     label = f"{task}, {rollouts}, {fields}, {evaluation}"
     path = folder / f"{hashlib.sha256(label.encode()).hexdigest()[:16]}.json"
@@ -195,10 +190,10 @@ def measured(
     found = json.loads(path.read_text())
     if not found:
         return None
-    return Table.of(found) if "true" in found else Pairs.of(found)
+    return Table.of(found)
 
 
-def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Table | Pairs | None:
+def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Table | None:
     """Train on a case, and measure its laws from the fields of these seeds."""
     case = KNOWN[name]
     problem = pdeloop.problem(
@@ -221,15 +216,8 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
         found = pdeloop.rollout(pair.plant, acts, seeds, own, keep=False).costs
         return np.where(found.diverged_step < 0, found.mean, np.inf)
 
-    def costs_of_policy(policy: Array) -> Array:
-        n_s = context.U.shape[1]
-        return costs_of(
-            policy[:, :n_s] @ context.U.T, policy[:, n_s:] @ (context.U.T @ context.target)
-        )
-
     if belief is None or "laws" not in state:
-        given = training.starts()[0], optimizer.policy
-        return pairs_of(state, rows, given, costs_of_policy, training.settings.explorations)
+        return None
     loop = belief.loop(context)
     none, first = loop.no_control, loop.theta(training.starts()[0])
     base = first if state["safe"] else none

@@ -250,14 +250,20 @@ def designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control)
         )
     truncated = settings.identification == "dmdc"
+    known: Sequence[tuple[ArrayLike, ArrayLike]] = trajectories
+    free = settings.action_set.free(settings.n_a)
+    if settings.action_set.zero_mean:  # only their differences show an effect
+        known = [(states, actions @ free) for states, actions in trajectories]
     model = identify(
-        trajectories,
+        known,
         method="dmdc" if truncated else "regression",
         n_s=min(model_order(asdict(settings)), target.size),
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
         settings=settings.method,
     )
+    if settings.action_set.zero_mean:
+        model = replace(model, B=model.B @ free.T)
     unsolved: DesignError | None = None
     try:
         gains = lqt.track(model, **weights)

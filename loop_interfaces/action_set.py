@@ -172,6 +172,21 @@ class ActionSet:
         found: NDArray[np.bool_] = (applied > self.low) & (applied < self.high)
         return found
 
+    def free(self, n_a: int) -> Array:
+        """Orthonormal directions (n_a, n) in which actions can move: all, or those of mean zero.
+
+        Examples
+        --------
+        >>> ActionSet(2, zero_mean=True).free(2).round(3).tolist()
+        [[0.707], [-0.707]]
+        """
+        if not self.zero_mean:
+            return np.eye(n_a)
+        # Helmert's contrasts: one actuator against the mean of those before it.
+        rows = np.tril(np.ones((n_a, n_a)), -1)[1:] - np.diag(np.arange(1.0, n_a), 1)[:-1]
+        found: Array = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).T
+        return found
+
     def _shifts(self, actions: Array) -> Array:
         """s of each action, (..., 1)."""
         rows = np.ascontiguousarray(actions).reshape(-1, actions.shape[-1])

@@ -23,6 +23,8 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     """
     given = flatten(options)
     plant, values = complete(training_parameters(name, given), compiled=False)
+    if plant.cost.target.ndim > 1:  # which the plant itself may say
+        values |= training_parameters(name, given, plant.cost)
     if _is_order_sought(name, given, plant, values):
         values["reduced_order"] = 0
     return plant, values

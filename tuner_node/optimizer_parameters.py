@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+from loop_interfaces.cost import Cost
 from loop_interfaces.parameters import LAW, OPTIMIZER, POINTS
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
@@ -55,17 +56,24 @@ def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
     return kind.settings_of(values, own)
 
 
-def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def training_parameters(
+    name: str, options: Mapping[str, Any], cost: Cost | None = None
+) -> dict[str, Any]:
     """Like `load_parameters`, with the optimiser's preferred defaults and all settings.
 
-    options: by dotted names, or nested, as optimizer_settings={"fields": 5}.
+    options: by dotted names, or nested, as optimizer_settings={"fields": 5}; cost: that of the plant,
+    where it is known.
     """
     own = flatten(options)
-    return with_settings(load_parameters(name, own, partial(_preferred, options=own)))
+    return with_settings(load_parameters(name, own, partial(_preferred, options=own, cost=cost)))
 
 
-def _preferred(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The given parameters with the defaults that the optimiser prefers, and of few sensors the law.
+def _preferred(
+    given: Mapping[str, Any], options: Mapping[str, Any], cost: Cost | None
+) -> dict[str, Any]:
+    """The given parameters with the defaults that the optimiser prefers.
+
+    The law too may be one of few sensors, or of a target that moves.
 
     A model of the whole field that a problem's file asks for, and the options do not, gives way to one
     of few readings. The optimiser's name may be written as the command line writes words: gauss-newton.
@@ -80,6 +88,8 @@ def _preferred(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str
     )
     if few and kind.law_of_sensors and _number(given, "sensor_delays") <= 1:
         preferences[LAW.name] = kind.law_of_sensors
+    elif kind.law_of_moving_targets and not few and cost is not None and cost.target.ndim > 1:
+        preferences[LAW.name] = kind.law_of_moving_targets
     readings = law_of({**preferences, **given}).from_readings
     if few and readings:
         preferences["identification"] = readings

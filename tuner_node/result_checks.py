@@ -3,6 +3,7 @@
 
 from typing import Any
 
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_method.adapt import Trajectory
 from loop_method.reduce.identifiability import examine_excitation
 from tuner_node.batch import BatchResult
@@ -23,12 +24,17 @@ def same_steps(result: BatchResult, known: int) -> int:
     return next(iter(steps), 0)
 
 
-def check_excitation(explored: Trajectory, seed: int) -> list[dict[str, Any]]:
+def check_excitation(
+    explored: Trajectory, seed: int, action_set: ActionSet = ANY_ACTION
+) -> list[dict[str, Any]]:
     """History rows about what an exploration hardly determines, whatever drew its actions.
 
-    NotIdentifiableError if the effects of its inputs cannot be told apart.
+    NotIdentifiableError if the effects of its inputs cannot be told apart; of actions with a mean of
+    zero, those of their differences.
     """
-    steps = len(explored.states) - 1
-    found = examine_excitation((explored.states, explored.actions[:steps]))
+    actions = explored.actions[: len(explored.states) - 1]
+    if action_set.zero_mean:
+        actions = actions @ action_set.free(actions.shape[1])
+    found = examine_excitation((explored.states, actions))
     found.require()
     return [{"event": "excitation", "seed": seed, "remark": remark} for remark in found.remarks]

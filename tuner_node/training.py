@@ -146,7 +146,8 @@ class Training:
                 seen = iter(result.trajectories)
                 for m in self.pending:
                     first, *further = islice(seen, together)
-                    remarks += check_excitation(first, self.settings.all_seeds[m])
+                    seed = self.settings.all_seeds[m]
+                    remarks += check_excitation(first, seed, self.settings.action_set)
                     self.explorations[m], self.further[m] = first, further
                 self.target = result.target
             # A controller that knows no common exploration gives a model of each: the first is taken.

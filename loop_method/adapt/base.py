@@ -251,6 +251,8 @@ class Optimizer(Protocol):
     """Rollouts of an exploration, from as many initial fields."""
     with_sensors: ClassVar[str] = ""
     """The optimiser used instead when the state is that of few sensors; empty: none."""
+    law_of_moving_targets: ClassVar[str] = ""
+    """The law preferred where the target changes from step to step; empty: as without."""
     law_of_sensors: ClassVar[str] = ""
     """The law preferred where the state is that of few sensors; empty: as without."""
     iteration_rollouts: ClassVar[int] = 0

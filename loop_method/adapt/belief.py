@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.array_files import checked_array
+from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record, State, part_of
-from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
 from loop_method.adapt.observed_loop import ObservedLoop
 from loop_method.adapt.replayed_loop import ReplayedLoop
 from loop_method.adapt.sensed_loop import sensed_loop
 from loop_method.adapt.settings import ImprovementSettings
 from loop_method.adapt.trajectories import within
+from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
 from loop_method.models.files import model_of
@@ -95,6 +97,8 @@ class Belief:
             return sensed_loop(context, self.model)
         if isinstance(context.law, Observer):
             return ObservedLoop(*problem, **on, law=context.law)
+        if isinstance(context.law, FeedForward):
+            return FeedForwardLoop(*problem, **on, law=context.law)
         return ClosedLoop(*problem, **on)
 
     def predicted_costs(self, context: Context, records: Sequence[Record]) -> list[float]:
@@ -211,6 +215,14 @@ def _measured(context: Context, record: Record) -> Measured:
     if explored or context.noise or isinstance(context.law, Observer):
         return Measured(record.states, record.actions)
     n_s = context.U.shape[1]
+    if isinstance(context.law, FeedForward):
+        parts = context.law.parts(record.policy)
+        gains, every = parts["K"] @ context.U.T, parts["b"]
+
+        def law(k: int, states: Array) -> Array:
+            return affine_law(gains, every[min(k, len(every) - 1)])(k, states)
+
+        return Measured(record.states, record.actions, law)
     K = record.policy[:, :n_s] @ context.U.T
     b = record.policy[:, n_s:] @ (context.U.T @ context.target)
     return Measured(record.states, record.actions, affine_law(K, b))

@@ -35,14 +35,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.adapt.base import Record
+from loop_method.laws.feedforward import FeedForward
 from loop_method.models import FieldModel
 
 
@@ -142,6 +144,11 @@ class ClosedLoop(ClosedLoopProblem):
     noise: float = field(default=0.0, kw_only=True)
     cost: Cost | None = field(default=None, kw_only=True)
 
+    @property
+    def constants(self) -> int:
+        """Columns of theta that are constant parts: 1, or one for each step."""
+        return 1
+
     replays: ClassVar[bool] = False
     """True if initial fields are measured rollouts, with what in them was not foreseen."""
 
@@ -175,7 +182,7 @@ class ClosedLoop(ClosedLoopProblem):
     def no_control(self) -> Array:
         """Theta of a = 0."""
         n_p = len(self.memory_input)
-        return np.zeros((self.model.n_a + n_p, self.U.shape[1] + n_p + 1))
+        return np.zeros((self.model.n_a + n_p, self.U.shape[1] + n_p + self.constants))
 
     def curvature(self, own: Array) -> Array:
         """Cost matrix of a change of the law's outputs [a; u], from that of an action, (n_a, n_a)."""
@@ -186,7 +193,7 @@ class ClosedLoop(ClosedLoopProblem):
         return self.simulate(theta, fields).costs
 
     def simulate(self, theta: Array, fields: Array) -> Simulation:
-        """Roll theta (n_a + n_p, n_s + n_p + 1) out from the fields (F, n_z)."""
+        """Roll theta (n_a + n_p, n_s + n_p + constants) out from the fields (F, n_z)."""
         B, T, count = self.memory_input, self.horizon, len(fields)
         (n_p, n_a), n_s = B.shape, self.U.shape[1]
         begin = self._start(fields)
@@ -195,7 +202,7 @@ class ClosedLoop(ClosedLoopProblem):
         features = np.full((T, count, n_s + n_p + 1), self.constant_feature)
         costs, finite = np.zeros(count), np.ones(count, dtype=bool)
         noise = self._noise_of(count)
-        gains, constant = theta[:, :-1].T, self.constant_feature * theta[:, -1]
+        gains, constants = theta[:, : n_s + n_p].T, self.constant_feature * theta[:, n_s + n_p :]
         states[0] = begin
         memory = np.empty((count, n_p))
         with np.errstate(all="ignore"):
@@ -204,7 +211,7 @@ class ClosedLoop(ClosedLoopProblem):
                 known = features[k, :, :-1]
                 known[:, :n_s] = s = outputs @ self.U + noise[k]
                 known[:, n_s:] = memory if k else s[:, :n_p]
-                out = known @ gains + constant
+                out = known @ gains + constants[:, min(k, self.constants - 1)]
                 a = out[:, :n_a]
                 self.action_set.project(a, out=a)
                 self._add_stage(costs, states[k], outputs, a, k)
@@ -235,8 +242,9 @@ class ClosedLoop(ClosedLoopProblem):
         if not np.isfinite(simulation.costs[weights > 0.0]).all():
             return np.inf, gradient
         states, actions = simulation.states, simulation.actions
-        B, gains, n_s = self.memory_input, theta[:, :-1], self.U.shape[1]
-        constant = self.constant_feature * theta[:, -1]
+        B, n_s = self.memory_input, self.U.shape[1]
+        n_f = n_s + len(B)
+        gains, constants = theta[:, :n_f], self.constant_feature * theta[:, n_f:]
         eta, mu = np.zeros_like(states[0]), np.zeros((len(fields), len(B)))
         weight = weights[:, None] / self.horizon
         if self.cost is not None:
@@ -252,12 +260,13 @@ class ClosedLoop(ClosedLoopProblem):
             else:
                 on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
             g = g + on_a + mu @ B
+            row = min(k, self.constants - 1)
             if self.action_set.bounded:
-                requested = simulation.features[k, :, :-1] @ gains.T + constant
+                requested = simulation.features[k, :, :-1] @ gains.T + constants[:, row]
                 g = self.action_set.pull_back(requested[:, : a.shape[1]], g)
             out = np.hstack([g, mu])
-            gradient[:, :-1] += out.T @ simulation.features[k, :, :-1]
-            gradient[:, -1] += self.constant_feature * out.sum(axis=0)
+            gradient[:, :n_f] += out.T @ simulation.features[k, :, :-1]
+            gradient[:, n_f + row] += self.constant_feature * out.sum(axis=0)
             known = out @ gains
             by_s, mu = known[:, :n_s], known[:, n_s:]
             if k == 0:
@@ -265,6 +274,12 @@ class ClosedLoop(ClosedLoopProblem):
             eta = eta + on_z + self._pull_outputs(by_s @ self.U.T)
         counted = weights > 0.0
         return float(weights[counted] @ simulation.costs[counted]), gradient
+
+    def moment(self, simulation: Simulation, weights: Array) -> Array:
+        """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields."""
+        features = simulation.features
+        found: Array = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
+        return found
 
     def _start(self, fields: Array) -> Array:
         """The model's state at the beginning; replayed rollouts have innovations after it."""
@@ -314,7 +329,7 @@ class Simulation:
     costs: Array
     features: Array
 
-    def of_fields(self, chosen: Array) -> Simulation:
+    def of_fields(self, chosen: NDArray[Any]) -> Simulation:
         """Of some of the fields."""
         return Simulation(
             self.states[:, chosen],
@@ -322,3 +337,41 @@ class Simulation:
             self.costs[chosen],
             self.features[:, chosen],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FeedForwardLoop(ClosedLoop):
+    """Laws a_k = K U^T z_k + b_k; theta is [K b_0 .. b_{T-1}].
+
+    Attributes
+    ----------
+    law : FeedForward
+        Whose vector of parameters a policy is.
+    """
+
+    law: FeedForward = field(kw_only=True)
+
+    constant_feature: ClassVar[float] = 1.0
+
+    @property
+    def constants(self) -> int:
+        return self.horizon
+
+    def theta(self, policy: Array) -> Array:
+        parts = self.law.parts(np.ravel(policy))
+        return np.hstack([parts["K"], parts["b"].T])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        n_s = self.U.shape[1]
+        parts = {"K": theta[:, :n_s], "b": theta[:, n_s:].T}
+        return self.law.vector(parts).reshape(near.shape)
+
+    def moment(self, simulation: Simulation, weights: Array) -> Array:
+        """F, with a number that is 1 at a step and else 0 for each step."""
+        features, n_s, T = simulation.features, self.U.shape[1], self.horizon
+        found = np.zeros((n_s + T, n_s + T))
+        found[:n_s, :n_s] = super().moment(simulation, weights)[:n_s, :n_s]
+        found[:n_s, n_s:] = np.einsum("kfi,f->ik", features[:, :, :n_s], weights) / T
+        found[n_s:, :n_s] = found[:n_s, n_s:].T
+        found[n_s:, n_s:] = np.eye(T) / T
+        return found

@@ -115,15 +115,14 @@ def improve(
     else:
         return None
     fields, weights = fields[finite], weights[finite] / weights[finite].sum()
-    features = simulation.features[:, finite]
-    moment = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
-    size = float(np.trace(moment[:-1, :-1])) / (len(moment) - 1)
+    moment = loop.moment(simulation.of_fields(finite), weights)
+    count = len(moment) - loop.constants
+    size = float(np.trace(moment[:count, :count])) / count
     if not (size > 0.0 and np.isfinite(moment).all()):
         return None
-    # s and the constant each in its own unit.
-    moment[np.diag_indices(len(moment))] += settings.isotropy * np.append(
-        np.full(len(moment) - 1, size), 1.0
-    )
+    # s and the constants each in its own unit.
+    units = np.append(np.full(count, size), np.full(loop.constants, 1.0 / loop.constants))
+    moment[np.diag_indices(len(moment))] += settings.isotropy * units
     gain = settings.least_gain if least_gain is None else least_gain
     return _descend(
         loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain, trust

@@ -32,6 +32,7 @@ from loop_method.adapt.base import (
 )
 from loop_method.adapt.trajectories import LowRankTrajectory
 from loop_method.laws.base import Law
+from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from loop_method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
 
@@ -68,13 +69,13 @@ class InCoordinates(Optimizer):
             line=False,
             shape=(),
             cost=context.cost and CostInCoordinates(context.cost, self.basis),
-            law=self._observer(context),
+            law=self._law(context),
         )
         self._own = make(own)
 
-    def _observer(self, context: Context) -> Law | None:
-        """The law of the coordinates, where it is the observer."""
-        if not isinstance(context.law, Observer):
+    def _law(self, context: Context) -> Law | None:
+        """The law of the coordinates, where it is more than gains."""
+        if not isinstance(context.law, FeedForward | Observer):
             return None
         U = self.basis.coordinates(context.U.T).T
         return type(context.law)(replace(context.law.model, U=U), context.law.horizon)

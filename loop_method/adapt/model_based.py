@@ -65,6 +65,7 @@ from loop_method.adapt.verdict import (
     evidence_of_rollouts,
     measured_change,
 )
+from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from loop_method.seeds import field_seed
 
@@ -101,11 +102,12 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
-    also_improves = ("observer", "extended_kalman")
+    also_improves = ("observer", "extended_kalman", "feedforward")
     in_coordinates = True
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"
+    law_of_moving_targets = "feedforward"
     law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
 
     def __init__(
@@ -123,8 +125,8 @@ class ModelBased(Optimizer):
         self._settings = settings or ModelBasedSettings()
         self._context, self._seed, self._budget = context, seed, rollouts
         self._declared = context.noise
-        observed = isinstance(context.law, Observer)
-        self._first = checked_theta(policy0) if observed else checked_policy(policy0)
+        vector = isinstance(context.law, FeedForward | Observer)
+        self._first = checked_theta(policy0) if vector else checked_policy(policy0)
         self._none = np.zeros_like(self._first)
         explored = [
             Record(self._none, np.inf, known.states, known.actions)

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import choices, local_choices
+from benchmarks import choices
 from benchmarks.choices import Table, interval, judge
-from benchmarks.local_choices import Pairs
 from loop_interfaces.arrays import Array
 from loop_method.adapt.verdict import ADAPTED, FIRST
 
@@ -85,54 +84,3 @@ def test_tables_are_kept_and_trainings_without_a_model_are_named(tmp_path: Path)
 def test_an_unknown_case_is_refused() -> None:
     with pytest.raises(ValueError, match="no case 'heat'"):
         choices.run(["heat"])
-
-
-def pairs(gain: float, spread: float, count: int) -> Pairs:
-    """Local steps that found a law of a mean gain, compared on `count` fields."""
-    before = np.full(COUNT, 10.0)
-    noise = np.random.default_rng(4).standard_normal(COUNT)
-    found = before - gain + spread * (noise - noise.mean())
-    return Pairs(before, found, found, FIRST, ADAPTED, count)
-
-
-def test_of_pairs_a_clear_gain_is_found_and_a_loss_no_more_often_than_by_chance() -> None:
-    clear = local_choices.judge(pairs(1.0, 0.1, 3), 100, 0)
-    assert clear["helped"] == 1.0 and clear["wrong"] == clear["missed"] == 0.0
-    assert clear["change"] == pytest.approx(-0.1) == clear["possible"]
-    for count in (2, 4, 8):
-        loss = local_choices.judge(pairs(-1e-3, 1.0, count), 2000, 0)
-        assert 0.0 < loss["wrong"] == loss["helped"] < 0.159 + 3.0 * 0.008 + 0.02
-        assert loss["worst"] == pytest.approx(1e-4)
-
-
-def test_the_pairs_of_a_training_are_the_fields_known_before_and_the_fresh_ones() -> None:
-    """Four rollouts of the first law are known; of ten at the end four are on their fields."""
-    state = {
-        "local.from_none": False,
-        "local.none_costs": [],
-        "local.search.policy": np.ones((1, 2)),
-    }
-    rows = [
-        {"rollouts": 6},
-        {"rollouts": 10},
-        {"rollouts": 20, "role": "confirming", "chosen": FIRST},
-    ]
-    laws = np.zeros((1, 2)), np.zeros((1, 2))
-
-    def costs(policy: Array) -> Array:
-        return np.full(5, policy.sum())
-
-    found = local_choices.pairs_of(state, rows, laws, costs, explorations=2)
-    assert found is not None and found.pairs == 4 + 3 and found.base == FIRST
-    assert found.found.tolist() == [2.0] * 5 and not found.before.any()
-    assert local_choices.pairs_of(state, rows[:2], laws, costs, explorations=2) is None
-
-
-def test_pairs_are_kept_as_tables_are(tmp_path: Path) -> None:
-    own = pairs(0.5, 1.0, 4)
-    options: dict[str, Any] = {"rollouts": 20, "fields": 4, "evaluation": 1, "folder": tmp_path}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choices, "table_of", lambda *_, **__: own)
-        again = choices.measured(("reacting plate", 1), **options)
-    assert isinstance(again, Pairs)
-    assert choices.judged(again, 50, 3) == local_choices.judge(own, 50, 3)

@@ -17,6 +17,7 @@ from loop_method.models.finite_difference import (
 )
 from loop_method.models.linear import LinearModel
 from loop_method.models.low_rank import LowRankModel
+from loop_method.models.polynomial import PolynomialModel
 from loop_method.models.readings import ReadingsModel
 from loop_method.models.sensed import Actuators, SensedModel, grid_points
 from loop_method.models.sensed_unknowns import EQUATION, FIRST, SHARED, TERMS, unknowns
@@ -71,6 +72,15 @@ MODELS: dict[str, FieldModel] = {
     "linear": LinearModel("k", numbers(N_Z, N_Z), numbers(N_Z, N_A), numbers(N_Z)),
     "low-rank": LowRankModel(
         "k", numbers(N_Z, 3), numbers(3, 3), numbers(3, N_A), constant=numbers(3)
+    ),
+    "polynomial": PolynomialModel(
+        "k",
+        numbers(N_Z, 3),
+        numbers(N_Z),
+        numbers(N_A),
+        np.linspace(0.5, 1.0, N_A),
+        np.array([[0, 0], [0, 3]]),
+        numbers(1 + 3 + N_A + 2, N_Z),
     ),
     "readings": ReadingsModel(
         numbers(3, 3),

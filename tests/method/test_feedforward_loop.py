@@ -1,0 +1,95 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Laws with a constant part for each step on a model, and rollouts that a model repeats."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.cost import Cost
+from loop_interfaces.model_rows import ModelRows
+from loop_method.adapt import Record
+from loop_method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.tracking import track_horizon
+from loop_method.laws.feedforward import FeedForward
+from loop_method.models.linear import LinearModel
+
+N, N_A, T = 4, 2, 15
+RNG = np.random.default_rng(7)
+A = RNG.normal(size=(N, N))
+A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+B, DRIFT = RNG.normal(size=(N, N_A)), 0.3 * RNG.normal(size=N)
+TARGET = np.cumsum(0.2 * RNG.normal(size=(T, N)), axis=0)
+COST = Cost(N, N_A, T, state_weight=np.diag([1.0, 2.0, 0.5, 1.0]), action_weight=0.3, target=TARGET)
+MODEL = LinearModel("linear", A, B, DRIFT)
+
+
+def loop(**changes: object) -> FeedForwardLoop:
+    gains = np.zeros((N_A, N))
+    rows = ModelRows(A=A, B=B, U=np.eye(N), K_a=gains, K_b=gains, s_r=np.zeros(N))
+    law = FeedForward(rows, T)
+    law.cost = COST
+    problem = (np.eye(N), COST.field_target, *COST.size, T)
+    made = FeedForwardLoop(*problem, model=MODEL, cost=COST, law=law)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def fields(count: int) -> np.ndarray:
+    return np.random.default_rng(8).normal(size=(count, N))
+
+
+def test_the_gradient_is_that_of_finite_differences_also_with_bounds_and_replays() -> None:
+    rng = np.random.default_rng(9)
+    theta = 0.2 * rng.normal(size=(N_A, N + T))
+    weights = np.array([0.6, 0.4])
+    plain, bounded = loop(), loop(action_set=ActionSet(N_A, [-0.2, 0.0], [0.5, 0.4]))
+    replays = np.hstack([fields(2), 0.1 * rng.normal(size=(2, N * T))])
+    for closed, start in ((plain, fields(2)), (bounded, fields(2)), (plain, replays)):
+        cost, gradient = closed.gradient(theta, start, weights)
+        assert cost == pytest.approx(weights @ closed.costs(theta, start), rel=1e-13)
+        step = rng.normal(size=theta.shape)
+        rise = closed.costs(theta + 1e-6 * step, start) - closed.costs(theta - 1e-6 * step, start)
+        assert np.sum(gradient * step) == pytest.approx(weights @ rise / 2e-6, rel=1e-5)
+    assert (np.abs(bounded.simulate(theta, fields(2)).actions[:, :, 1] - 0.4) < 1e-15).any()
+
+
+def test_the_descent_leads_to_the_tracking_law_of_one_initial_state() -> None:
+    """From one state a feed-forward is as good as any controller: LQ tracking with the drift."""
+    closed, start = loop(), fields(1)
+    gains = track_horizon(A, B, COST, np.eye(N), DRIFT)
+    z, best = start[0], np.zeros(1)
+    for k in range(T):
+        a = gains.K[k] @ z + gains.b[k]
+        COST.add(best, z[None], a[None], k)
+        z = A @ z + B @ a + DRIFT
+    settings = ModelBasedSettings(iterations=300, least_gain=1e-9)
+    begun = np.zeros((N_A, N + T))
+    found = improve(closed, begun, start, np.ones(1), curvature_of(closed), settings)
+    assert found is not None
+    assert found.before > 1.5 * best[0] / T
+    assert found.after == pytest.approx(best[0] / T, rel=1e-4)
+    policy = closed.policy(found.theta, closed.law.theta_start)
+    assert np.array_equal(closed.theta(policy), found.theta)
+
+
+def test_a_replayed_rollout_costs_what_was_measured_whatever_the_model() -> None:
+    """Of a plant that bends, with a linear model; the law is the one that it was measured under."""
+    rng = np.random.default_rng(10)
+    closed = ClosedLoop(np.eye(N), np.ones(N), 1.0, 0.4, T, model=MODEL)
+    theta = 0.2 * rng.normal(size=(N_A, N + 1))
+    z, states, actions, total = rng.normal(size=N), [], [], 0.0
+    for _ in range(T):
+        a = theta[:, :N] @ z + theta[:, N]
+        total += float(np.sum((z - 1.0) ** 2) + 0.4 * np.sum(a**2))
+        states.append(z)
+        actions.append(a)
+        z = A @ z + B @ a + 0.3 * np.sin(3.0 * z) + 0.1 * rng.normal(size=N)
+    record = Record(theta, total / T, np.array([*states, z]), np.array(actions))
+    replayed = closed.replays_of([record])
+    assert closed.costs(theta, replayed)[0] == pytest.approx(record.cost, rel=1e-12)
+    assert closed.costs(theta, replayed[:, :N])[0] != pytest.approx(record.cost, rel=1e-2)
