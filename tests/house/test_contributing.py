@@ -56,14 +56,18 @@ def test_nothing_but_the_registry_names_an_equation(name: str) -> None:
     assert f"equation: {name}\n" in text
 
 
+KNOWING_FEED_FORWARD = ("closed_loop", "belief", "in_coordinates", "model_based")
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_nothing_but_the_registry_names_a_plant(name: str) -> None:
     # Plants of one family share a file with their common base.
     assert who_names(PLANTS[name]) <= {*TABLE["a plant"], "pde_sim_node/plants/reactions.py"}
 
 
-def test_nothing_but_the_registry_names_a_law_that_needs_no_model_of_the_loop() -> None:
-    assert who_names(OWN_LAWS.shipped["feedforward"]) <= {*TABLE["a law"]}
+def test_nothing_but_the_registry_and_model_based_name_a_law() -> None:
+    own = {f"loop_method/adapt/{name}.py" for name in KNOWING_FEED_FORWARD}
+    assert who_names(OWN_LAWS.shipped["feedforward"]) <= {*TABLE["a law"], *own}
 
 
 def test_the_package_offers_an_optimiser_as_any_other_package_would() -> None:

@@ -93,7 +93,12 @@ def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
 
 def test_a_training_designs_and_adapts_for_it() -> None:
     run = pdeloop.train(
-        plant=Servo(), rollouts=9, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS
+        plant=Servo(),
+        law="affine",
+        rollouts=9,
+        evaluation_fields=2,
+        reduced_order=N_Z,
+        **FEW_FITS,
     )
     plant, U = DynamicsPlant(Servo()), run.models[0].U
     z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target
@@ -111,6 +116,18 @@ def test_a_training_designs_and_adapts_for_it() -> None:
     cost = {name: pdeloop.rollout(plant, law, fields).costs.mean for name, law in laws.items()}
     assert (cost["best"] < cost["adapted"]).all() and (cost["best"] < cost["first"]).all()
     assert cost["adapted"].mean() < cost["first"].mean()
+
+
+def test_a_moving_target_is_followed_by_default() -> None:
+    run = pdeloop.train(
+        plant=Servo(), rollouts=12, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS
+    )
+    assert run.values["law"] == "feedforward"
+    plant, fields = DynamicsPlant(Servo()), np.arange(100, 130)
+    best = track_horizon(A, B, plant.cost, np.eye(N_Z))
+    laws = {"best": lambda k, z: z @ best.K[k].T + best.b[k], "adapted": run.law()}
+    cost = {name: pdeloop.rollout(plant, law, fields).costs.mean for name, law in laws.items()}
+    assert cost["adapted"].mean() <= 1.03 * cost["best"].mean()
 
 
 def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:

@@ -172,15 +172,18 @@ def test_a_file_alone_does_not_run_it(
 
 @pytest.mark.parametrize(
     ("optimizer", "adapted"),
-    [("model_based", "affine, observer and extended_kalman"), ("gauss_newton", "affine")],
+    [
+        ("model_based", "affine, observer, extended_kalman and feedforward"),
+        ("gauss_newton", "affine"),
+    ],
 )
 def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     optimizer: str, adapted: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    words = ["train", str(SMALL), "--law", "feedforward", "--optimizer", optimizer]
+    words = ["train", str(SMALL), "--law", OWN, "--optimizer", optimizer]
     assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
     told = capsys.readouterr().err
-    assert f"adapts only {adapted}, but the law is 'feedforward'" in told
+    assert f"adapts only {adapted}, but the law is '{OWN}'" in told
     assert "such as two_point" in told
     assert told.count("\n") == 1 and not (tmp_path / "run").exists()
 
