@@ -58,8 +58,9 @@ class Rollouts:
         else:
             problem = pdeloop.problem(case.base, **case.parameters())
             plant = self._plant = problem.plant()
-            self.variance, self.components = problem.values["exploration_variance"], 1
-            self.action_set = plant.action_set
+            self.action_set, self.components = plant.action_set, 1
+            given = problem.values["exploration_variance"]
+            self.variance = given or self.action_set.exploration_variance
             self.noise = plant.instruments.measurement_noise
         self.n_a, self.horizon = plant.n_a, plant.horizon
         self.weights = plant.state_weight, plant.action_weight

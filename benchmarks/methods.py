@@ -273,7 +273,8 @@ def identified_again(
     pair = LocalPair(values)
     plant, weights = pair.plant, {name: values[name] for name in ("state_weight", "action_weight")}
     target = build_plant({**values, "sensors": 0}).target if whole else plant.target
-    variance, admissible = values["exploration_variance"], ActionSet.of(values)
+    admissible = ActionSet.of(values)
+    variance = values["exploration_variance"] or admissible.exploration_variance
     data: list[Experiment] = []
     law: Law | None = None
     paid = 0
@@ -284,10 +285,10 @@ def identified_again(
         def excited(
             k: int, states: Array, fields: list[int] = fields, law: Law | None = law
         ) -> Array:
-            actions = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
-            if law is not None:
-                actions += law(k, states)
-            return admissible.project(actions)
+            draws = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
+            if law is None:
+                return admissible.explored(draws)
+            return admissible.project(law(k, states) + admissible.exploration_scale * draws)
 
         episode = rollout(plant, excited, fields)
         paid += count

@@ -133,7 +133,8 @@ class ProjectedLaw:
         plan["constant"], plan["feedback"] = (array.ctypes.data for array in self._gains)
         self._scratch = np.zeros(4 * whole_lanes(self._n_s) + whole_lanes(gains.shape[1]))
         plan["scratch"] = self._scratch.ctypes.data
-        bounds = self.action_set.low, self.action_set.high
+        own = self.action_set  # actions of mean zero are projected as they are
+        bounds = (-np.inf, np.inf) if own.zero_mean else (own.low, own.high)
         self._bounds = [np.broadcast_to(bound, gains.shape[1]).copy() for bound in bounds]
         plan["low"], plan["high"] = (array.ctypes.data for array in self._bounds)
 
@@ -190,7 +191,7 @@ def excitations(rows: Array, step: int, n_a: int, action_set: ActionSet = ANY_AC
 def excitation(
     seed: int, step: int, n_a: int, variance: float, action_set: ActionSet = ANY_ACTION
 ) -> Array:
-    """The exploratory action (n_a,) of one step: the nearest to a draw of N(0, variance I).
+    """The exploratory action (n_a,) of one step, of a draw of N(0, variance I).
 
     A pure function of (seed, step), so that a step that is answered twice gets the same action
     twice.
@@ -203,4 +204,4 @@ def excitation(
     if not (np.isfinite(variance) and variance >= 0.0):
         raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
     draw: Array = np.random.default_rng([seed, step]).standard_normal(n_a)
-    return action_set.project(math.sqrt(variance) * draw)
+    return action_set.explored(math.sqrt(variance) * draw)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The actions that actuators can take: bounds from below and above for each, and a mean of zero.
+"""The actions that actuators can take, and those of an exploration.
 
     P(a) = argmin |x - a|,    low <= x <= high,  sum x_j = 0 if asked for
          = clip(a - s, low, high),
@@ -7,6 +7,11 @@
 with s = 0, or the shift with which the sum is zero. A plant applies P(a) of a requested action a. The
 derivative of P is 1 for each actuator that is not at a bound and 0 for the others; with a mean of zero
 that of the former is less their mean.
+
+Explorations are drawn around an operating point within the bounds, P(m + D x) with x ~ N(0, v I): m is
+the middle between two bounds, and otherwise the point nearest to 0 that is two standard deviations from
+the bound. D is the size of each actuator's standard deviation relative to the largest: a quarter of
+half the range between two bounds, and sqrt(0.1) otherwise. Without declared bounds m = 0 and D = I.
 
 References
 ----------
@@ -27,6 +32,10 @@ from loop_interfaces.spec import ParameterError
 
 NO_BOUND = 1e300
 """Magnitude that stands for no bound in the parameter `action_bounds`."""
+EXPLORED = 0.25
+"""Standard deviation of exploratory actions as a share of the half range between two bounds."""
+UNBOUNDED_VARIANCE = 0.1
+"""Variance of exploratory actions of an actuator without two bounds."""
 _BALANCED = 1e-13
 """Mean of actions, relative to the largest, that rounding explains."""
 
@@ -44,6 +53,8 @@ class ActionSet:
         Whether the actions of a step have mean zero.
     limit : float
         Magnitude at which all actions saturate besides; 0 for none.
+    exploration_mean : (n_a,) array, optional
+        m, the operating point; in place of the one above.
 
     Attributes
     ----------
@@ -52,13 +63,17 @@ class ActionSet:
     bounded : bool
         Whether there is an action that is not in it.
     signed : (n,) array
-        What signatures are of (`loop_interfaces.signature`): the parameters `action_limit` and
-        `action_bounds`.
+        What signatures are of (`loop_interfaces.signature`): the parameters `action_limit`,
+        `action_bounds` and `exploration_mean`.
+    exploration_mean, exploration_scale : (n_a,) array, or () for any number
+        m, and the diagonal of D.
+    exploration_variance : float
+        v unless another one is asked for.
 
     Raises
     ------
     ValueError
-        A bound does not fit, or no action is allowed.
+        A bound or the operating point does not fit, or no action is allowed.
     """
 
     def __init__(
@@ -69,6 +84,7 @@ class ActionSet:
         zero_mean: bool = False,
         *,
         limit: float = 0.0,
+        exploration_mean: ArrayLike = (),
     ) -> None:
         own = [_bound(name, values, n_a) for name, values in (("low", low), ("high", high))]
         self.zero_mean, reach = bool(zero_mean), limit or np.inf
@@ -83,12 +99,26 @@ class ActionSet:
         if zero_mean or np.isfinite(own).any():
             least, most = (np.clip(part, -NO_BOUND, NO_BOUND).ravel().tolist() for part in own)
             self.bounds = [*least, *most, float(self.zero_mean)]
-        self.signed = np.array([limit, *self.bounds])
         self.bounded = bool(zero_mean or np.isfinite([self.low, self.high]).any())
+        mean = float_array("exploration_mean", exploration_mean)
+        if mean.size and not (mean.shape == (n_a,) and np.allclose(self.project(mean), mean)):
+            raise ValueError(
+                f"exploration_mean must be {n_a} numbers that are an admissible action, got "
+                f"{mean.tolist()}"
+            )
+        self.signed = np.array([limit, *self.bounds, *mean])
+        self.exploration_variance, self.exploration_scale = (
+            UNBOUNDED_VARIANCE,
+            np.ones_like(self.low),
+        )
+        self.exploration_mean = mean if mean.size else np.zeros_like(self.low)
+        self._moved = bool(self.bounds or mean.size)
+        if self.bounds:
+            self._set_exploration(given=bool(mean.size))
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> ActionSet:
-        """The set of the parameters `action_limit` and `action_bounds`.
+        """The set of the parameters `action_limit`, `action_bounds` and `exploration_mean`.
 
         Examples
         --------
@@ -97,9 +127,13 @@ class ActionSet:
         array([[ 3., -1.]])
         """
         n_a, bounds = values["n_a"], np.array(values.get("action_bounds") or [])
+        others: dict[str, Any] = {
+            "limit": values["action_limit"],
+            "exploration_mean": values.get("exploration_mean") or [],
+        }
         try:
             if not bounds.size:
-                return ActionSet(n_a, limit=values["action_limit"])
+                return ActionSet(n_a, **others)
             if bounds.size != 2 * n_a + 1 or bounds[-1] not in (0.0, 1.0):
                 raise ValueError(
                     f"expected {n_a} lower bounds, {n_a} upper bounds, and 1 where actions have mean "
@@ -107,9 +141,24 @@ class ActionSet:
                 )
             own = np.where(np.abs(bounds) < NO_BOUND, bounds, np.copysign(np.inf, bounds))
             low, high = own[:n_a], own[n_a:-1]
-            return ActionSet(n_a, low, high, bool(bounds[-1]), limit=values["action_limit"])
+            return ActionSet(n_a, low, high, bool(bounds[-1]), **others)
         except ValueError as error:
-            raise ParameterError(f"parameter 'action_bounds': {error}") from error
+            name = "exploration_mean" if "exploration_mean" in str(error) else "action_bounds"
+            raise ParameterError(f"parameter '{name}': {error}") from error
+
+    def _set_exploration(self, *, given: bool) -> None:
+        two, most = np.isfinite(self.high - self.low), np.sqrt(UNBOUNDED_VARIANCE)
+        with np.errstate(invalid="ignore"):
+            own = np.where(two, 0.5 * EXPLORED * (self.high - self.low), most)
+            middle = np.where(two, 0.5 * (self.low + self.high), 0.0)
+            inside = np.clip(middle, self.low + 2.0 * own, self.high - 2.0 * own)
+        if two.any():
+            self.exploration_variance = float(own.max()) ** 2
+        self.exploration_scale = own / max(float(own.max()), 1e-300)
+        if not given:
+            self.exploration_mean = (
+                self.project(inside) if inside.ndim else inside * (not self.zero_mean)
+            )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ActionSet) and np.array_equal(self.signed, other.signed)
@@ -186,6 +235,19 @@ class ActionSet:
         rows = np.tril(np.ones((n_a, n_a)), -1)[1:] - np.diag(np.arange(1.0, n_a), 1)[:-1]
         found: Array = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).T
         return found
+
+    def explored(self, draws: Array) -> Array:
+        """The exploratory actions P(m + D x) of draws x of N(0, v I), (..., n_a).
+
+        Examples
+        --------
+        >>> heater = ActionSet(low=0.0, high=4.0)
+        >>> heater.explored(np.array([-1.0, 0.0, 9.0])), heater.exploration_variance
+        (array([1., 2., 4.]), 0.25)
+        """
+        return self.project(
+            self.exploration_mean + self.exploration_scale * draws if self._moved else draws
+        )
 
     def _shifts(self, actions: Array) -> Array:
         """s of each action, (..., 1)."""

@@ -152,8 +152,14 @@ PROBLEM = _section(
     Spec("dmdc_order", 0, 0, 1024, nodes="CT").means(
         "order n_s for the identification dmdc; 0: reduced_order"
     ),
-    Spec("exploration_variance", 0.1, positive=True, nodes="T").means(
-        "variance of each exploratory action, raised as measurement_noise requires"
+    Spec("exploration_variance", 0.0, 0.0, 1e300, nodes="T").means(
+        "variance of exploratory actions, raised as measurement_noise requires; with action_bounds "
+        "that of the widest range, and others in proportion; 0: 0.1, or a quarter of half the range "
+        "squared"
+    ),
+    Spec("exploration_mean", [], -1e300, 1e300, nodes="CT").means(
+        "operating point around which actions are explored, one number for each actuator; empty: the "
+        "middle of action_bounds, two standard deviations inside where there is one bound, else 0"
     ),
     Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
         "step size eta of two_point from the LQT warm start"

@@ -108,7 +108,7 @@ class Problem:
         states : (T + 1, state_size) array
             z_0 .. z_T as they are measured.
         actions : (T, n_a) array
-            Drawn from N(0, exploration_variance), whatever the states.
+            Drawn around the middle of the actuators' bounds, or 0, whatever the states.
 
         Raises
         ------

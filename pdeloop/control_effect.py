@@ -32,16 +32,16 @@ def idle_actuators(plant: Plant, states: Array, actions: Array) -> list[int]:
 def beyond_bounds(plant: Plant, actions: Array) -> tuple[bool, str]:
     """Whether bounds of a user's actuators change few of the actions (N, n_a), and how many, in words.
 
-    Empty where next to none are. What bounds do to small actions too, such as to take away the mean,
-    models know.
+    Empty where next to none are. What they do to small actions too models know, as they know declared
+    bounds.
     """
-    if not isinstance(plant, DynamicsPlant):
+    if not (isinstance(plant, DynamicsPlant) and plant.actuated):
         return True, ""
     linear = plant.applied(SMALL * actions) / SMALL
     changed = ~np.isclose(plant.applied(actions), linear, rtol=1e-6, atol=1e-9)
     share = float(changed.any(axis=1).mean())
     told = (
-        f"{100 * share:.0f} % of the exploratory actions exceed the actuators' bounds, which the "
+        f"{100 * share:.0f} % of the exploratory actions exceed the bounds of `actuated`, which the "
         "models do not include: lower exploration_variance"
     )
     return share <= MOST_BEYOND, told if share > SOME_BEYOND else ""

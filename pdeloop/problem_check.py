@@ -18,6 +18,7 @@ from scipy import linalg
 
 from controller_node.identification import DesignSettings, designed
 from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.parameters import INSTRUMENTS
@@ -115,9 +116,10 @@ def _variance(values: Mapping[str, Any]) -> float:
 def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
     """From the mean field and from drawn ones, under white inputs."""
     seeds = [MEAN_FIELD, *range(DRAWN)]
-    inputs = np.random.default_rng(0).normal(
+    draws = np.random.default_rng(0).normal(
         scale=np.sqrt(_variance(values)), size=(len(seeds), plant.horizon, plant.n_a)
     )
+    inputs = ActionSet.of(values).explored(draws)
     return rollout(plant, lambda k, states: inputs[:, k], seeds, np.arange(len(seeds)))
 
 
@@ -263,6 +265,24 @@ def _first_law(plant: Plant, rows: ModelRows, settings: DesignSettings) -> Law:
     return batch.actions
 
 
+class Counted:
+    """A law that counts actions at a bound."""
+
+    def __init__(self, law: Law, action_set: ActionSet) -> None:
+        self._law, self._action_set = law, action_set
+        self._at_bound: list[float] = []
+
+    def __call__(self, k: int, states: Array) -> Array:
+        actions = self._law(k, states)
+        self._at_bound.append(float(np.mean(~self._action_set.inside(actions))))
+        return actions
+
+    @property
+    def share(self) -> float:
+        """Actions at a bound, of all."""
+        return float(np.mean(self._at_bound))
+
+
 def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings on exploration variance, order and law, from the plant as it is measured."""
     plant = build_plant(values)
@@ -293,6 +313,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             f"{suggested + plant.n_a} or more"
         )
     yield Finding("order", True, told)
+    share: float | None = None
     costs, compared = {"no control": _drawn_fields_cost(plant)}, compares_first_law(values)
     for order in dict.fromkeys(orders):
         try:
@@ -308,8 +329,15 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             )
             yield Finding("first law", compared, told, note=compared)
             return
-        cost = _drawn_fields_cost(plant, _first_law(plant, rows, settings))
+        law_of_rows = Counted(_first_law(plant, rows, settings), settings.action_set)
+        cost = _drawn_fields_cost(plant, law_of_rows)
+        share = law_of_rows.share if share is None else share
         costs.setdefault(f"order {rows.A.shape[0]}", cost)
+    if share is not None and settings.action_set.bounded:
+        told = (
+            f"{100 * share:.0f} % of the actions of the first law are at a bound of their actuator"
+        )
+        yield Finding("saturation", True, told, note=share > 0.5)
     told = ", ".join(
         f"{format(cost, '.4g') if np.isfinite(cost) else 'diverges'} with {name}"
         for name, cost in costs.items()

@@ -255,6 +255,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         width=values["actuator_width"],
         n_z=values["n_z"],
     )
+    action_set = ActionSet.of(values)
     # The published readings are scaled (docs/robustness.md).
     scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
@@ -262,8 +263,10 @@ def build_training(values: Mapping[str, Any]) -> Training:
     centres, widths = declared_actuators(values)
     given |= {
         "law": law,
-        "action_set": ActionSet.of(values),
-        "exploration_variance": max(values["exploration_variance"], variance),
+        "action_set": action_set,
+        "exploration_variance": max(
+            values["exploration_variance"] or action_set.exploration_variance, variance
+        ),
         "sensors": sensors,
         "actuator_positions": centres,
         "actuator_widths": widths,

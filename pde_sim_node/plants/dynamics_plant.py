@@ -175,9 +175,14 @@ class DynamicsPlant(BatchPlant):
         self._advanced(states, self.applied(actions), costs, 0, np.arange(len(states)))
         return costs
 
+    @property
+    def actuated(self) -> bool:
+        """True if the class says itself what its actuators apply."""
+        return type(self.dynamics).actuated is not Dynamics.actuated
+
     def applied(self, actions: Array) -> Array:
         """The actions that actuators apply for requested ones (M, n_a)."""
-        if type(self.dynamics).actuated is Dynamics.actuated:
+        if not self.actuated:
             return self.action_set.project(actions)
         taken = [float_array("it", self._call("actuated", a.copy())) for a in actions]
         held = np.stack(taken) if {a.shape for a in taken} == {(self.n_a,)} else np.zeros(0)

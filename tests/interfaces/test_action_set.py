@@ -110,3 +110,41 @@ def test_bounds_that_admit_nothing_are_refused(
 ) -> None:
     with pytest.raises(ParameterError, match=f"'action_bounds': .*{words}"):
         ActionSet.of({"n_a": 2, "action_limit": limit, "action_bounds": bounds})
+
+
+def test_an_exploration_is_around_mid_range_and_a_quarter_of_half_the_range_wide() -> None:
+    mixed = ActionSet(4, [0.0, -2.0, 1.0, -np.inf], [4.0, 2.0, np.inf, np.inf])
+    draws = np.random.default_rng(6).standard_normal((20_000, 4))
+    actions = mixed.explored(np.sqrt(mixed.exploration_variance) * draws)
+    unit = np.sqrt(0.1)
+    np.testing.assert_allclose(actions.mean(axis=0), [2.0, 0.0, 1.0 + 2 * unit, 0.0], atol=0.02)
+    np.testing.assert_allclose(actions.std(axis=0), [0.5, 0.5, unit, unit], rtol=0.03)
+    np.testing.assert_array_equal(mixed.project(actions), actions)
+    reactor = ActionSet(3, -0.3, 0.3)
+    assert np.sqrt(reactor.exploration_variance) == pytest.approx(0.075)
+    wide = ActionSet(2, [-2.0, -1.0], [2.0, 1.0])
+    np.testing.assert_allclose(wide.explored(np.ones((1, 2))), [[1.0, 0.5]])
+
+
+def test_without_declared_bounds_an_exploration_is_what_is_drawn() -> None:
+    draws = requests()
+    np.testing.assert_array_equal(ANY_ACTION.explored(draws), draws)
+    limited = ActionSet(4, limit=0.4)
+    np.testing.assert_array_equal(limited.explored(draws), np.clip(draws, -0.4, 0.4))
+    assert ANY_ACTION.exploration_variance == limited.exploration_variance == 0.1
+
+
+def test_an_operating_point_of_mean_zero_and_one_that_is_given() -> None:
+    balanced = SETS["mean zero and bounds"]
+    m = balanced.exploration_mean
+    np.testing.assert_array_equal(balanced.project(m), m)
+    assert balanced.explored(requests()).sum(axis=1) == pytest.approx(0.0, abs=1e-12)
+    values = {"n_a": 2, "action_limit": 0.0, "action_bounds": [0.0, 0.0, 4.0, 4.0, 0.0]}
+    given = ActionSet.of(values | {"exploration_mean": [1.0, 3.0]})
+    np.testing.assert_array_equal(given.explored(np.zeros((1, 2))), [[1.0, 3.0]])
+    assert given.signed.tolist() == [0.0, 0.0, 0.0, 4.0, 4.0, 0.0, 1.0, 3.0]
+    for bad in ([1.0], [1.0, 5.0]):
+        with pytest.raises(
+            ParameterError, match=r"'exploration_mean': .* 2 numbers that are an admi"
+        ):
+            ActionSet.of(values | {"exploration_mean": bad})

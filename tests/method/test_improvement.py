@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ActionSet
+from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO
 from loop_method.adapt.improve import curvature_of, improve
@@ -48,15 +48,26 @@ def fields(count: int) -> np.ndarray:
     return np.random.default_rng(2).normal(size=(count, N_Z))
 
 
-@pytest.mark.parametrize(("limit", "noise"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.3)])
-def test_the_gradient_is_that_of_finite_differences(limit: float, noise: float) -> None:
-    closed = replace(loop(limit), noise=noise)
+@pytest.mark.parametrize(
+    ("admissible", "noise"),
+    [
+        (ANY_ACTION, 0.0),
+        (ActionSet(limit=0.4), 0.0),
+        (ActionSet(low=-0.1), 0.0),
+        (ActionSet(N_A, -0.5, 0.3, zero_mean=True), 0.0),
+        (ANY_ACTION, 0.3),
+    ],
+)
+def test_the_gradient_is_that_of_finite_differences(admissible: ActionSet, noise: float) -> None:
+    closed = replace(loop(), action_set=admissible, noise=noise)
     start, weights = fields(3), np.array([0.5, 0.2, 0.3])
     theta = 0.3 * np.random.default_rng(3).normal(size=(N_A, N_S + 1))
     cost, gradient = closed.gradient(theta, start, weights)
     assert cost == pytest.approx(weights @ closed.costs(theta, start), rel=1e-14)
-    saturated = np.abs(closed.simulate(theta, start).actions) == limit
-    assert saturated.any() == bool(limit) and not saturated.all()
+    actions = closed.simulate(theta, start).actions
+    saturated = ~admissible.inside(actions)
+    assert saturated.any() == admissible.bounded and not saturated.all()
+    np.testing.assert_array_equal(admissible.project(actions), actions)
     h, finite = 1e-6, np.zeros_like(theta)
     for index in np.ndindex(theta.shape):
         step = np.zeros_like(theta)

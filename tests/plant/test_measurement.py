@@ -212,6 +212,11 @@ def test_the_law_and_the_exploration_saturate_and_change_nothing_inside() -> Non
     assert inside.any() and not inside.all()
     assert same_bits(held[inside], a[inside])
     assert same_bits(held[~inside], 0.7 * np.sign(a[~inside]))
+    for balanced in (False, True):
+        own = ActionSet(4, [-0.1, 0.0, -np.inf, -1.0], [0.2, 0.5, np.inf, 0.3], balanced)
+        bounded = ProjectedLaw([U], z_r, own)
+        bounded.set(policies)
+        assert same_bits(bounded.actions(states), own.project(a))
     drawn = excitation(1, 2, 200, 1.0)
     assert same_bits(excitation(1, 2, 200, 1.0, ActionSet(limit=0.3)), np.clip(drawn, -0.3, 0.3))
 

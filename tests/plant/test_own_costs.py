@@ -197,3 +197,38 @@ def test_a_class_says_itself_what_its_actuators_take() -> None:
     np.testing.assert_array_equal(
         plant.step(np.array([[2.0, 4.0]])), own.step(np.array([[1.0, 2.0]]))
     )
+
+
+class Heated(Dynamics):
+    """Two heaters of 0 to 4, of a state that has to be warm."""
+
+    n_z, n_a, horizon, target, action_weight = 3, 2, 60, 5.0, 0.05
+    action_low, action_high = 0.0, 4.0
+    A, B = 0.9 * np.eye(3) + 0.05 * np.eye(3, k=1), 0.3 * np.eye(3, 2, k=0) + 0.1
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return 2.0 + 0.3 * rng.standard_normal(3)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return self.A @ z + self.B @ a
+
+
+def test_what_is_recorded_of_bounded_actuators_is_what_acts_from_mid_range_on() -> None:
+    problem = pdeloop.problem(plant=Heated())
+    assert problem.values["action_bounds"] == [0.0, 0.0, 4.0, 4.0, 0.0]
+    states, actions = problem.explore(0)
+    acted = states[:-1] @ Heated.A.T + actions @ Heated.B.T
+    np.testing.assert_allclose(states[1:], acted, atol=1e-12)
+    assert np.abs(actions.mean(axis=0) - 2.0).max() < 0.25
+    assert np.abs(actions.std(axis=0) - 0.5).max() < 0.12
+
+
+def test_a_law_of_bounded_actuators_asks_for_no_more_than_they_take() -> None:
+    run = pdeloop.train(plant=Heated(), rollouts=8, evaluation_fields=3)
+    plant = pdeloop.problem(plant=Heated()).plant()
+    asked: list[np.ndarray] = []
+    law = run.law()
+    pdeloop.rollout(plant, lambda k, z: asked.append(law(k, z)) or asked[-1], [1, 2, 3])
+    actions = np.array(asked)
+    assert actions.min() >= 0.0 and actions.max() <= 4.0
+    assert run.costs["adapted"].mean() < run.costs["none"].mean()

@@ -158,9 +158,16 @@ def test_inputs_without_effect_are_named() -> None:
 
 
 class Bounded(Around):
-    """The same with bounds of a third of the exploration's standard deviation, and without a mean."""
+    """The same with a saturation of its own, at a third of the exploration's standard deviation."""
 
-    action_low, action_high, zero_mean = -0.1, 0.1, True
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return np.clip(a, -0.1, 0.1)
+
+
+class Heated(Around):
+    """The same with declared bounds, far below the actions of a law without them."""
+
+    action_low, action_high = -0.05, 0.1
 
 
 class Balanced(Around):
@@ -174,6 +181,15 @@ def test_an_exploration_beyond_the_bounds_of_the_actuators_is_told() -> None:
     share = float(re.match(r"[\d.]+", text)[0])
     assert not good and 90 < share <= 100 and text.endswith("lower exploration_variance")
     assert "bounds" not in findings_of(Balanced()) and "bounds" not in findings_of(Around())
+
+
+def test_actions_of_the_first_law_at_declared_bounds_are_told() -> None:
+    found = findings_of(Heated())
+    assert "bounds" not in found and "saturation" not in findings_of(Around())
+    share = float(
+        re.match(r"([\d.]+) % of the actions of the first law", found["saturation"][1])[1]
+    )
+    assert 50 < share <= 100
 
 
 def test_a_law_that_does_next_to_nothing_is_not_a_matter_of_the_order() -> None:
