@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import ACTION, START, TARGET, Topic
 from pdeloop.conformance.controller import ControllerCheck
@@ -37,7 +38,7 @@ ONE_FIELD |= {f"physical.spread_{end}": 0.05 for end in ("min", "max")}
         ("controller", {"identification": "dmdc", "dmdc_rank": 40}, ["(known plant)"]),
         # The first kind of model that predicts it well enough is taken, not the exact one.
         ("controller", {"identification": "field"}, ["(known plant)"]),
-        ("controller", {"action_limit": 1e-3}, ["(draws)"]),
+        ("controller", {"action_set": ActionSet(limit=1e-3)}, ["(draws)"]),
         ("tuner", {}, ["(another run)"]),
         ("tuner", {"rollouts": 0, "iterations": 3}, ["(another run)"]),
         ("tuner", {"seeds": 3}, ["(another run)"]),
