@@ -37,12 +37,15 @@ class EpisodeRecord:
         a_0 .. a_{T-1}, as the law gave them.
     costs : EpisodeCosts
         Mean and sum of the stage costs, and where an environment diverged.
+    applied : (T, M, n_a) array
+        The actions that the actuators applied for these, within their bounds.
     """
 
     states: Array
     fields: Array
     actions: Array
     costs: EpisodeCosts
+    applied: Array
 
     def __repr__(self) -> str:
         steps, cost = len(self.actions), self.costs.mean
@@ -114,6 +117,7 @@ def rollout(
     batch, kept = len(z), plant.horizon if keep else -1
     states = np.empty((kept + 1, *z.shape))
     actions = np.empty((max(kept, 0), batch, plant.n_a))
+    applied = actions.copy()
     own = not plant.instruments.ideal
     fields = np.empty((kept + 1, batch, plant.n_z)) if own else states
     for k in range(plant.horizon + 1):
@@ -125,8 +129,8 @@ def rollout(
             a = law(k, z)
             z = plant.step(a)
             if keep:
-                actions[k] = a
-    return EpisodeRecord(states, fields, actions, plant.episode_costs())
+                actions[k], applied[k] = a, plant.actions
+    return EpisodeRecord(states, fields, actions, plant.episode_costs(), applied)
 
 
 def mean_field_cost(plant: Plant, law: Law | None = None) -> float:

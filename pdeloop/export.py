@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.spec import ParameterError
 from loop_method.laws import Law
 from loop_method.laws.extended_kalman import ExtendedKalman
+from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
 
@@ -40,7 +42,7 @@ class Parameters:
     theta: Array
     model: ModelRows
     law: Law | None
-    limit: float
+    action_set: ActionSet
     sample_time: float
     name: str
 
@@ -53,19 +55,23 @@ class Parameters:
             law=np.array(self.kind),
             theta=self.theta,
             sample_time=np.array(self.sample_time),
-            action_limit=np.array(self.limit),
+            **_bounds(self.action_set, len(self.model.K_a)),
             **arrays,
             **known,
         )
 
     def c(self) -> bytes:
-        """One function in C99 for the law `observer`, and for one that acts on nothing else.
+        """One function in C99 for the laws `feedforward` and `observer`, and for one that acts as that.
 
         Any other law is refused with a ParameterError.
         """
         law, theta, other = self.law, self.theta, ""
         if isinstance(law, ExtendedKalman) and law.estimates(theta):
             other = ", or train with `--law observer`, which can"
+        if isinstance(law, FeedForward):
+            own = law.parts(theta)
+            K, b = _rows(own["K"]), _rows(own["b"])
+            return _filled("feedforward", self, self.model, K=K, b=b, steps=str(len(own["b"])))
         if other or type(law) not in (Observer, ExtendedKalman):
             raise ParameterError(
                 f"the law '{self.kind}' cannot be written in C; write its parameters as .npz{other}"
@@ -80,13 +86,13 @@ class Parameters:
 
 @dataclass(frozen=True, eq=False)
 class GainLaw:
-    """a = K_a U^T z + K_b s_r, limited to +- limit where that is above 0.
+    """a = K_a U^T z + K_b s_r, or the nearest admissible action.
 
     model: with the law's own gains; sample_time in s; name: what it is the law of, in words.
     """
 
     model: ModelRows
-    limit: float
+    action_set: ActionSet
     sample_time: float
     name: str
 
@@ -95,7 +101,7 @@ class GainLaw:
         return _archive(
             model=pack(self.model)[np.newaxis],
             sample_time=np.array(self.sample_time),
-            action_limit=np.array(self.limit),
+            **_bounds(self.action_set, len(self.model.K_a)),
             **self.model.arrays,
         )
 
@@ -114,7 +120,7 @@ def law_of(
     ParameterError for a seed that the run does not have.
     """
     m, policy = run.index(seed), run.theta(which, seed)
-    model, law, limit = run.models[m], _loaded(run, m), float(run.values["action_limit"])
+    model, law, limit = run.models[m], _loaded(run, m), ActionSet.of(run.values)
     step = float(run.values["sample_time"])
     name = f"the {which} law of {run.values['problem']}, seed {run.seeds[m]}"
     if law is None or not law.compiled:
@@ -166,9 +172,30 @@ def _filled(template: str, law: GainLaw | Parameters, model: ModelRows, **number
         n_s=n_s,
         n_a=n_a,
         U=_rows(model.U.T),
-        limit=float(law.limit).hex(),
+        bounds=_bounds_in_c(law.action_set, n_a),
         **numbers,
     ).encode()
+
+
+def _bounds(allowed: ActionSet, n_a: int) -> dict[str, Array]:
+    """action_low and action_high (n_a,), infinite without a bound, and zero_mean."""
+    low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
+    return {"action_low": low, "action_high": high, "zero_mean": np.array(float(allowed.zero_mean))}
+
+
+def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
+    """The function that makes an action admissible."""
+    low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
+    balance = (_TEMPLATES / "balance.c.txt").read_text() if allowed.zero_mean else ""
+    shift = "    const double shift = pdeloop_shift(a);\n"
+    text = Template((_TEMPLATES / "bounds.c.txt").read_text())
+    return text.substitute(
+        low=_numbers(low),
+        high=_numbers(high),
+        balance=balance,
+        balanced=shift if allowed.zero_mean else "",
+        moved=" - shift" if allowed.zero_mean else "",
+    )
 
 
 def _rows(matrix: Array) -> str:
@@ -176,4 +203,5 @@ def _rows(matrix: Array) -> str:
 
 
 def _numbers(vector: Array) -> str:
-    return ", ".join(float(value).hex() for value in vector)
+    infinite = {np.inf: "HUGE_VAL", -np.inf: "-HUGE_VAL"}
+    return ", ".join(infinite.get(float(value)) or float(value).hex() for value in vector)

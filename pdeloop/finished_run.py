@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from controller_node.law_batch import LawBatch
 from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED
@@ -218,27 +219,30 @@ class FinishedRun:
         return counted or [0] * len(self.policies)
 
     def trajectories(self) -> Iterator[EpisodeRecord]:
-        """The complete episodes in the run's bag, in order, one at a time.
+        """The complete episodes of the run, in order, one at a time.
+
+        They are those in its bag. A run that was not recorded is repeated in this process, with the
+        same bits, which takes as long as the training did.
 
         Yields
         ------
         EpisodeRecord
-            Its states (T + 1, M, state_size) are those that were published; so are the `fields`, as a
-            bag has no others.
+            Its states (T + 1, M, state_size) are those that were published; of a bag, so are the
+            `fields`, as it has no others.
 
         Raises
         ------
         ValueError
-            The run was not recorded, or its bag cannot be read.
+            The bag cannot be read, or there is none and the run cannot be repeated, as its plant or law
+            is another one by now.
         """
         from pdeloop.bags.mcap_messages import files
         from pdeloop.bags.reader import bags_of
 
         if not any(map(files, self.folder.glob("bag*"))):
-            raise ValueError(
-                f"{self.folder} holds no trajectories, as its run was not recorded; record one with: "
-                "pdeloop train --record, or compute an episode with pdeloop.rollout"
-            )
+            yield from self._repeated()
+            return
+        allowed = ActionSet.of(self.values)
         for bag in bags_of(self.folder):
             for episode in bag.episodes():
                 if episode.cost is None or episode.missing:
@@ -246,7 +250,27 @@ class FinishedRun:
                 states, actions = episode.trajectory()
                 mean, total, ended = episode.cost.values.T[:3]
                 lost = np.where(ended == COMPLETED, -1, ended).astype(np.int64)
-                yield EpisodeRecord(states, states, actions, EpisodeCosts(mean, total, lost))
+                costs = EpisodeCosts(mean, total, lost)
+                yield EpisodeRecord(states, states, actions, costs, allowed.project(actions))
+
+    def _repeated(self) -> Iterator[EpisodeRecord]:
+        """The episodes of the same training, carried out again."""
+        from pdeloop.in_process import episodes
+        from tuner_node.build import build_training
+
+        with TemporaryDirectory() as temporary:
+            values = dict(self.values)
+            if values["model"]:  # as it was, wherever that file is now
+                values["model"] = str(Path(temporary) / "model.npz")
+                own: dict[str, Any] = {"model": pack(self.models[0])[np.newaxis]}
+                np.savez(values["model"], **own | self.models[0].arrays)
+            training = build_training(values)
+            yield from episodes(training, values)
+        if not np.array_equal(training.policies(), self.policies):
+            raise ValueError(
+                f"the run in {self.folder} was not recorded, and gave another policy when it was "
+                "repeated, as its plant, law or version is another one: record it with --record"
+            )
 
 
 def load_run(folder: str | Path) -> FinishedRun:

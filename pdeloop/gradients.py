@@ -267,7 +267,7 @@ class Gradients:
             M = self.plant.batch
             none, infinite = np.empty((0, M, 0)), np.full(M, np.inf)
             return EpisodeRecord(
-                none, none, none, EpisodeCosts(infinite, infinite, np.zeros(M, int))
+                none, none, none, EpisodeCosts(infinite, infinite, np.zeros(M, int)), none
             )
 
     def _gradient(

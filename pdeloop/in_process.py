@@ -7,7 +7,7 @@ pure functions from the same float64 arrays; only the transport is missing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -128,6 +128,14 @@ def train(
     after_batch: Callable[[], None] = lambda: None,
 ) -> None:
     """Run `training` to its end on `pair`."""
+    for _ in batches(training, pair, report, max_batch=max_batch):
+        after_batch()
+
+
+def batches(
+    training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024
+) -> Iterator[None]:
+    """The same, batch by batch."""
     pair.follow(training)
     phase = ""
     while True:
@@ -141,4 +149,25 @@ def train(
         for row in training.finish(result):
             report(row)
         pair.follow(training)
-        after_batch()
+        yield
+
+
+def episodes(training: Training, values: Mapping[str, Any]) -> Iterator[EpisodeRecord]:
+    """The episodes of a training, which is run to its end on the way."""
+    pair = _KeepingPair(values)
+    for _ in batches(training, pair, lambda row: None, max_batch=values["max_batch"]):
+        yield from pair.kept
+        pair.kept.clear()
+
+
+class _KeepingPair(LocalPair):
+    """Keeps the states and actions of every episode."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self.kept: list[EpisodeRecord] = []
+
+    def roll_out(self, batch: Batch) -> EpisodeRecord:
+        seeds = batch.rows[:, StartColumn.SEED].astype(np.int64)
+        self.kept.append(rollout(self.plant, self.law(batch), seeds, noise_seeds(batch.rows)))
+        return self.kept[-1]

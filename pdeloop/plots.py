@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,7 +17,8 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
 from pdeloop.report import figures, learning, planes
 from pdeloop.report.data import ProblemData, of_run
-from pdeloop.report.places import beside
+from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
+from pdeloop.report.places import beside, moving_target
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
 __all__ = [
@@ -62,19 +64,40 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
     components, axis = plant.grid.components, plant.grid.line
     extent = (0.0, times[-1], 0.0, axis.length)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 1.6 + 1.7 * len(components)))
-        *maps, below = figure.subplots(len(components) + 1, 1, sharex=True)
-        for i, (ax, name) in enumerate(zip(maps, components, strict=True)):
-            own = plant.grid.part(i)
+        moving = moving_target(plant)
+        each = 1 if moving is None else 2
+        figure = Figure(figsize=(6.4, 1.6 + 1.7 * each * len(components)))
+        *maps, below = figure.subplots(each * len(components) + 1, 1, sharex=True)
+        for i, name in enumerate(components):
+            own, ax = plant.grid.part(i), maps[each * i]
             field, target = episode.fields[:, environment, own], plant.field_target[own]
-            low, high = field_range(field, target)
+            low, high = field_range(field, target if moving is None else moving[:, own])
+            if moving is not None:
+                goal = maps[each * i + 1]
+                wanted: Any = image(
+                    goal,
+                    moving[: steps + 1, own].T,
+                    extent,
+                    origin="lower",
+                    cmap=FIELD_MAP,
+                    vmin=low,
+                    vmax=high,
+                )
+                goal.set_ylabel(axis.label)
+                figure.colorbar(wanted, ax=goal, label=f"target of {name}", pad=0.01)
             drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
-            beside(ax, target, (low, high), axis.length)
+            if moving is None:
+                beside(ax, target, (low, high), axis.length)
             ax.set_ylabel(axis.label)
             figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
-        held = episode.actions[:, environment]
-        below.step(times, np.vstack([held, held[-1:]]), where="post", linewidth=0.9)
-        below.set_ylabel("actions $a_j$")
+        applied = episode.applied[:, environment]
+        limits = action_range([applied], plant.action_set)
+        picture: Any = held_actions(below, times, applied, plant.action_set, limits)
+        name_actions(below, plant.n_a)
+        if picture is not None:
+            figure.colorbar(picture, ax=below, label="$a_j(t)$", pad=0.01)
+        if text := share_text(applied, plant.action_set):
+            below.set_title(text, loc="right", fontsize=8, color="0.4", pad=2)
         below.set_xlabel("t (s)")
     return figure
 

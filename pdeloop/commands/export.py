@@ -22,8 +22,8 @@ def add(commands: Commands) -> None:
         help="export a run's law as .npz or C, its learning curve as .csv or for TensorBoard",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: "
         "as .npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` also reads, or "
-        "as a C99 function; the law `observer` as a C99 function with a memory; any other law's "
-        "parameters as .npz; and the cost after each step "
+        "as a C99 function; the laws `feedforward` and `observer` as a C99 function of the step, "
+        "or with a memory; any other law's parameters as .npz; and the cost after each step "
         "of the training as .csv or as event files of TensorBoard.",
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )

@@ -38,8 +38,8 @@ from tuner_node.run_folder import RunFolderError
 class Behaviour:
     """One controller from the mean initial field.
 
-    states (T + 1, n_z), actions (T, n_a), cost: mean stage cost; diverged at this step, -1 if it did
-    not. What follows a divergence is NaN.
+    states (T + 1, n_z), actions (T, n_a) as they were applied, cost: mean stage cost; diverged at this
+    step, -1 if it did not. What follows a divergence is NaN.
     """
 
     controller: str
@@ -264,7 +264,7 @@ def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) 
     costs, found = episode.costs, []
     for i, name in enumerate(policies):
         diverged = int(costs.diverged_step[i])
-        states, actions = episode.fields[:, i], episode.actions[:, i]
+        states, actions = episode.fields[:, i], episode.applied[:, i]
         if diverged >= 0:
             states[diverged + 1 :], actions[diverged:] = np.nan, np.nan
         found.append(Behaviour(name, states, actions, float(costs.mean[i]), diverged))

@@ -17,8 +17,9 @@ from loop_interfaces.colour_scale import field_range
 from loop_interfaces.model_rows import ModelRows
 from loop_method.reduce.order import OrderStudy
 from pdeloop.report import planes
-from pdeloop.report.data import Behaviour, ProblemData
-from pdeloop.report.places import beside, mark_places
+from pdeloop.report.data import ProblemData
+from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
+from pdeloop.report.places import beside, mark_places, moving_target
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
 Eigenvalues = NDArray[Any]
@@ -29,7 +30,8 @@ def behaviour(problem: ProblemData) -> Figure:
     if len(problem.plant.grid.axes) > 1:
         return planes.behaviour(problem)
     shown, components = problem.behaviours, problem.plant.grid.components
-    count, fields = len(shown), len(components)
+    plant, moving = problem.plant, moving_target(problem.plant)
+    count, fields = len(shown) + (moving is not None), len(components)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
         2 * fields + 1,
@@ -39,20 +41,32 @@ def behaviour(problem: ProblemData) -> Figure:
         squeeze=False,
         height_ratios=(1.25,) * fields + (1,) * (1 + fields),
     )
-    largest = max(float(np.nanmax(np.abs(b.actions), initial=0.0)) for b in shown) or 1.0
+    limits = action_range([b.actions for b in shown], plant.action_set)
     times = problem.first.values["sample_time"] * np.arange(len(shown[0].states))
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
         grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
-        _actions(grid[fields, column], b, times, largest)
+        picture: Any = held_actions(
+            grid[fields, column], times, b.actions, plant.action_set, limits
+        )
+        grid[fields, column].set_xlabel("t (s)")
+        if text := share_text(b.actions, plant.action_set):
+            grid[fields, column].set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
         for ax in grid[:, column]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
-    grid[fields, 0].set_ylabel("actions $a_j$")
+    name_actions(grid[fields, 0], plant.n_a)
+    if picture is not None:
+        row = grid[fields, : len(shown)].tolist()
+        figure.colorbar(picture, ax=row, label="$a_j(t)$", aspect=10, pad=0.01)
+    if moving is not None:
+        grid[0, -1].set_title("target")
+        for ax in grid[fields:, -1]:
+            ax.set_axis_off()
     for i, name in enumerate(components):
         own = problem.plant.grid.part(i)
         _maps(figure, problem, own, grid[i], name, float(times[-1]))
-        _profiles(problem, i, grid[fields + 1 + i], name)
+        _profiles(problem, i, grid[fields + 1 + i, : len(shown)].tolist(), name)
     figure.legend(
         *grid[fields + 1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3
     )
@@ -65,21 +79,25 @@ def _maps(
     """A component of the state in space and time."""
     fields = [b.states[:, own] for b in problem.behaviours]
     target, axis = problem.plant.field_target[own], problem.plant.grid.line
-    low, high = field_range(np.stack(fields), target)
+    moving = moving_target(problem.plant)
+    low, high = field_range(np.stack(fields), target if moving is None else moving[:, own])
+    fields += [] if moving is None else [moving[:, own]]
     for ax, values in zip(axes, fields, strict=True):
         ax.set_facecolor("0.9")
         extent = (0.0, end, 0.0, axis.length)
         drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
         ax.set_xlabel("t (s)")
     axes[0].set_ylabel(axis.label)
-    beside(axes[-1], target, (low, high), axis.length)
+    if moving is None:
+        beside(axes[-1], target, (low, high), axis.length)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
 def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes], name: str) -> None:
     """Its initial and final profiles, the target, and where actuators act and sensors measure."""
     own = problem.plant.grid.part(component)
-    axis, target = problem.plant.grid.line, problem.plant.field_target[own]
+    axis, moving = problem.plant.grid.line, moving_target(problem.plant)
+    target = problem.plant.field_target[own] if moving is None else moving[-1, own]
     for ax, b in zip(axes, problem.behaviours, strict=True):
         mark_places(ax, problem.plant, component)
         first, last = b.states[0, own], b.states[-1, own]
@@ -89,14 +107,6 @@ def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes], name: 
         ax.set_xlim(0, axis.length)
         ax.set_xlabel(axis.label)
     axes[0].set_ylabel(f"{name}(x, T)")
-
-
-def _actions(ax: Axes, b: Behaviour, times: Array, largest: float) -> None:
-    held = np.vstack([b.actions, b.actions[-1:]])
-    ax.step(times, held, where="post", color=COLOURS[b.controller], linewidth=0.7, alpha=0.75)
-    ax.set_xlim(0, float(times[-1]))
-    ax.set_ylim(-1.08 * largest, 1.08 * largest)
-    ax.set_xlabel("t (s)")
 
 
 def gains(problem: ProblemData) -> Figure:

@@ -46,6 +46,15 @@ def mark_places(ax: Axes, plant: Plant, component: int) -> None:
         ax.plot(x[points], np.zeros(len(points)), "k.", transform=below, ms=4, clip_on=False)
 
 
+def moving_target(plant: Plant) -> Array | None:
+    """The target of each step, (T + 1, n_z); None where it is constant, or that of an output."""
+    cost = plant.cost
+    if cost.target.ndim < 2 or cost.output is not None:
+        return None
+    missing = plant.horizon + 1 - len(cost.target)
+    return np.vstack([cost.target, *[cost.target[-1:]] * max(missing, 0)])
+
+
 def beside(ax: Axes, target: Array, limits: tuple[float, float], length: float) -> None:
     """The target of a field on one axis, as a strip in its colours to the right of `ax`."""
     strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))

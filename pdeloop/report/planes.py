@@ -14,8 +14,9 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.colour_scale import field_range
 from loop_interfaces.grid import Grid
 from pde_sim_node.plant import Plant
+from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
 from pdeloop.report.places import mark_places, supports_of
-from pdeloop.report.style import COLOURS, FIELD_MAP, NAMES
+from pdeloop.report.style import FIELD_MAP, NAMES
 
 if TYPE_CHECKING:
     from pdeloop.episode import EpisodeRecord
@@ -49,12 +50,13 @@ def behaviour(problem: ProblemData) -> Figure:
         own = axes[len(SHARES) * i : len(SHARES) * (i + 1)].ravel().tolist()
         figure.colorbar(drawn, ax=own, label=name, pad=0.01, extend="both")
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
+    limits = action_range([b.actions for b in shown], plant.action_set)
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
         axes[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
-        _held(axes[-1, column], times, b.actions, color=COLOURS[b.controller])
-    axes[-1, 0].set_ylabel("actions $a_j$")
+        _held(axes[-1, column], times, b.actions, plant, limits)
+    name_actions(axes[-1, 0], plant.n_a)
     axes[-1, -1].set_axis_off()
     return figure
 
@@ -80,8 +82,9 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
         ax.remove()
     below = figure.add_subplot(len(components) + 1, 1, len(components) + 1)
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
-    _held(below, times, record.actions[:, environment])
-    below.set_ylabel("actions $a_j$")
+    applied = record.applied[:, environment]
+    _held(below, times, applied, plant, action_range([applied], plant.action_set))
+    name_actions(below, plant.n_a)
     return figure
 
 
@@ -137,6 +140,10 @@ def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float,
     return field_range(values, plant.field_target[plant.grid.part(component)])
 
 
-def _held(ax: Axes, times: Array, actions: Array, **how: Any) -> None:
-    ax.step(times, np.vstack([actions, actions[-1:]]), where="post", linewidth=0.8, **how)
+def _held(
+    ax: Axes, times: Array, applied: Array, plant: Plant, limits: tuple[float, float]
+) -> None:
+    held_actions(ax, times, applied, plant.action_set, limits)
+    if text := share_text(applied, plant.action_set):
+        ax.set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
     ax.set_xlabel("t (s)")

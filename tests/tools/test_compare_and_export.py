@@ -169,7 +169,9 @@ def test_a_law_with_a_linear_filter_in_c_is_that_of_the_loop(tmp_path: Path) -> 
     # So is one with a nonlinear filter as long as it acts on its linear one alone.
     law = ExtendedKalman(run.models[0], horizon)
     theta = law.theta_start.ravel()
-    exported = Parameters(law.name, theta, law.model, law, LIMIT, 0.1, "the lqt law")
+    exported = Parameters(
+        law.name, theta, law.model, law, ActionSet(limit=LIMIT), 0.1, "the lqt law"
+    )
     source = tmp_path / "first.c"  # a library that is loaded already is not loaded again
     source.write_bytes(exported.c())
     assert_c_is(source, law, theta)
@@ -226,7 +228,7 @@ def test_texts_of_a_file_become_neither_a_formula_nor_the_end_of_a_comment() -> 
     own = ModelRows(
         **{name: np.ones((1, 1)) for name in ("A", "B", "U", "K_a", "K_b")}, s_r=np.ones(1)
     )
-    code = GainLaw(own, 0.0, 0.1, "a **// system(0); /*").c().decode()
+    code = GainLaw(own, ActionSet(), 0.1, "a **// system(0); /*").c().decode()
     assert code.index("*/") == code.index(" */\n") + 1
 
 

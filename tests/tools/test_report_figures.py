@@ -69,9 +69,10 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
     svg = (tmp_path / "both.svg").read_text()
     for words in (">u(x, t)<", ">u_t(x, t)<", ">u(x, T)<", ">u_t(x, T)<"):
         assert words in svg, words
-    # A map and a profile of each field under every controller, and a target and a colour bar of each.
+    # A map and a profile of each field under every controller, and a target and a colour bar of each;
+    # the actions of eight actuators are a picture with a colour bar.
     maps = re.findall(r'<g id="axes_\d+">', svg)
-    assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2
+    assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2 + 1
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])
