@@ -4,13 +4,19 @@
 POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
 the directions that it senses, also for other fields: a plant that is unstable at its target is
 saturated by the end of the episode, and an episode has only one initial field. A model of the whole
-field (`loop_method.models`) that predicts the episodes is linearised at the target, with e = z - z_r,
+field (`loop_method.models`) that predicts the episodes is linearised at the target, with e = z - z_r
+(if that is far outside of the data and the model not exact, at the measured state nearest to it),
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
 
 and the law a = K e + b that minimises the cost over the horizon senses only the n_a rows of K. They
 are the first columns of U; the others are POD modes of the remainder of simulated states, with that law
 and without control. If U has too few columns for both, all are POD modes.
+
+No model is the only judge of its own law. The model of the whole field and the reduced one are accepted
+by their errors on parts of the data that they were not fitted to, relative to the variation of the data
+and to the error of the other one. Every accepted model predicts the cost of both laws, and the law with
+the lower of their worst predictions is used. All errors are of numbers in units of their own variation.
 
 References
 ----------
@@ -20,7 +26,7 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +36,7 @@ from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.one_thread import one_thread
 from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
 from loop_method.models import (
     FieldModel,
@@ -39,13 +46,33 @@ from loop_method.models import (
     affine_law,
     fit_field_model,
 )
-from loop_method.models.base import Law, saturated
+from loop_method.models.base import Law, Samples, saturated
+from loop_method.models.choice import UNKNOWN, Accuracy, Scale, accuracy_of, limited, turns
 from loop_method.models.denoising import smoothed
-from loop_method.models.prediction import predicted
+from loop_method.models.linear import LinearModel
+from loop_method.models.low_rank import LowRankModel
+from loop_method.models.prediction import pieces as cut
+from loop_method.models.prediction import predicted, usable
 from loop_method.models.settings import DEFAULTS as MODEL_DEFAULTS
+from loop_method.models.spectral import SpectralModel
 from loop_method.models.undeclared_noise import fit_undeclared_noise
-from loop_method.reduce.reduced_model import Trajectory, pieces
+from loop_method.reduce.reduced_model import (
+    ReducedModel,
+    Steps,
+    Trajectory,
+    leading_modes,
+    pieces,
+)
+from loop_method.reduce.regression import fit
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
+
+EXACT = 1e-6
+"""E of a model that counts as exact."""
+FAR = 3.0
+"""Distance of the target from the mean state, relative to that of the farthest measured state, above
+which it is outside of the data."""
+LEAST = 1e-6
+"""Least unit of a number of the state, relative to the largest: what hardly moves has no say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +86,19 @@ class FieldLaw:
     rows : ModelRows or None
         Its law, with the linearised model on U; None if the model is not accurate enough.
     cost, other_cost : float
-        Mean stage costs that the model predicts from the initial fields of the trajectories, of its
-        law and of the law to compare with; infinite where there is none, or it diverges.
+        The worst mean stage costs that accepted models predict from the initial fields of the
+        trajectories, of its law and of the law to compare with; infinite where there is none, or it
+        diverges.
     noise : float
         Measurement noise that the model was fitted for where another one, or none, was declared; 0:
         what was declared. There is no law then, as the exploration was drawn for the declared noise,
         and is too weak for the effects of the actuators where that is less.
+    regression : Accuracy
+        Of the regression, to compare with `fitted.own`.
+    judges : tuple of str
+        The models that were accepted.
+    remark : str
+        Where the model is linearised, if the target is far outside of the data.
     """
 
     fitted: FittedModel | None
@@ -72,6 +106,9 @@ class FieldLaw:
     cost: float = np.inf
     other_cost: float = np.inf
     noise: float = 0.0
+    regression: Accuracy = UNKNOWN
+    judges: tuple[str, ...] = ()
+    remark: str = ""
 
     @property
     def better(self) -> bool:
@@ -85,7 +122,13 @@ class FieldLaw:
             "kind": fitted and fitted.model.kind,
             "error": fitted and fitted.error,
             "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
+            "own_error": fitted and _number(fitted.own.simulated),
+            "one_step_error": fitted and _number(fitted.own.one_step),
+            "regression_error": _number(self.regression.simulated),
+            "regression_one_step_error": _number(self.regression.one_step),
             "believed": self.rows is not None,
+            "judges": list(self.judges),
+            "linearised": self.remark,
             "noise": self.noise,
             "predicted_cost": _number(self.cost),
             "predicted_cost_of_regression": _number(self.other_cost),
@@ -100,8 +143,13 @@ class FieldLaw:
         lines = [
             f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} in "
             "predicting the data",
+            f"  relative to what the data do, on parts held out: {fitted.own.simulated:.2g}, "
+            f"regression {self.regression.simulated:.2g}; of single steps {fitted.own.one_step:.2g} "
+            f"and {self.regression.one_step:.2g}",
             f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
         ]
+        if self.remark:
+            lines.append(f"  {self.remark}")
         if self.noise:
             return [
                 *lines,
@@ -110,12 +158,15 @@ class FieldLaw:
                 "strongly as it requires",
             ]
         if self.rows is None:
-            return [*lines, "  it is not accurate enough: the law of the regression is used"]
+            exact = "regression" in self.judges
+            reason = "the regression is more accurate" if exact else "it is not accurate enough"
+            return [*lines, f"  {reason}: the law of the regression is used"]
         taken = "its law is used" if self.better else "the law of the regression is used"
         costs = (
             f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
         )
-        return [*lines, f"  predicted mean stage cost {costs}: {taken}"]
+        by = f" by {' and '.join(self.judges)}, the worse one," if len(self.judges) > 1 else ""
+        return [*lines, f"  predicted mean stage cost{by} {costs}: {taken}"]
 
 
 def _number(cost: float) -> float | None:
@@ -133,19 +184,33 @@ def best_model(
     settings: IdentificationSettings = DEFAULTS,
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
-) -> tuple[FittedModel | None, float]:
+) -> tuple[FittedModel | None, float, list[Measured]]:
     """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
 
     The noise is what the model was fitted for where another, or none, was declared; 0: as declared.
     Pieces, because the state of a chaotic plant soon becomes independent of its initial field. They are
     predicted even by models that take noise for the field, so noise that was not declared is
-    looked for before. The work grows with the third power of the size of the state, so there is a
-    largest one.
+    looked for before. A target far outside of the data makes every error small, so a model that does
+    not reproduce what the data do is chosen again by that. The work grows with the third power of the
+    size of the state, so there is a largest one. Last, what the model was chosen by.
     """
-    if len(target) > settings.field_largest:
-        return None, 0.0
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
-    whole = fit_field_model(rollouts, target, action_set=action_set, noise=noise, settings=models)
+    if len(target) > settings.field_largest:
+        return None, 0.0, rollouts
+    scale = variation(trajectories)
+
+    def fitted(data: Sequence[Measured], by_scale: bool = False) -> FittedModel | None:
+        return fit_field_model(
+            data,
+            target,
+            action_set=action_set,
+            noise=noise,
+            settings=models,
+            scale=scale,
+            by_scale=by_scale,
+        )
+
+    whole = fitted(rollouts)
     error = np.inf if whole is None else whole.error
     misjudged = fit_undeclared_noise(
         rollouts,
@@ -157,12 +222,47 @@ def best_model(
         action_set=action_set,
     )
     if misjudged is not None:
-        return misjudged
-    if error <= settings.field_error:
-        return whole, 0.0
-    parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
-    found = fit_field_model(parts, target, action_set=action_set, noise=noise, settings=models)
-    return (found if found is not None and found.error < error else whole), 0.0
+        return *misjudged, rollouts
+    data, best = rollouts, whole
+    if error > settings.field_error:
+        parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
+        found = fitted(parts)
+        if found is not None and found.error < error:
+            data, best, error = parts, found, found.error
+    if best is not None and error <= settings.field_error < best.own.simulated:
+        again = fitted(data, by_scale=True)
+        if again is not None and again.own.simulated < best.own.simulated:
+            best = again
+    return best, 0.0, data
+
+
+def regression_accuracy(
+    rollouts: Sequence[Measured],
+    n_s: int,
+    scale: Scale,
+    models: FieldModelSettings = MODEL_DEFAULTS,
+    noise: float = 0.0,
+) -> Accuracy:
+    """The accuracy of a regression of this order, on rollouts or pieces that it was not fitted to."""
+    if len(rollouts) == 1:
+        rollouts = cut(rollouts[0], models.folds)
+    parts = []
+    for others, own in turns(rollouts, models.folds):
+        samples = Samples.of(others)
+        try:
+            U, _ = leading_modes(samples.after, n_s)
+            model = _whole(fit(Steps(samples.before, samples.after, samples.actions), U))
+        except ValueError:  # fewer modes than that, or numbers that overflow
+            return UNKNOWN
+        own = usable(own)
+        parts.append((model, own, predicted(model, own)))
+    return accuracy_of(parts, scale, models.worst, noise)
+
+
+def _whole(model: ReducedModel | ModelRows) -> LowRankModel:
+    """A reduced model as one of the whole state: what is outside of U is lost in a step."""
+    parts = model.U, model.A, model.B, np.zeros(len(model.A))
+    return LowRankModel("regression", *(np.ascontiguousarray(part) for part in parts))
 
 
 def field_law(
@@ -187,7 +287,7 @@ def field_law(
     target : (n_z,) array
         z_r.
     other : ModelRows
-        The law to compare with.
+        The law to compare with, and its model.
     state_weight, action_weight : float
         q and r.
     cost : Cost, optional
@@ -197,32 +297,53 @@ def field_law(
     noise : float
         Standard deviation of the noise on every number of the states; 0: none.
     settings : IdentificationSettings
-        Those whose names begin with `field_`. Errors are relative to sum |z - z_r|^2.
+        Those whose names begin with `field_`. Errors are relative to the variation of the data.
     models : FieldModelSettings
         How models are fitted and one is chosen.
     """
-    fitted, found = best_model(trajectories, target, action_set, settings, noise, models)
-    if fitted is None or found or fitted.error > settings.field_error:
+    fitted, found, rollouts = best_model(trajectories, target, action_set, settings, noise, models)
+    if fitted is None or found:
         return FieldLaw(fitted, noise=found)
-    model, n_s = fitted.model, other.U.shape[1]
-    A, B = model.linearise(target, np.zeros(model.n_a))
-    drift = model.step(target[None], np.zeros((1, model.n_a)))[0] - target
+    n_s, scale = other.U.shape[1], variation(trajectories)
+    limits = [limited(rollout, action_set) for rollout in rollouts]
+    with one_thread():
+        regression = regression_accuracy(limits, n_s, scale, models, noise)
+    known = [(fitted.model, fitted.own), (_whole(other), regression)]
+    accepted = _accepted(known, settings.field_error, models.better)
+    report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
+    if fitted.error > settings.field_error:
+        return report
+    model = fitted.model
+    if not any(judge is model for judge in accepted):
+        return report
+    point, remark = linearisation_point(trajectories, target, fitted, models.reproduced)
+    A, B = model.linearise(point, np.zeros(model.n_a))
+    drift = model.step(point[None], np.zeros((1, model.n_a)))[0] - point
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
-        return FieldLaw(fitted)
+        return report
     horizon = max(len(actions) for _, actions in trajectories)
+    if cost is None and point is not target:
+        cost = Cost(
+            len(target),
+            model.n_a,
+            horizon,
+            state_weight=state_weight,
+            action_weight=action_weight,
+            target=target,
+        )
     try:
         if cost is None:
             K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
         else:
-            K, b = finite_horizon_of(A, B, drift, cost, target)
+            K, b = finite_horizon_of(A, B, drift, cost, point)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
-        return FieldLaw(fitted)
+        return report
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
-        return FieldLaw(fitted)
+        return report
     fields = [states[0] for states, _ in trajectories]
     if noise:
         fields = list(smoothed(np.stack(fields), noise))
-    best = saturated(affine_law(K, b - K @ target), action_set)
+    best = saturated(affine_law(K, b - K @ point), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
     U = _basis(
@@ -231,14 +352,14 @@ def field_law(
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)
-    constant = b - K @ target
+    constant = b - K @ point
     K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
 
-    def predicted_cost(rows: ModelRows) -> float:
+    def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_set)
         total = 0.0
-        for states in states_under(model, law, fields, horizon):
+        for states in states_under(judge, law, fields, horizon):
             if len(states) < horizon:
                 return np.inf
             actions = law(0, states[:horizon])
@@ -249,7 +370,61 @@ def field_law(
             total += action_weight * float(np.sum(actions**2))
         return total / (horizon * len(fields))
 
-    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other))
+    worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
+    return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)
+
+
+def variation(trajectories: Sequence[Trajectory]) -> Scale:
+    """The mean state, and the standard deviation of every number of the state."""
+    states = np.concatenate([states for states, _ in trajectories])
+    spread = states.std(axis=0)
+    units = np.maximum(spread, max(LEAST * float(spread.max()), 1e-300))
+    return Scale(states.mean(axis=0), units)
+
+
+def _accepted(
+    models: Sequence[tuple[FieldModel, Accuracy]], most: float, better: float
+) -> list[FieldModel]:
+    """The models whose errors are small, and not several times as large as those of another one.
+
+    Errors of less than a millionth of the variation are equal.
+    """
+    simulated, once = (
+        better * max(min(own[i] for _, own in models), level)
+        for i, level in enumerate((EXACT, np.sqrt(EXACT)))
+    )
+    return [
+        model
+        for model, own in models
+        if own.simulated <= min(most, simulated) and own.one_step <= once
+    ]
+
+
+def linearisation_point(
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    fitted: FittedModel,
+    exact: float,
+) -> tuple[Array, str]:
+    """Where a model is linearised, and what to say of a target that is far outside of the data.
+
+    At the target, or, if it is outside, at the measured state nearest to it. A linear model is the same
+    everywhere. What reproduces the data, or is an equation whose coefficients all points share, says
+    something of other states as well.
+    """
+    states = np.concatenate([states for states, _ in trajectories])
+    mean, units = variation(trajectories)
+    away = np.linalg.norm((states - mean) / units, axis=1)
+    far = float(np.linalg.norm((target - mean) / units) / max(away.max(), 1e-300))
+    if far <= FAR or isinstance(fitted.model, LinearModel | LowRankModel):
+        return target, ""
+    where = (
+        f"the target is {far:.3g} times as far from the mean state as any measured state: the model"
+    )
+    if fitted.own.simulated <= exact or isinstance(fitted.model, SpectralModel):
+        return target, f"{where} is linearised there, where nothing was measured"
+    nearest = int(np.argmin(np.linalg.norm((states - target) / units, axis=1)))
+    return states[nearest], f"{where} is linearised at the measured state nearest to it"
 
 
 def sum_of(cost: Cost, states: Array, actions: Array) -> float:

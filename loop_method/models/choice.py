@@ -10,8 +10,9 @@ best. It is then fitted to all rollouts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +22,40 @@ from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
 from loop_method.models.denoising import cleaned_states
 from loop_method.models.kinds import Kind, kinds_of
-from loop_method.models.prediction import errors, finite, pieces
+from loop_method.models.prediction import (
+    errors,
+    one_step,
+    pieces,
+    predicted,
+    usable,
+)
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 FEWEST_SAMPLES = 4
+
+
+class Scale(NamedTuple):
+    """What errors are relative to: the variation about a state, with its numbers in units of their own.
+
+    reference, units: (n_z,) each.
+    """
+
+    reference: Array
+    units: Array
+
+
+class Accuracy(NamedTuple):
+    """Errors on data that a model was not fitted to.
+
+    simulated: E from initial states, relative to sum |z - reference|^2; one_step: root of the sum of
+    squared errors of single steps, over that of squared changes.
+    """
+
+    simulated: float
+    one_step: float
+
+
+UNKNOWN = Accuracy(np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +69,14 @@ class FittedModel:
         E of its kind, the mean over rollouts that it was not fitted to.
     candidates : list of (kind, E)
         Those that were tried, in that order.
+    own : Accuracy
+        The same relative to what the data do, where a scale was given.
     """
 
     model: FieldModel
     error: float
     candidates: list[tuple[str, float]]
+    own: Accuracy = UNKNOWN
 
 
 def fit_field_model(
@@ -57,6 +91,8 @@ def fit_field_model(
     line: bool = True,
     shape: tuple[int, ...] = (),
     knows_noise: bool = False,
+    scale: Scale | None = None,
+    by_scale: bool = False,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -83,6 +119,10 @@ def fit_field_model(
         Points of each axis, where the states are fields on several; none: they are not.
     knows_noise : bool
         Try only the kinds that are fitted for noise.
+    scale : Scale, optional
+        Of the errors `own` of the result, always of rollouts or pieces that it was not fitted to.
+    by_scale : bool
+        Whether E is relative to this scale instead of the distance to the target.
     """
     rollouts = [limited(rollout, action_set) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
@@ -95,13 +135,16 @@ def fit_field_model(
         kinds = [kind for kind in kinds if kind.fit_noisy is not None]
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
+    own: dict[Kind, Accuracy] = {}
     with one_thread():  # a rounding must not depend on the machine's load
         for kind in kinds:
             least = min(judged.values(), default=np.inf)
             if not least > kind.needed:
                 continue
-            error = _error(kind, rollouts, target, settings, least, noise)
-            if error is not None:
+            found = _error(kind, rollouts, target, settings, least, noise, scale)
+            if found is not None:
+                error, own[kind] = found
+                error = own[kind].simulated if by_scale else error
                 judged[kind] = error
                 if error <= settings.reproduced:
                     break
@@ -112,8 +155,12 @@ def fit_field_model(
         for kind in sorted(good, key=lambda kind: kind.unknowns):
             model = _fitted(kind, rollouts, noise)
             if model is not None:
+                if scale and len(rollouts) == 1 and not kind.unknowns[0]:
+                    cut = pieces(rollouts[0], settings.folds)
+                    held = _error(kind, cut, target, settings, np.inf, noise, scale)
+                    own[kind] = held[1] if held else UNKNOWN
                 seen = [(kind.name, error) for kind, error in judged.items()]
-                return FittedModel(model, judged[kind], seen)
+                return FittedModel(model, judged[kind], seen, own[kind])
     return None
 
 
@@ -121,7 +168,7 @@ def with_clean(
     rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
 ) -> list[Measured]:
     """The rollouts with denoised states."""
-    rollouts = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
+    rollouts = usable(rollouts)
     clean = cleaned_states([r.states for r in rollouts], noise, components, line=line)
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
@@ -133,26 +180,57 @@ def _error(
     settings: FieldModelSettings,
     least: float,
     noise: float,
-) -> float | None:
-    """E of a kind, its mean over the rollouts; None where there is nothing to fit or to judge.
+    scale: Scale | None,
+) -> tuple[float, Accuracy] | None:
+    """E of a kind, its mean over the rollouts, and its accuracy on a scale if there is one.
+
+    None where there is nothing to fit or to judge.
 
     least: that of the best kind so far. One that is far from it after the first turn gets no other.
     """
     # Coefficients that all points share are hardly fitted to a single rollout's accidents.
     if len(rollouts) == 1 and kind.unknowns[0] > 0:
         rollouts = pieces(rollouts[0], settings.folds)
-    folds = min(len(rollouts), settings.folds)
     found: list[float] = []
-    for fold in range(folds):
-        others = [rollout for i, rollout in enumerate(rollouts) if i % folds != fold]
-        model = _fitted(kind, others or rollouts, noise)
-        own = rollouts[fold::folds]
+    parts: list[tuple[FieldModel, list[Measured], list[Array]]] = []
+    for others, own in turns(rollouts, settings.folds):
+        model = _fitted(kind, others, noise)
         if model is None:
             return None
-        found += errors(model, own, target, settings.worst, noise).tolist()
+        own = usable(own)
+        parts.append((model, own, predicted(model, own)))
+        found += errors(model, own, target, settings.worst, noise, None, parts[-1][2]).tolist()
         if found and np.mean(found) > settings.hopeless * max(least, settings.reproduced):
             break
-    return float(np.mean(found)) if found else None
+    if not found:
+        return None
+    known = UNKNOWN if scale is None else accuracy_of(parts, scale, settings.worst, noise)
+    return float(np.mean(found)), known
+
+
+def turns(
+    rollouts: Sequence[Measured], folds: int
+) -> Iterator[tuple[list[Measured], list[Measured]]]:
+    """Rollouts to fit to and others to judge by, so that each is judged once; a single one is both."""
+    folds = min(len(rollouts), folds)
+    for fold in range(folds):
+        others = [rollout for i, rollout in enumerate(rollouts) if i % folds != fold]
+        yield others or list(rollouts), list(rollouts[fold::folds])
+
+
+def accuracy_of(
+    parts: Sequence[tuple[FieldModel, Sequence[Measured], Sequence[Array]]],
+    scale: Scale,
+    worst: float,
+    noise: float = 0.0,
+) -> Accuracy:
+    """The accuracy of models, each with rollouts to judge it by and what it predicts of them."""
+    found, sums = list[float](), np.zeros(2)
+    for model, own, simulated in parts:
+        found += errors(model, own, scale.reference, worst, noise, scale.units, simulated).tolist()
+        sums += one_step(model, own, scale.units)
+    with np.errstate(all="ignore"):
+        return Accuracy(float(np.mean(found)), float(np.sqrt(sums[0] / sums[1])))
 
 
 def _fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:

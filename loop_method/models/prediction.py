@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.base import FieldModel, Law, Measured
+from loop_method.models.base import FieldModel, Law, Measured, Samples
 
 
 def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
@@ -45,26 +45,48 @@ def errors(
     target: Array,
     worst: float,
     noise: float = 0.0,
+    units: Array | None = None,
+    simulated: Sequence[Array] | None = None,
 ) -> Array:
     """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
+
+    Both sums are of the numbers of a state in `units` (n_z,), if there are any. simulated: what the
+    model predicts, if it is known.
 
     Of a rollout that ends in values that are not finite, those before count; one without two finite
     states is left out. The expected contribution of measurement noise is subtracted from both sums, as
     the model is not to blame for it.
     """
-    kept = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
+    kept = usable(rollouts)
+    simulated = predicted(model, kept) if simulated is None else simulated
     found = np.full(len(kept), float(worst))
-    for i, (rollout, states) in enumerate(zip(kept, predicted(model, kept), strict=True)):
+    own = 1.0 if units is None else units
+    variance = noise**2 * float(np.mean(1.0 / np.square(own)))
+    for i, (rollout, states) in enumerate(zip(kept, simulated, strict=True)):
         if len(states) == len(rollout.states):
             with np.errstate(all="ignore"):
-                error = float(np.sum((states - rollout.states) ** 2))
-                size = float(np.sum((rollout.states - target) ** 2))
+                error = float(np.sum(((states - rollout.states) / own) ** 2))
+                size = float(np.sum(((rollout.states - target) / own) ** 2))
                 if noise:
-                    share = noise**2 * states.size
+                    share = variance * states.size
                     error, size = max(error - share, 0.0), max(size - share, share)
                 relative = np.divide(error, size)
             found[i] = min(worst, float(np.nan_to_num(relative, nan=worst)))
     return found
+
+
+def one_step(model: FieldModel, rollouts: Sequence[Measured], units: Array) -> Array:
+    """Sums of squares of the errors of single steps, and of the changes in a step, (2,)."""
+    samples = Samples.of(rollouts)
+    with np.errstate(all="ignore"):
+        missed = samples.after - model.step(samples.before, samples.actions)
+        parts = [np.sum((part / units) ** 2) for part in (missed, samples.after - samples.before)]
+    return np.nan_to_num(np.array(parts), nan=np.inf)
+
+
+def usable(rollouts: Sequence[Measured]) -> list[Measured]:
+    """The rollouts up to their first value that is not finite, without those of no step."""
+    return [short for rollout in rollouts if len((short := finite(rollout)).actions)]
 
 
 def finite(rollout: Measured) -> Measured:

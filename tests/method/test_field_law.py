@@ -10,12 +10,17 @@ import pytest
 
 from controller_node.identification import DesignSettings, design, design_each, designed
 from loop_interfaces.action_set import ActionSet
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows, unpack
-from loop_method.design.field_law import FieldLaw, field_law, states_under
+from loop_method.design import lqt
+from loop_method.design.field_law import FieldLaw, field_law, linearisation_point, states_under
 from loop_method.design.finite_horizon import finite_horizon
 from loop_method.design.lqt import DesignError
 from loop_method.models import affine_law
+from loop_method.models.choice import Accuracy, FittedModel
+from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
 from loop_method.models.spectral import SpectralModel
+from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.reduce.settings import IdentificationSettings
 from tests.support.small import FEW_FITS
 
@@ -199,3 +204,87 @@ def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
     assert ("its law is used" in told) is found.better is (known["law"] == "field")
     nothing = FieldLaw(None)
     assert "regression" in nothing.text()[0] and nothing.summary()["predicted_cost"] is None
+
+
+ROD = np.array([[0.9, 0.05, 0, 0], [0.05, 0.85, 0.05, 0], [0, 0.05, 0.85, 0.05], [0, 0, 0.05, 0.9]])
+HEATERS = np.array([[0.1, 0], [0.02, 0], [0, 0.03], [0, 0.12]])
+FAR = np.array([8.0, 5.0, 5.0, 8.0])
+
+
+def rod_log(seed: int, units: float | Array = 1.0) -> list[tuple[Array, Array]]:
+    """Two logs without noise of a rod with two heaters, and its states in these units."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(2):
+        states, actions = [rng.standard_normal(4)], 3.0 * rng.standard_normal((120, 2))
+        for a in actions:
+            states.append(ROD @ states[-1] + HEATERS @ a)
+        found.append((np.array(states) * units, actions))
+    return found
+
+
+def rod_cost(rows: ModelRows) -> float:
+    z, total = np.zeros(4), 0.0
+    for _ in range(120):
+        a = rows.K_a @ rows.U.T @ z + rows.K_b @ rows.s_r
+        total += np.sum((z - FAR) ** 2) + 0.001 * np.sum(a**2)
+        z = ROD @ z + HEATERS @ a
+    return float(total)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_model_that_is_exact_wins_however_far_the_target_is(seed: int) -> None:
+    """Relative to a far target every model has a small error, also one that is no better than none."""
+    best = lqt.track(ReducedModel(ROD, HEATERS, np.eye(4)), state_weight=1.0, action_weight=0.001)
+    exact = ModelRows(ROD, HEATERS, np.eye(4), best.K_a, best.K_b, FAR)
+    how = DesignSettings(2, 4, 1.0, 0.001, identification="field")
+    found = designed(rod_log(seed), FAR, how)
+    assert rod_cost(found.rows) < 1.02 * rod_cost(exact)
+    assert found.field is not None and found.field.regression.simulated < 1e-20
+    assert "the regression is more accurate" in found.field.text()[-1] or found.field.better
+
+
+def test_the_units_of_the_states_change_nothing() -> None:
+    """What is a hundredth of another unit is weighted ten thousand times, and the law is the same."""
+    units = np.array([1.0, 0.1, 500.0, 10.0])
+    weights = Cost(4, 2, 120, state_weight=units**-2, action_weight=0.001, target=FAR * units)
+    laws = []
+    for scale, texts in ((np.ones(4), []), (units, weights.texts)):
+        how = DesignSettings(2, 4, 1.0, 0.001, identification="field", cost=texts)
+        rows = designed(rod_log(1, scale), FAR * scale, how).rows
+        laws.append(np.column_stack([rows.K_a @ rows.U.T * scale, rows.K_b @ rows.s_r]))
+    np.testing.assert_allclose(laws[1], laws[0], rtol=1e-5, atol=1e-6)
+
+
+def test_every_accepted_model_judges_every_law() -> None:
+    """With noise both models are as good, and the law is not worse than the other by either."""
+    rng = np.random.default_rng(5)
+    log = [(z + 0.01 * rng.standard_normal(z.shape), a) for z, a in rod_log(3)]
+    how = DesignSettings(2, 4, 1.0, 0.001, identification="field")
+    other = designed(log, FAR, replace(how, identification="regression")).rows
+    found = field_law(log, FAR, other, state_weight=1.0, action_weight=0.001)
+    assert found.fitted is not None and found.rows is not None
+    assert found.judges == (found.fitted.model.kind, "regression")
+    assert np.isfinite([found.cost, found.other_cost]).all()
+    assert rod_cost(designed(log, FAR, how).rows) < 1.1 * rod_cost(other)
+
+
+@pytest.mark.parametrize(
+    ("error", "distance", "there"),
+    [(0.01, 1.0, True), (0.01, 40.0, False), (1e-4, 40.0, True)],
+)
+def test_where_nothing_was_measured_only_an_exact_model_is_linearised(
+    error: float, distance: float, there: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    states, actions = rng.uniform(-1.0, 1.0, (50, 6)), rng.standard_normal((49, 1))
+    features = features_of(1, 3, 1)
+    model = FiniteDifferenceModel(
+        "x", features, np.zeros((len(features), 1, 6)), np.zeros((6, 1)), np.zeros(6), 1
+    )
+    target = np.full(6, distance)
+    point, told = linearisation_point(
+        [(states, actions)], target, FittedModel(model, 0.0, [], Accuracy(error, 0.1)), 2e-3
+    )
+    nearest = states[np.argmin(np.linalg.norm((states - target) / states.std(axis=0), axis=1))]
+    assert np.array_equal(point, target if there else nearest)
+    assert ("measured" in told) is (distance > 3.0)
