@@ -112,6 +112,7 @@ def identify(
     p: int = 0,
     channels: Channels = NUMBERED,
     settings: IdentificationSettings = DEFAULTS,
+    constant: bool | None = None,
 ) -> ReducedModel:
     """The reduced model of one plant.
 
@@ -129,6 +130,8 @@ def identify(
         Names of states and inputs in error messages.
     settings : IdentificationSettings
         How an order is suggested.
+    constant : bool, optional
+        Whether the regression has a constant term; None: if it predicts held-out data better.
 
     Raises
     ------
@@ -144,7 +147,9 @@ def identify(
         raise ValueError(f"p is the rank of 'dmdc', but method is {method!r}; leave it out")
     n_s = n_s or study_orders(trajectories, channels=channels, settings=settings).suggested
     if method == "regression":
-        return regression.exact_regression(trajectories, n_s=n_s, channels=channels)
+        return regression.exact_regression(
+            trajectories, n_s=n_s, channels=channels, constant=constant
+        )
     n_a = np.shape(trajectories[0][1])[-1]
     return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s, channels=channels)
 
@@ -205,6 +210,7 @@ def designed(
     further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
     *,
     or_no_control: bool = False,
+    constant: bool = False,
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -223,6 +229,8 @@ def designed(
         are those of none.
     or_no_control : bool
         Gains of 0 where there are no stabilising ones.
+    constant : bool
+        Whether a model with a filter may have a constant term, which its rows do not carry.
 
     Raises
     ------
@@ -244,7 +252,11 @@ def designed(
             )
         every = [*trajectories, *further]
         found_model = subspace_model(
-            every, order=settings.reduced_order, channels=channels, settings=settings.method
+            every,
+            order=settings.reduced_order,
+            channels=channels,
+            settings=settings.method,
+            constant=constant and regression.needs_constant(every, target.size),
         )
         return Designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control)
@@ -261,6 +273,7 @@ def designed(
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
         settings=settings.method,
+        constant=False if filtered and not constant else None,
     )
     if settings.action_set.zero_mean:
         model = replace(model, B=model.B @ free.T)
@@ -274,7 +287,10 @@ def designed(
         unsolved, K_a = error, np.zeros(model.B.T.shape)
         K_b = K_a
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
-    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=K_a, K_b=K_b, s_r=s_r)
+    d = model.d if model.d.any() else None
+    if d is not None and unsolved is None and (size := float(s_r @ s_r)):
+        K_b = K_b + np.outer(gains.b, s_r) / size
+    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
     if settings.identification != "field":
         return Designed(
             lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows
@@ -296,6 +312,8 @@ def designed(
         if not (found.better or or_no_control):
             raise unsolved
     chosen = found.rows if found.better and found.rows else rows
+    if filtered and not constant:
+        chosen = replace(chosen, d=None)
     return Designed(
         lqg.with_filter(chosen, trajectories, settings=settings.method) if filtered else chosen,
         found,

@@ -28,6 +28,8 @@ class ModelRows:
 
     A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a and K_b (n_a, n_s), s_r (n_s,). L (n_s, n_s): the
     estimate after a measurement is p + L (U^T z - p), with p the prediction; None: no filter.
+    d (n_s,): the constant term of s_{k+1} = A s_k + B a_k + d; None: 0. The rows do not have it, but
+    K_b knows of it.
     """
 
     A: Array
@@ -37,6 +39,7 @@ class ModelRows:
     K_b: Array
     s_r: Array
     L: Array | None = None
+    d: Array | None = None
 
     @property
     def arrays(self) -> dict[str, Array]:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from loop_method.design.field_law import FieldLaw
     from pdeloop.bags.episodes import RecordedEpisode
 
+FAR = 0.5
+"""Share of the distance to the target left in the end from which there is a warning."""
 Trajectories = Sequence[tuple[Array, Array]]
 Source = Mapping[str, int | str]
 """The name of the trajectory."""
@@ -71,7 +73,20 @@ class Identified:
     @property
     def warnings(self) -> list[str]:
         """Warnings to read before the model is used."""
-        return [*self.remarks, *self.determined.remarks]
+        found = [*self.remarks, *self.determined.remarks]
+        loop, d = self.closed_loop, self.model.d
+        if loop is not None and loop.left > FAR:
+            found.append(
+                f"on the model the law ends with {100 * loop.left:.3g} % of the distance to the target "
+                "left: the actuators hardly reach it, or the model is wrong; take a target that they "
+                "reach, a lower action_weight, or a log that comes nearer to the target"
+            )
+        if isinstance(self.model, ModelRows) and d is not None and not self.model.s_r.any():
+            found.append(
+                "the model has a constant term, but with a target of 0 the law a = K_a s + K_b s_r has "
+                "none: give the states relative to another point"
+            )
+        return found
 
     def summary(self) -> dict[str, Any]:
         """The result as data, without the arrays, which `save` writes."""
@@ -88,6 +103,7 @@ class Identified:
             "sample_time": self.sample_time,
             "trajectories": list(self.sources),
             "poles": [[pole.real, pole.imag] for pole in poles],
+            "constant": [] if self.model.d is None else self.model.d.tolist(),
             "spectral_radius": float(np.abs(poles).max()),
             "rank": determined.rank,
             "unknowns": determined.unknowns,
@@ -118,6 +134,10 @@ class Identified:
         if self.sample_time is not None:
             rates = np.log(np.abs(np.linalg.eigvals(self.model.A))) / self.sample_time
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
+        if self.model.d is not None and self.model.d.any():
+            lines.append(
+                "  constant term d: the data are not deviations from rest, and the law knows of it"
+            )
         own = self.determined.independence
         lines.append(
             f"  rank {known['rank']} of {known['unknowns']}, smallest singular value "
@@ -147,7 +167,8 @@ class Identified:
         assert isinstance(self.model, ModelRows)
         law = "a = K_a U^T z + K_b s_r"
         if self.model.L is not None:
-            law = "a = K_a x + K_b s_r, x = p + L (U^T z - p), and then p = A x + B a"
+            drift = "" if self.model.d is None else " + d"
+            law = f"a = K_a x + K_b s_r, x = p + L (U^T z - p), and then p = A x + B a{drift}"
             names += "; p = U^T z at first"
         return [
             *loop.text(self.sample_time),
@@ -239,7 +260,9 @@ def _identified(
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
     known = {**recorded, **given}
-    of_past = known.get("identification") == "subspace" and target is not None
+    of_past = known.get("identification") == "subspace"
+    if of_past and "law" not in known:
+        known["law"] = "observer"  # it has a filter
     if given.get("reduced_order", 0) > n_z and not of_past:
         raise ParameterError(
             f"expected an order of at most {n_z}, the numbers of a state, got {given['reduced_order']}"
@@ -278,14 +301,22 @@ def _identified(
             f"--rank applies to the identification dmdc, but this one is {method}: add "
             "--identification dmdc, or leave --rank out"
         )
-    if target is None and method in ("field", "subspace") and "identification" in given:
+    if target is None and method == "field" and "identification" in given:
         raise ParameterError(
             f"--identification {method} designs a law for a target: give --target as well"
         )
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
-    if target is not None:
-        found = designed(trajectories, target, settings, channels)
+    if target is not None or of_past:
+        rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
+        found = designed(
+            trajectories,
+            rest if target is None else target,
+            settings,
+            channels,
+            or_no_control=target is None,
+            constant=True,
+        )
         model, field = found.rows, found.field
     else:
         truncated = method == "dmdc"
@@ -320,9 +351,14 @@ def save(found: Identified, path: Path) -> None:
     """
     model = found.model
     arrays: dict[str, Any] = {"A": model.A, "B": model.B, "U": model.U}
-    if isinstance(model, ModelRows):
+    if model.d is not None and model.d.any():
+        arrays["d"] = model.d
+    if isinstance(model, ModelRows) and found.target is None:
+        arrays["L"] = model.L
+    elif isinstance(model, ModelRows):
         arrays |= model.arrays
-        arrays["model"] = pack(model)[np.newaxis]
+        if model.L is None or model.d is None:  # the rows have no d, which a filter needs
+            arrays["model"] = pack(model)[np.newaxis]
     if found.sample_time is not None:
         arrays["sample_time"] = np.array(found.sample_time)
     for name in ("states", "inputs"):

@@ -74,7 +74,7 @@ def predicted(model: ReducedModel | ModelRows, states: Array, actions: Array) ->
     reduced = [s]
     with np.errstate(over="ignore", invalid="ignore"):
         for a in actions:
-            s = model.A @ s + model.B @ a
+            s = model.A @ s + model.B @ a + (0.0 if model.d is None else model.d)
             reduced.append(s)
     seen = model.measurement if isinstance(model, ModelRows) else model.U
     return np.asarray(np.array(reduced) @ seen.T)

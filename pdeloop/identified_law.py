@@ -73,7 +73,7 @@ class ClosedLoop:
 
 
 def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:
-    """Simulate s_{k+1} = A s_k + B a_k under a_k = K_a s_k + K_b s_r, from s_0 = U^T z_0.
+    """Simulate s_{k+1} = A s_k + B a_k + d under a_k = K_a s_k + K_b s_r, from s_0 = U^T z_0.
 
     states (N + 1, n_z) and actions (N, n_a): the recorded trajectory whose first state it begins with.
     It runs for its length, or longer, until the slowest mode has decayed.
@@ -85,7 +85,7 @@ def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) ->
     reduced, applied = [s], list[Array]()
     for _ in range(steps):
         a = law.K_a @ s + forced
-        after = law.A @ s + law.B @ a
+        after = law.A @ s + law.B @ a + (0.0 if law.d is None else law.d)
         if applied and not np.abs(after).max() < _OVERFLOW:
             break
         s = after

@@ -242,6 +242,7 @@ def regression_accuracy(
     scale: Scale,
     models: FieldModelSettings = MODEL_DEFAULTS,
     noise: float = 0.0,
+    constant: bool = False,
 ) -> Accuracy:
     """The accuracy of a regression of this order, on rollouts or pieces that it was not fitted to."""
     if len(rollouts) == 1:
@@ -251,7 +252,8 @@ def regression_accuracy(
         samples = Samples.of(others)
         try:
             U, _ = leading_modes(samples.after, n_s)
-            model = _whole(fit(Steps(samples.before, samples.after, samples.actions), U))
+            data = Steps(samples.before, samples.after, samples.actions)
+            model = _whole(fit(data, U, constant))
         except ValueError:  # fewer modes than that, or numbers that overflow
             return UNKNOWN
         own = usable(own)
@@ -261,7 +263,7 @@ def regression_accuracy(
 
 def _whole(model: ReducedModel | ModelRows) -> LowRankModel:
     """A reduced model as one of the whole state: what is outside of U is lost in a step."""
-    parts = model.U, model.A, model.B, np.zeros(len(model.A))
+    parts = model.U, model.A, model.B, np.zeros(len(model.A)) if model.d is None else model.d
     return LowRankModel("regression", *(np.ascontiguousarray(part) for part in parts))
 
 
@@ -307,7 +309,9 @@ def field_law(
     n_s, scale = other.U.shape[1], variation(trajectories)
     limits = [limited(rollout, action_set) for rollout in rollouts]
     with one_thread():
-        regression = regression_accuracy(limits, n_s, scale, models, noise)
+        regression = regression_accuracy(
+            limits, n_s, scale, models, noise, constant=other.d is not None
+        )
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
     accepted = _accepted(known, settings.field_error, models.better)
     report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
@@ -354,7 +358,8 @@ def field_law(
     size = float(s_r @ s_r)
     constant = b - K @ point
     K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
-    rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
+    d = U.T @ (point + drift - A @ point)
+    rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_set)

@@ -211,6 +211,8 @@ def with_filter(
 def _residuals(model: ModelRows, steps: Steps) -> Array:
     s, after = steps.before @ model.U, steps.after @ model.U
     residuals: Array = after - s @ model.A.T - steps.inputs @ model.B.T
+    if model.d is not None:
+        residuals -= model.d
     return residuals
 
 
@@ -268,7 +270,7 @@ def law_of_innovations(
         require_detectable(A, C)
         seen = model.U @ C
         try:
-            gains = track_outputs(A, B, seen, cost)
+            gains = track_outputs(A, B, seen, cost, 0.0 if model.d is None else model.d)
             K_a, b = gains.K_a, gains.K_b @ (seen.T @ cost.field_target)
         except DesignError:
             if not or_no_control:
@@ -280,4 +282,4 @@ def law_of_innovations(
         s_r = U.T @ target
         size = float(s_r @ s_r)
         K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
-    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C)
+    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d)

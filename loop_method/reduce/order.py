@@ -39,10 +39,12 @@ from loop_method.reduce.reduced_model import (
     repeated,
     steps_of,
 )
-from loop_method.reduce.regression import fit
+from loop_method.reduce.regression import fit, needs_constant
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
+MOST = 8
+"""The highest order by which it is decided whether models have a constant term."""
 ROUNDING = 1e-9
 """Smaller errors are equal."""
 
@@ -170,6 +172,7 @@ def study_orders(
         singular_values: Array = linalg.svdvals(everything.after)
         if len(everything.inputs) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
+        constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
         for fitted, held in _folds(known, settings):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
@@ -177,7 +180,7 @@ def study_orders(
             if most < 1:  # an input that moved in the held-out steps only, for one
                 continue
             tried = [n for n in tried if n <= most]
-            models = [fit(data, modes[:, :n]) for n in tried]
+            models = [fit(data, modes[:, :n], constant) for n in tried]
             errors.append([_summed(_errors(model, *piece) for piece in held) for model in models])
             scales += _summed(_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held)
     if not (tried and errors):
@@ -219,7 +222,7 @@ def _folds(
 def _errors(model: ReducedModel, states: Array, actions: Array) -> Array:
     """Sums of squared errors on one piece: of one step, and rolled out."""
     A, B, U = model.A, model.B, model.U
-    inputs = actions @ B.T
+    inputs = actions @ B.T + model.d
     rolled = np.empty((len(states), model.n_s))
     rolled[0] = states[0] @ U
     with np.errstate(over="ignore", invalid="ignore"):

@@ -31,7 +31,7 @@ methods: an overview", IET Control Theory & Applications 7(10), 2013.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -79,6 +79,8 @@ class InnovationModel:
     error : float
         Of predicting held-out measurements one step ahead, relative to their changes in a step; NaN
         where past and order were given.
+    d : (n,) array or None
+        The constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data.
     """
 
     A: Array
@@ -89,6 +91,7 @@ class InnovationModel:
     innovations: Array
     past: int
     error: float = np.nan
+    d: Array | None = None
 
 
 def subspace_model(
@@ -98,6 +101,7 @@ def subspace_model(
     past: int = 0,
     channels: Channels = NUMBERED,
     settings: IdentificationSettings = DEFAULTS,
+    constant: bool = False,
 ) -> InnovationModel:
     """Identify a model in innovation form.
 
@@ -113,6 +117,9 @@ def subspace_model(
         Names of states and inputs in error messages.
     settings : IdentificationSettings
         `subspace_tolerance`.
+    constant : bool
+        Identify the model about the means of measurements and inputs, from which its constant term
+        follows: degrees and per cent of a machine at rest are then no mode that never decays.
 
     Raises
     ------
@@ -126,6 +133,10 @@ def subspace_model(
         for number, (z, a) in enumerate(trajectories)
         if number not in copies
     ]
+    means = np.zeros(data.after.shape[1]), np.zeros(data.inputs.shape[1])
+    if constant:
+        means = data.after.mean(axis=0), data.inputs.mean(axis=0)
+        known = [(z - means[0], a - means[1]) for z, a in known]
     with one_thread():
         few = 0 < order <= MANY
         pasts = (past,) if past else PASTS if few else PASTS + LONGER
@@ -146,7 +157,12 @@ def subspace_model(
             error = np.nan
         else:
             p, n, error = _choose(tried, known, settings.subspace_tolerance)
-        return _fitted(known, p, n, channels, error)
+        found = _fitted(known, p, n, channels, error, constant=constant)
+        if found.d is None:
+            return found
+        # The state of the mean measurement is the least one.
+        x = linalg.pinv(found.C) @ (found.U.T @ means[0])
+        return replace(found, d=found.d + x - found.A @ x - found.B @ means[1])
 
 
 def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
@@ -287,6 +303,7 @@ def _fitted(
     error: float,
     *,
     check: bool = True,
+    constant: bool = False,
     predictor: _Predictor | None = None,
 ) -> InnovationModel:
     """The model of given sizes. Call it with one LAPACK thread.
@@ -300,13 +317,18 @@ def _fitted(
         raise ValueError(f"{len(y)} samples do not determine {n} states")
     states, r = predictor.states(n), y.shape[1]
     kept = states.shape[1]
-    C, e = _regressed(states, y)
+    # What begins or ends away from the mean drifts on average, so the means are not enough.
+    one = np.ones((len(y), int(constant)))
+    C, e = _regressed(np.hstack([states, one]), y)
     before, next_ = states[~last], states[1:][~last[:-1]]
     inputs = predictor.inputs
     if check:
         examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
-    joint, w = _regressed(np.hstack([before, inputs]), next_)
-    A, B = joint[:, :kept], joint[:, kept:]
+    joint, w = _regressed(np.hstack([before, inputs, one[: len(next_)]]), next_)
+    A, B, d = joint[:, :kept], joint[:, kept : kept + inputs.shape[1]], None
+    if constant:
+        C, shift = C[:, :kept], linalg.pinv(C[:, :kept]) @ C[:, kept]
+        d = joint[:, -1] + shift - A @ shift
     e = e[~last]
     count = len(e)
     V, W, S = e.T @ e / count, w.T @ w / count, w.T @ e / count
@@ -322,7 +344,7 @@ def _fitted(
         ) from failed
     innovations = C @ P @ C.T + V
     G = linalg.solve(innovations, (A @ P @ C.T + S).T, assume_a="pos").T
-    return InnovationModel(A, B, C, G, predictor.U, innovations, p, error)
+    return InnovationModel(A, B, C, G, predictor.U, innovations, p, error, d)
 
 
 def _ridge(X: Array, y: Array) -> Array:

@@ -107,7 +107,7 @@ def add(commands: Commands) -> None:
         choices=IDENTIFICATION.choices,
         help="field: a model of the whole field where its law is better; regression: least squares "
         "in reduced coordinates; subspace: a model with its filter, from measurements alone; dmdc: "
-        "truncated DMDc [the run's, or regression]",
+        "truncated DMDc [the run's, or field]",
     )
     add_own_code(identify, ("law",))
     add("--rank", type=int, metavar="P", help="rank p of --identification dmdc [the run's]")

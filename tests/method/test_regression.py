@@ -86,6 +86,29 @@ def test_same_bits_whatever_the_threads() -> None:
         assert np.array_equal(getattr(one, name), getattr(four, name))
 
 
+@pytest.mark.parametrize("offset", [0.0, 20.0, 293.15])
+def test_data_about_an_operating_point_give_the_model_of_the_deviations(offset: float) -> None:
+    """Degrees and kelvin, with heaters at half power: x+ = A x + B a + d with d = (I - A) c - B a_c."""
+    A, B = linear_system(N_S)
+    states, actions = trajectory(A, B, steps=STEPS)
+    power = 0.0 if not offset else 50.0
+    c = np.full(N_S, offset)
+    model = exact_regression([(states + c, actions + power)], n_s=N_S)
+    U = model.U
+    np.testing.assert_allclose(U @ model.A @ U.T, A, atol=1e-8)
+    np.testing.assert_allclose(U @ model.B, B, atol=1e-8)
+    d = c - A @ c - B @ np.full(B.shape[1], power)
+    np.testing.assert_allclose(U @ model.d, d, atol=1e-6)
+    assert bool(model.d.any()) is bool(offset)
+
+
+def test_white_noise_needs_no_constant_term() -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    noisy = states + 0.05 * np.random.default_rng(2).standard_normal(states.shape)
+    found = [exact_regression([(noisy, actions)], n_s=N_S, constant=c) for c in (None, False)]
+    assert np.array_equal(found[0].A, found[1].A) and not found[0].d.any()
+
+
 def test_refuses_what_it_cannot_identify() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="needs at least 6 steps, but there are 5"):

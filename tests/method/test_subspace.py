@@ -136,3 +136,22 @@ def test_data_that_do_not_determine_it_are_refused_by_name() -> None:
     )
     with pytest.raises(DesignError, match=r"do not observe a mode that grows by the factor 1\.1"):
         law_of_innovations(blind, np.zeros(1), state_weight=Q, action_weight=R)
+
+
+def test_a_stable_machine_at_ambient_temperature_is_stable() -> None:
+    """Five states, three thermocouples at 20 to 22 degC, two heaters that are on half of the time."""
+    rng = np.random.default_rng(5)
+    A = np.diag([0.97, 0.93, 0.85, 0.6, 0.3])
+    A[0, 1], A[1, 2] = 0.1, 0.08
+    B, C = 0.3 * rng.standard_normal((5, 2)), rng.standard_normal((3, 5))
+    u, x, y = np.repeat(rng.uniform(0.0, 5.0, (120, 2)), 5, 0), np.zeros(5), np.empty((600, 3))
+    for k in range(600):
+        y[k] = C @ x + 0.005 * rng.standard_normal(3) + [20.0, 21.0, 22.0]
+        x = A @ x + B @ u[k] + 0.001 * rng.standard_normal(5)
+    model = subspace_model([(y, u[:-1])], order=5, constant=True)
+    poles = np.sort(np.abs(np.linalg.eigvals(model.A)))[::-1]
+    np.testing.assert_allclose(poles[:3], [0.97, 0.93, 0.85], atol=0.02)
+    assert model.d is not None
+    # At rest, with the heaters off, it predicts the ambient temperature.
+    rest = model.U @ model.C @ np.linalg.solve(np.eye(len(A)) - model.A, model.d)
+    np.testing.assert_allclose(rest, [20.0, 21.0, 22.0], atol=0.2)

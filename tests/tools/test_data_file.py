@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pdeloop
 from loop_interfaces.model_rows import unpack
 from loop_method.laws import Observer
 from loop_method.laws.calls import along
@@ -150,9 +151,9 @@ def test_a_law_with_a_filter_is_identified_and_applied_as_it_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, words = tmp_path / "model.npz", ["identify", "--data", str(EXAMPLE)]
-    assert main([*words, "--identification", "subspace"]) == FAILED
+    assert main([*words, "--identification", "subspace", "--law", "affine"]) == FAILED
     assert "designs a filter, which the law 'affine' does not use" in capsys.readouterr().err
-    filtered = ["--law", "observer", "--identification", "subspace", "--out", str(out)]
+    filtered = ["--identification", "subspace", "--out", str(out)]
     assert main([*words, *filtered]) == 0
     assert "x = p + L (U^T z - p), and then p = A x + B a" in capsys.readouterr().out
     rows = read_model(out, 2, Observer)
@@ -224,3 +225,34 @@ def test_a_bag_whose_inputs_always_moved_together_is_refused(
     monkeypatch.setattr(RecordedEpisode, "trajectory", coupled)
     assert main(["identify", "--bag", str(BAG)]) == FAILED
     assert "a1 and a3 always moved together (a3 = -3 a1)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("target", [[], ["--target", "25,26,27"]])
+def test_a_log_in_degrees_gives_the_model_of_the_machine(
+    tmp_path: Path, target: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two heaters of up to 5 kW, three thermocouples at 20 to 22 degC, no noise."""
+    rng = np.random.default_rng(3)
+    A, B, rest = (
+        np.diag([0.9, 0.8, 0.5]),
+        rng.uniform(0.1, 1.0, (3, 2)),
+        np.array([20.0, 21.0, 22.0]),
+    )
+    u, x = rng.uniform(0.0, 5.0, (200, 2)), [np.zeros(3)]
+    for own in u[:-1]:
+        x.append(A @ x[-1] + B @ own)
+    rows = np.column_stack([np.arange(200.0), np.array(x) + rest, u])
+    log, out = tmp_path / "log.csv", tmp_path / "model.npz"
+    np.savetxt(log, rows, delimiter=",", header="t,z1,z2,z3,a1,a2", comments="")
+    how = ["--identification", "regression", "--order", "3", "--out", str(out)]
+    assert main(["identify", "--data", str(log), *how, *target]) == 0
+    model = pdeloop.ReducedModel.load(out)
+    np.testing.assert_allclose(np.sort(model.poles.real), [0.5, 0.8, 0.9], atol=1e-9)
+    settled = model.U @ np.linalg.solve(np.eye(3) - model.A, model.d)
+    np.testing.assert_allclose(settled, rest, rtol=1e-9)
+    assert "constant term d" in capsys.readouterr().out
+    if target:  # the law ends where that of the deviations does
+        gains = np.load(out)
+        b = gains["K_b"] @ gains["s_r"] + gains["K_a"] @ model.U.T @ rest
+        own = pdeloop.track(pdeloop.ReducedModel(A, B), state_weight=1.0, action_weight=1.0)
+        np.testing.assert_allclose(b, own.K_b @ (np.array([25.0, 26.0, 27.0]) - rest), rtol=1e-6)
