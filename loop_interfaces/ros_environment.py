@@ -38,6 +38,11 @@ _NEUTRAL = {
     "FASTDDS_BUILTIN_TRANSPORTS": "",
 }
 """Variables that steer discovery and transport, with their neutral values."""
+STEERING = (*_NEUTRAL, "ROS_DISCOVERY_SERVER", PROFILE, "RMW_IMPLEMENTATION")
+"""Variables on which it depends which nodes find each other."""
+_SERVER = re.compile(r"(?:UDPv[46]:)?\[?(?P<host>[^\[\]]*?)\]?(?::(?P<port>\d+))?")
+_SERVER_PORT = 11811
+"""Of a discovery server whose address names none."""
 _QUIET = {"SKIP_DEFAULT_XML_FILE": "1"}
 """Fast DDS would read a profile that lies in the working directory."""
 _BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
@@ -102,6 +107,48 @@ def prepared(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]
     if found.get(_BOOTSTRAPPED) and str(Path(sys.prefix) / "lib") not in libraries:
         del found[_BOOTSTRAPPED]  # of another shell: the wheels have to find their libraries again
     return found, remarks
+
+
+def with_servers_there(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """The environment without discovery servers of this machine where nothing listens, and a remark.
+
+    Nodes wait for a server for ever, and those of one command find each other without one.
+    """
+    named = environment.get("ROS_DISCOVERY_SERVER", "")
+    if not named or not _all_loopback(named):
+        return dict(environment), []
+    ports = {
+        int(match["port"] or _SERVER_PORT)
+        for server in filter(None, named.split(";"))
+        if (match := _SERVER.fullmatch(server))
+    }
+    if ports & _open_ports():
+        return dict(environment), []
+    found = {name: value for name, value in environment.items() if name != "ROS_DISCOVERY_SERVER"}
+    return found, [f"ROS_DISCOVERY_SERVER={named} is ignored: no server runs there"]
+
+
+def _open_ports() -> set[int]:
+    """Ports of this machine's UDP sockets."""
+    found = set()
+    for table in ("udp", "udp6"):
+        try:
+            lines = Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+        except OSError:
+            continue
+        found |= {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
+    return found
+
+
+def steering(environment: Mapping[str, str]) -> str:
+    """The variables that are set and may keep nodes from finding each other, for a sentence."""
+    usual = ("", MIDDLEWARE, str(loopback_profile()))
+    names = [
+        name
+        for name in STEERING
+        if environment.get(name, "") not in (*usual, _NEUTRAL.get(name, ""))
+    ]
+    return ", ".join(f"{name}={environment[name]}" for name in names)
 
 
 def with_log_folder(environment: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:

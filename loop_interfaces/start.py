@@ -12,6 +12,8 @@ import signal
 import sys
 from collections.abc import Callable
 from functools import partial
+from io import TextIOWrapper
+from pathlib import Path
 from typing import Any
 
 from loop_interfaces.module_path import leave_out_working_directory
@@ -29,6 +31,8 @@ PARENT = "PDELOOP_PARENT"
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 """The environment variable with their number. Results are those of one (`one_thread`): the others would
 begin with each process, and spin for work that does not come."""
+OWN = {"MPLBACKEND": "agg"}
+"""Variables with other values in own processes, and in what these start: figures go to files alone."""
 _PR_SET_PDEATHSIG = 1
 _EXTRAS = {
     "rosbags": "record",
@@ -56,7 +60,11 @@ def begin(program: str) -> None:
     """
     leave_out_working_directory()
     os.environ.setdefault(BLAS_THREADS, "1")
+    os.environ.update(OWN)
     _open_streams()
+    for stream in (sys.stdout, sys.stderr):  # PYTHONIOENCODING=ascii, LC_ALL=C
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
         print(
@@ -112,13 +120,39 @@ def on_signals(handler: Callable[[str], None]) -> dict[signal.Signals, Any]:
     return {number: signal.signal(number, handle) for number in numbers}
 
 
-def what_to_install(error: ModuleNotFoundError) -> str | None:
-    """Name the missing module and how to install it; None for one that nothing here installs."""
+def what_to_install(error: ImportError) -> str | None:
+    """Name the missing module and how to install it; None for one that nothing here installs.
+
+    Modules of another Python's ROS, as PYTHONPATH may name them, are named with their place.
+    """
     module = (error.name or "").split(".")[0]
+    if foreign := _foreign(error):
+        path, what = foreign
+        return (
+            f"the {what} in {path} cannot be loaded by this Python "
+            f"{sys.version_info.major}.{sys.version_info.minor}: take it out of PYTHONPATH (a "
+            "setup.bash of ROS 2 puts it there), or install pdeloop for the Python of that ROS 2"
+        )
+    if not isinstance(error, ModuleNotFoundError):
+        return None
     if module in _ROS or module.endswith(_MESSAGES):
         return f"needs {module}: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]'"
     extra = _EXTRAS.get(module)
     return extra and f"needs {module}: pip install 'pdeloop[{extra}]'"
+
+
+def _foreign(error: ImportError) -> tuple[Path, str] | None:
+    """The folder and name of a package of ROS 2 that is there, outside of this Python, and broken."""
+    frames, trace = [Path(error.path)] if error.path else [], error.__traceback__
+    while trace is not None:
+        frames.append(Path(trace.tb_frame.f_code.co_filename))
+        trace = trace.tb_next
+    for file in frames:
+        for folder in file.parents:
+            ours = folder.name in (*_ROS, "rpyutils") or folder.name.endswith(_MESSAGES)
+            if ours and Path(sys.prefix) not in folder.parents:
+                return folder.parent, folder.name
+    return None
 
 
 def run(node: str) -> int:
@@ -129,7 +163,7 @@ def run(node: str) -> int:
     try:
         with quick_imports():
             module = importlib.import_module(f"{node}.node")
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         if (needed := what_to_install(error)) is None:
             raise
         print(f"{node}: {needed}", file=sys.stderr)

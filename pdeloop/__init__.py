@@ -90,6 +90,13 @@ __all__ = sorted(_MODULES)
 if not TYPE_CHECKING:  # a type checker knows the names above, and that there are no others
 
     def __getattr__(name: str) -> object:
+        if name == "__version__":
+            from importlib.metadata import version  # a tenth of a short command's time
+
+            return version("pdeloop")
         if name not in _MODULES:
             raise AttributeError(f"module 'pdeloop' has no attribute {name!r}")
         return getattr(importlib.import_module(_MODULES[name]), name)
+
+    def __dir__() -> list[str]:
+        return [*__all__, "__version__"]

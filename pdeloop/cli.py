@@ -77,7 +77,7 @@ def _run(
         # RunFolderError, FileError, ParameterError, DomainError, NodeError and the plant's
         # and controller's refusals.
         return _failed(_sentence(error))
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         needed = what_to_install(error)
         return _crashed() if needed is None else _failed(needed)
     except (KeyboardInterrupt, Interruption) as reason:

@@ -36,6 +36,9 @@ class StreamConsole(Console):
             super().print(*objects, **how)
         except BrokenPipeError:
             raise
+        except UnicodeEncodeError as error:  # the stream of a program with its own encoding
+            texts = (str(one).encode(error.encoding, "backslashreplace") for one in objects)
+            super().print(*(text.decode(error.encoding) for text in texts), **how)
         except OSError as error:
             complain(f"no more lines can be written ({error.strerror}); the work continues")
             self.quiet = True

@@ -121,7 +121,8 @@ class Frames:
                 bar.set_height(value)
             _grow(ax, own)
         self._time.set_text(f"t = {step * self._plant.sample_time:.3g} s")
-        self._canvas.draw()
+        with rc_context(STYLE):  # in which ticks are made
+            self._canvas.draw()
         drawn: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         return drawn
 

@@ -16,7 +16,7 @@ from typing import Any
 from loop_interfaces.affinity import least_busy_cores, usable_cores
 from loop_interfaces.isolation import NETWORK, PROFILE
 from loop_interfaces.parameters import taken_by
-from loop_interfaces.ros_environment import prepared
+from loop_interfaces.ros_environment import prepared, with_servers_there
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
 from pdeloop.domain import given_domain
@@ -162,7 +162,9 @@ class Transport:
 
         RosEnvironmentError where no node could work.
         """
-        return prepared({**os.environ, **({NETWORK: "1"} if self.network else {})})
+        found, remarks = prepared({**os.environ, **({NETWORK: "1"} if self.network else {})})
+        found, more = with_servers_there(found)
+        return found, remarks + more
 
     @property
     def words(self) -> list[str]:

@@ -17,6 +17,15 @@ __all__ = ["draw"]
 
 def draw(values: Mapping[str, Any], path: Path) -> None:
     """A picture of the initial fields, the target and the actuators' supports."""
+    from matplotlib import rc_context
+
+    from pdeloop.report.style import STYLE
+
+    with rc_context(STYLE):
+        _draw(values, path)
+
+
+def _draw(values: Mapping[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     plant = field_plant(values, compiled=False)

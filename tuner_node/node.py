@@ -9,6 +9,7 @@ Messages and their order: docs/protocol.md. The work itself: tuner_node.session.
 """
 
 import contextlib
+import os
 import sys
 import time
 from collections import deque
@@ -30,6 +31,7 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.ros.suspend_watchdog import sleep_for
+from loop_interfaces.ros_environment import steering
 from loop_interfaces.spec import FREE
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training, remarks_on
@@ -250,6 +252,8 @@ class TunerNode:
         missing, seconds = self._diagnostics.absent(now)
         if missing:
             hint = "; do they use this ROS_DOMAIN_ID, namespace and DDS profile?"
+            if others := steering(os.environ):
+                hint += f" Set here: {others}"
             self._log.warning(
                 f"waiting for {' and '.join(missing)} for {seconds:.0f} s"
                 + (hint if seconds > 2 * ABSENCE_REPORT else ""),

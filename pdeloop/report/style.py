@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from matplotlib import rcParamsDefault
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
@@ -22,8 +23,15 @@ COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
 LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "gauss_newton": (0, (5, 1))}
 """Line styles; the others are solid."""
+_LOOKS = (
+    "axes.", "contour.", "errorbar.", "figure.", "font.", "grid.", "hatch.", "image.", "legend.",
+    "lines.", "markers.", "mathtext.", "patch.", "path.", "pcolor.", "savefig.", "scatter.", "svg.",
+    "text.", "xtick.", "ytick.",
+)  # fmt: skip
+"""How the parameters of Matplotlib begin that are all set: a reader's file may ask for TeX."""
 FIELD_MAP, GAIN_MAP = LinearSegmentedColormap.from_list("field", LIGHT), "PuOr"
 STYLE: dict[Any, Any] = {
+    **{name: value for name, value in rcParamsDefault.items() if name.startswith(_LOOKS)},
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.titlesize": 9,

@@ -1,0 +1,88 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Commands in environments that are set for other work: each works, or names the variable."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from loop_interfaces.ros_environment import steering, with_servers_there
+from tests.support.interpreter import ROOT
+
+
+def command(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """`pdeloop WORDS...` in a folder and an environment."""
+    return subprocess.run(
+        [sys.executable, "-m", "pdeloop", *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend_inline", "TkAgg", "none"])
+def test_figures_need_no_backend_of_another_program(tmp_path: Path, backend: str) -> None:
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfont.family: nowhere\n")
+    words = ("check", "allen-cahn", "--picture", "a.png")
+    ended = command(tmp_path, *words, MPLBACKEND=backend)
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "a.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_a_stream_that_cannot_write_a_character_ends_no_training(tmp_path: Path) -> None:
+    plant = tmp_path / "plant.py"
+    plant.write_text(
+        "import numpy as np, pdeloop\n"
+        "class Plant(pdeloop.Dynamics):\n"
+        "    n_z, n_a, horizon = 2, 1, 10\n"
+        "    def initial_state(self, rng):\n"
+        "        return rng.normal(size=2)\n"
+        "    def step(self, z, a):\n"
+        "        return 0.9 * z + a\n"
+    )
+    folder = tmp_path / "größe"
+    words = ("train", "--plant", f"{plant}:Plant", "--in-process", "--rollouts", "6")
+    ended = command(tmp_path, *words, "--out", str(folder), PYTHONIOENCODING="ascii")
+    assert ended.returncode in (0, 3), ended.stderr  # 3: the law of few rollouts costs more
+    assert "gr\\xf6\\xdfe" in ended.stdout and (folder / "result.json").exists()
+
+
+@pytest.mark.parametrize("missing", ["ModuleNotFoundError", "ImportError"])
+def test_the_rclpy_of_another_python_is_named_with_its_place(tmp_path: Path, missing: str) -> None:
+    foreign = tmp_path / "foreign" / "rclpy"
+    foreign.mkdir(parents=True)
+    (foreign / "__init__.py").write_text(f"raise {missing}('_rclpy_pybind11', name='_rclpy')\n")
+    words = ("train", "allen-cahn", "--rollouts", "6")
+    path = os.pathsep.join([str(foreign.parent), str(ROOT)])
+    ended = command(tmp_path, *words, PYTHONPATH=path, ROS_LOG_DIR=str(tmp_path))
+    assert ended.returncode == 1
+    assert "Traceback" not in ended.stderr
+    assert f"rclpy in {foreign.parent} cannot be loaded by this Python" in ended.stderr
+
+
+def test_a_discovery_server_that_is_not_there_is_left_out_and_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        there = {"ROS_DISCOVERY_SERVER": address}
+        assert with_servers_there(there) == (there, [])
+    found, (said,) = with_servers_there(there)
+    assert (
+        found == {} and said == f"ROS_DISCOVERY_SERVER={address} is ignored: no server runs there"
+    )
+    elsewhere = {"ROS_DISCOVERY_SERVER": "192.0.2.7:11811"}
+    assert with_servers_there(elsewhere) == (elsewhere, [])
+
+
+def test_who_waits_names_the_variables_that_may_be_the_cause() -> None:
+    usual = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    assert steering(usual) == ""
+    set_ = {"ROS_STATIC_PEERS": "192.0.2.7", "ROS_DISCOVERY_SERVER": "x:1"}
+    assert steering(usual | set_) == "ROS_STATIC_PEERS=192.0.2.7, ROS_DISCOVERY_SERVER=x:1"
