@@ -19,6 +19,8 @@ def read_only(values: ArrayLike) -> Array:
 
 def float_array(name: str, values: ArrayLike) -> Array:
     """The values as float64; a ValueError unless they are an array of real numbers."""
+    if type(values).__name__ == "MaskedArray" and np.any(getattr(values, "mask", False)):
+        raise ValueError(f"{name} has masked entries, which have no value: fill or drop them")
     try:
         array = np.asarray(values)
         what = str(array.dtype)

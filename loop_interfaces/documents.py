@@ -37,12 +37,28 @@ def parse_yaml(text: str | bytes, most: int = MAX_YAML_NODES) -> Any:
     """
     try:
         _check_yaml(text, most)
-        return yaml.load(text, _Loader)
+        return yaml.load(text, _UniqueLoader)
     except yaml.YAMLError as error:
         raise ValueError(_yaml_problem(error)) from error
     except (ArithmeticError, AttributeError, LookupError, TypeError, RecursionError) as error:
         # PyYAML's constructors on values that are not of the type which they are tagged as.
         raise ValueError("it has a value that is not of the type it is tagged as") from error
+
+
+class _UniqueLoader(_Loader):  # type: ignore[misc, valid-type]
+    """Refuses a map with a key that stands in it twice, of which YAML would keep the last value."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys: set[tuple[str, str]] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in keys:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"'{key.value}' stands twice in one map; leave one of them out",
+                        problem_mark=key.start_mark,
+                    )
+                keys.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)
 
 
 class _TaggedLoader(_Loader):  # type: ignore[misc, valid-type]

@@ -24,7 +24,7 @@ from loop_interfaces.spec import (
     check_names,
     exponent_hint,
 )
-from loop_interfaces.text import shown
+from loop_interfaces.text import alike, shown
 
 
 def config_folder() -> Path:
@@ -61,7 +61,8 @@ def find_problem(name: str) -> Path:
             raise ParameterError(f"no problem file at {name}; give the path of a YAML file")
         return path
     raise ParameterError(
-        f"unknown problem '{name}'; expected one of {', '.join(shipped)}, or the path of a YAML file"
+        f"unknown problem '{name}'; {alike(name, shipped)}expected one of {', '.join(shipped)}, or the "
+        "path of a YAML file"
     )
 
 
@@ -116,8 +117,8 @@ def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
     if package != "pde_sim_node" and others:  # of a plant from another source
         return dict(given)
     raise ParameterError(
-        f"unknown problem {shown(name)} without an 'equation'; expected one of {', '.join(shipped)}, "
-        "or the parameters of a problem of your own"
+        f"unknown problem {shown(name)} without an 'equation'; {alike(str(name), shipped)}expected one "
+        f"of {', '.join(shipped)}, or the parameters of a problem of your own"
     )
 
 

@@ -7,6 +7,7 @@ import contextlib
 import difflib
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,6 +118,7 @@ class Spec:
                 f"{called} is {shown(value)}; expected {self.range}"
                 + (f" ({self.unit})" if self.unit else "")
                 + (exponent_hint(value) if self.type is float else "")
+                + ("" if _normal(value) else f"; {_NEAR_ZERO}")
             )
         return good
 
@@ -153,8 +155,8 @@ class Spec:
         if self.file_name:
             return value if _FILE_NAME.fullmatch(str(value)) else None
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            infinite = isinstance(value, float) and not math.isfinite(value)
-            if infinite or (self.positive and value <= 0):
+            unfit = isinstance(value, float) and not (math.isfinite(value) and _normal(value))
+            if unfit or (self.positive and value <= 0):
                 return None
             if self.minimum is not None and value < self.minimum:
                 return None
@@ -171,6 +173,15 @@ class Spec:
         number = replace(self, default=0.0)
         found = [number._coerce(item) for item in value]
         return None if None in found else [float(item) for item in found]
+
+
+_NEAR_ZERO = "a number so near to 0 cannot be written to a file and read back"
+
+
+def _normal(value: object) -> bool:
+    """False for a number that is not 0, and nearer to it than a parameter file can say."""
+    near = isinstance(value, float) and abs(value) < sys.float_info.min
+    return not near or value == 0.0
 
 
 def _plain(number: float) -> str:

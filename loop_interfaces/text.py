@@ -1,7 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Texts and values from files and the network, made safe for display."""
 
+import difflib
 import reprlib
+from collections.abc import Iterable
 
 MAX_SHOWN = 200
 """Characters of a value in an error."""
@@ -65,3 +67,13 @@ def shown(value: object) -> str:
     """
     text = _BOUNDED.repr(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+def alike(name: str, known: Iterable[str]) -> str:
+    """A question for the known name that is meant by another one, if any is near.
+
+    >>> alike("burger", ["burgers", "kdv"]), alike("rocket", ["burgers", "kdv"])
+    ("did you mean 'burgers'? ", '')
+    """
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.7)
+    return f"did you mean '{near[0]}'? " if near else ""

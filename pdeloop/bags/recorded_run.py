@@ -40,6 +40,7 @@ class RecordedRun:
         target: Array | None,
     ) -> None:
         self._name, self._report = f"run {number}", report
+        self._recomputed = 0
         self._rollouts: dict[bytes, list[str]] = {}
         """The recorded rollouts in words, by their keys (`_keys`)."""
         self._answered: Counter[bytes] = Counter()
@@ -103,6 +104,8 @@ class RecordedRun:
 
         claims: what the run's folder says, if it is known; the training is then run as far as that.
         """
+        if not self._recomputed:
+            self._report.unverified.append(self._name)
         if claims is not None and self._values is not None:
             compare_parameters(claims, self._values, self._report)
         if not self._follow(claims):
@@ -187,6 +190,8 @@ class RecordedRun:
     def _run_again(self, episode: RecordedEpisode, where: str) -> None:
         """The whole episode from its seeds, under its policies or its excitation."""
         assert episode.start is not None and episode.cost is not None
+        self._recomputed += 1
+        self._report.recomputed += 1
         report, plant, rows = self._report, self._pair.plant, episode.start.values
         states, actions = episode.trajectory()
         if states.shape[1:] != (len(rows), plant.state_size) or actions.shape[2] != plant.n_a:

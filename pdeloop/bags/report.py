@@ -18,24 +18,27 @@ SHOWN = 5
 class Report:
     """Comparisons, differences and gaps.
 
-    incomplete: episodes that lack something, which a training may have repeated; missing: what the bag,
-    its metadata or its run says there is, and is not there; count: of the differences, of which the
-    first are in `differences`.
+    recomputed: episodes that were run again; unverified: runs of which none was; incomplete: episodes
+    that lack something, which a training may have repeated; missing: what the bag, its metadata or its
+    run says there is, and is not there; count: of the differences, of which the first are in
+    `differences`.
     """
 
     bag: str
     episodes: int = 0
+    recomputed: int = 0
     compared: dict[str, int] = field(default_factory=dict)
     differences: list[str] = field(default_factory=list)
     count: int = 0
     incomplete: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    unverified: list[str] = field(default_factory=list)
 
     @property
     def good(self) -> bool:
-        """True if nothing is missing, and nothing differs."""
-        return not (self.count or self.missing)
+        """True if every run was recomputed, nothing is missing, and nothing differs."""
+        return bool(self.recomputed) and not (self.count or self.missing or self.unverified)
 
     def count_compared(self, what: str, number: int) -> None:
         """Count compared items of one kind."""
@@ -82,6 +85,9 @@ class Report:
         lines += [f"  missing: {text}" for text in self.missing[:SHOWN]]
         if len(self.missing) > SHOWN:
             lines.append(f"  and {len(self.missing) - SHOWN} more things are missing")
+        lines += [
+            f"  not verified: {name}, no episode of which was run again" for name in self.unverified
+        ]
         if self.differences:
             lines.append(f"  {self.count} differences; the first: {self.differences[0]}")
             lines += [f"    {text}" for text in self.differences[1:]]
@@ -89,6 +95,8 @@ class Report:
             lines.append(
                 "  everything that is there is the same to the bit; missing parts were not compared"
             )
-        elif self.compared:
-            lines.append("  no difference, to the bit")
+        elif self.recomputed:
+            part = f" in the {self.recomputed} of {self.episodes} episodes that were run again"
+            whole = self.recomputed == self.episodes
+            lines.append(f"  no difference, to the bit{'' if whole else part}")
         return "\n".join(lines)

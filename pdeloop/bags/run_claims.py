@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,16 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from loop_interfaces.documents import parse_json
 from loop_interfaces.files import FileError, read_json
 from loop_interfaces.text import shown
 from pdeloop.bags.report import Report
 from pdeloop.display import ProgressFile
-from tuner_node.results import check_result
+from tuner_node.results import check_result, summarise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, RunFolderError
 from tuner_node.training import Training
 
 RESULT, RUN, PROGRESS = "result.json", "run.json", "progress.jsonl"
+FILES = (RUN, PROGRESS, "parameters.yaml", "policy.npz")
+"""The files of a finished run beside its results."""
 
 
 @dataclass
@@ -104,12 +108,29 @@ def compare_results(claims: RunClaims, training: Training, report: Report) -> No
         told = np.array(costs[name], dtype=np.float64)
         report.compare("results", f"'{name}' of {where}", told, training.evaluation[:, i])
     _compare_history(claims.result.get("history", []), training.history, report, where)
+    _compare_summary(claims.result, training, report, where)
+    for name in FILES:
+        if not (claims.folder / name).exists():
+            report.missing.append(f"{name} of the run in {claims.folder}")
     try:
         told = RunFolder(claims.folder).policies()["policy"]
     except RunFolderError as error:
         report.differs(str(error))
         return
     report.compare("results", f"the policy in {claims.folder}", told, training.policies())
+
+
+def _compare_summary(
+    told: Mapping[str, Any], training: Training, report: Report, where: Path
+) -> None:
+    """Compare every other figure of the results, those that this version writes as well."""
+    for name, value in parse_json(json.dumps(summarise(training)).encode()).items():
+        if name in told and name not in ("costs_by_field", "history"):
+            report.count_compared("figures of results", 1)
+            if told[name] != value:
+                report.differs(
+                    f"'{name}' of {where} is {shown(told[name])}, the training has {shown(value)}"
+                )
 
 
 def _compare_history(

@@ -89,7 +89,7 @@ def _bag_verify(options: argparse.Namespace) -> int:
         print_json(asdict(report))
     else:
         print(report.text())
-    if not report.compared:
+    if not report.recomputed:
         why = "; ".join(report.notes) or "no episode is complete"
         raise ParameterError(f"nothing was recomputed, so nothing is verified: {why}")
     return 0 if report.good else 1

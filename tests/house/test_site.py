@@ -50,6 +50,15 @@ def test_no_heading_begins_with_a_digit() -> None:
         assert re.search(r"^# \S", text, re.MULTILINE), page
 
 
+def test_no_text_is_taken_for_a_tag() -> None:
+    """A page of the site is HTML: what begins like a tag, as k<T, swallows what follows it."""
+    for page in (*DOCS.rglob("*.md"), *ROOT.glob("*.md")):
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(r"^(    |\t).*$", "", text, flags=re.MULTILINE)
+        text = re.sub(r"(`+).+?\1", "", text, flags=re.DOTALL)
+        assert not re.findall(r"<(?!https?://|!--)[A-Za-z/!?][^\n]{,30}", text), page
+
+
 def test_a_link_that_leaves_the_documents_leads_to_the_repository() -> None:
     spec = importlib.util.spec_from_file_location("site_hooks", DOCS / "site_hooks.py")
     assert spec and spec.loader

@@ -159,6 +159,21 @@ RUN_FILES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], str]] = {
         lambda c: c["costs_by_field"]["adapted"][0].__setitem__(0, 0.5),
         "'adapted' of",
     ),
+    "a better mean": (
+        "result.json",
+        lambda c: c["mean_cost"].update(adapted=0.5),
+        "'mean_cost' of",
+    ),
+    "another outcome": (
+        "result.json",
+        lambda c: c["outcome"][0].update(verdict="better than ever"),
+        "'outcome' of",
+    ),
+    "another reduction": (
+        "result.json",
+        lambda c: c["reduction"].update(ratio_of_means=0.99),
+        "'reduction' of",
+    ),
     "another history": (
         "result.json",
         lambda c: c["history"][1].update(rollouts=99),
@@ -202,6 +217,29 @@ def test_another_policy_than_the_trainings_is_a_difference(run):
     arrays["policy"][0, 0, 0] = np.nextafter(arrays["policy"][0, 0, 0], 1.0)
     np.savez(run / "policy.npz", **arrays)
     assert f"the policy in {run}" in words_of(verify(run))
+
+
+def test_a_target_alone_is_not_a_verified_bag(messages, tmp_path, capsys):
+    """Of every episode the cost is missing, so that none is run again; the target is the plant's."""
+    bag = write(tmp_path / "bag", [[m for m in messages if m.topic != "/episode/cost"]])
+    report = verify(bag)
+    assert report.compared["targets"] == 1 and report.recomputed == 0
+    assert not report.good and "no difference" not in report.text()
+    assert len(report.unverified) == 1 and report.unverified[0].startswith("run ")
+    assert verified(bag) == 1
+    assert "nothing was recomputed" in capsys.readouterr().err
+
+
+def test_how_many_episodes_were_run_again_is_said(run, messages, tmp_path):
+    lost = next(m for m in messages if m.topic == "/state" and episode_of(m) == PART + EPISODES - 1)
+    bag = write(tmp_path / "bag", [[m for m in messages if m is not lost]])
+    report = verify(bag)
+    assert report.recomputed == EPISODES - 1 == report.episodes - 1
+
+
+def test_a_file_that_the_run_lacks_is_named(run):
+    (run / "progress.jsonl").unlink()
+    assert f"progress.jsonl of the run in {run}" in verify(run).missing
 
 
 def test_gaps_in_the_numbers_are_named_where_no_training_can_be_followed(run, messages, tmp_path):
