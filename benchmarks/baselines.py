@@ -17,7 +17,7 @@ import importlib.util
 import itertools
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,6 @@ from benchmarks.limits import find
 from benchmarks.methods import LIBRARIES, METHODS, measure
 from loop_interfaces.arrays import Array
 from loop_interfaces.controllers import CONTROLLERS
-from loop_interfaces.files import read_json
 from loop_interfaces.parameters import table as parameters
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import read_document
@@ -38,7 +37,8 @@ from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import interval
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
-from pdeloop.study.executors import processes as pool
+from pdeloop.study.executors import local_workers as pool
+from pdeloop.study.results import RESULTS_FILE, reading
 
 __all__ = ["run", "text"]
 
@@ -126,7 +126,7 @@ def run(
         for problem, file in study.problems.items():
             result["limits"][problem] = limit(file, study.settings)
             for budget in rollouts:
-                found = table(place / str(budget) / problem, budget)
+                found = table(place / str(budget), problem, budget)
                 result["rows"] += [{"problem": problem, **row} for row in found]
     if figure is not None:
         plot(result, figure)
@@ -227,12 +227,23 @@ def with_methods(
 def refuse_other_constants(folder: Path, tasks: Mapping[str, Any]) -> None:
     """ValueError if a result in the folder is that of a method with other constants."""
     for label, task in tasks.items():
-        for path in folder.glob(f"*/{label}/*/result.json"):
-            known, wanted = read_json(path)["constants"], task.args[1]
+        for name, result in kept_results(folder, label):
+            known, wanted = result["constants"], task.args[1]
             if known != wanted:
                 raise ValueError(
-                    f"{path} has constants {known}, not {wanted}; give another --folder"
+                    f"{name} in {folder} has constants {known}, not {wanted}; give another --folder"
                 )
+
+
+def kept_results(folder: Path, variant: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and result.json of each finished task of a variant, in the order of the seeds."""
+    if not (folder / RESULTS_FILE).exists():
+        return
+    with reading(folder) as results:
+        rows = results.rows("name, variant, seed", "costs IS NOT NULL")
+        for row in sorted(rows, key=lambda row: int(row["seed"])):
+            if row["variant"] == variant:
+                yield row["name"], json.loads(results.files(row["name"])["result.json"])
 
 
 def iqm(values: Array, axis: int = -1) -> Any:
@@ -249,20 +260,25 @@ def iqm(values: Array, axis: int = -1) -> Any:
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
-def table(folder: Path, budget: int) -> list[dict[str, Any]]:
-    """A row for each method with results in DIR/METHOD/SEED, the best first; `costs`: of the seeds."""
+def table(folder: Path, problem: str, budget: int) -> list[dict[str, Any]]:
+    """A row for each method with results on a problem, the best first; `costs`: of the seeds."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    with reading(folder) as kept:
+        columns = "problem, variant, seed, costs, rollouts"
+        for row in sorted(
+            kept.rows(columns, "costs IS NOT NULL"), key=lambda row: int(row["seed"])
+        ):
+            if row["problem"] == problem:
+                found.setdefault(row["variant"], []).append(row)
     rows = []
-    for place in sorted(folder.iterdir()):
-        results = [read_json(path) for path in sorted(place.glob("*/result.json"))]
-        if not results:
-            continue
-        costs = np.array([result["costs_by_field"]["adapted"][0] for result in results])
+    for method, results in found.items():
+        costs = np.array([json.loads(result["costs"])["adapted"][0] for result in results])
         means = costs.mean(axis=1)
         rows.append(
             {
                 "budget": budget,
-                "method": place.name,
-                "rollouts": int(max(result["rollouts"][0]["total"] for result in results)),
+                "method": method,
+                "rollouts": int(max(result["rollouts"] for result in results)),
                 "seeds": len(results),
                 "cost": float(iqm(means)),
                 "interval": interval((means,), iqm),

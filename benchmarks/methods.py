@@ -31,7 +31,7 @@ from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from pdeloop.in_process import LocalPair, train
-from pdeloop.study.training import require_environment
+from pdeloop.study.training import environment
 from tuner_node.build import build_training
 
 Values = Mapping[str, Any]
@@ -43,24 +43,21 @@ DIVERGED = 1e3
 """Each residual of a diverged rollout."""
 
 
-def measure(
-    method: str, constants: Values, values: Values, expected: Mapping[str, str] | None = None
-) -> dict[str, bytes]:
+def measure(method: str, constants: Values, values: Values) -> dict[str, bytes]:
     """A task of a study: the costs of a method's law on the fields of a closing evaluation.
 
     Parameters
     ----------
     method, constants
         Which of `METHODS`, and what it is called with.
-    values, expected
+    values
         As of `pdeloop.study.training.train_one`, whose result.json this one's is like.
     """
-    here = require_environment(expected)
     with one_thread():
         pair, law, paid = METHODS[method](values, **constants)
         costs = rollout(pair.plant, law, evaluation_fields(values), keep=False).costs.mean
     result = {
-        "environment": here,
+        "environment": environment(),
         "constants": dict(constants),
         "rollouts": [{"total": paid}],
         "costs_by_field": {"adapted": [costs.tolist()]},

@@ -34,6 +34,8 @@ from tuner_node.run_folder import RunFolder, model_of
 LAWS = ("adapted", "lqt")
 """The laws of a run, the first being the default."""
 RESAMPLES = 9999
+_DRAWN = 2**20
+"""Numbers that are drawn at a time."""
 CONFIDENCE = 0.95
 
 
@@ -388,8 +390,12 @@ def interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float] 
     n = len(samples[0])
     if n < 2:
         return None
-    drawn = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
-    found = np.sort(statistic(*(sample[drawn] for sample in samples), axis=-1))
+    draw, found = np.random.default_rng(0), np.empty(RESAMPLES)
+    rows = max(1, _DRAWN // n)  # in pieces of the same numbers: thousands of seeds take gigabytes
+    for first in range(0, RESAMPLES, rows):
+        drawn = draw.integers(0, n, (min(rows, RESAMPLES - first), n))
+        found[first : first + rows] = statistic(*(sample[drawn] for sample in samples), axis=-1)
+    found.sort()
     tail = (1 - CONFIDENCE) / 2
     share = np.array([tail, 1 - tail])
     place = share * RESAMPLES + (1 - share)  # the first is 1

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pdeloop.finished_run import FinishedRun, load_run, merged
 from pdeloop.study.description import Study
-from pdeloop.study.run import STUDY_FILE, read_study
+from pdeloop.study.results import STUDY_FILE, read_study, reading
 
 LEARNED = {
     "lqt_po": {"start": "lqt", "optimizer": "two_point"},
@@ -58,10 +60,16 @@ def reproduction_in(folder: Path) -> Study | None:
 
 def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
     """The finished runs of a problem over all seeds, by adapted controller."""
-    return {
-        name: merged([load_run(folder / problem / name / str(seed)) for seed in study.seeds])
-        for name in LEARNED
-    }
+    with reading(folder) as results, TemporaryDirectory(prefix="pdeloop-") as place:
+
+        def one(name: str) -> FinishedRun:
+            run = load_run(results.extract(name, Path(place)))
+            return replace(run, folder=folder / name)
+
+        return {
+            variant: merged([one(f"{problem}/{variant}/{seed}") for seed in study.seeds])
+            for variant in LEARNED
+        }
 
 
 def beside_the_paper(rows: Sequence[Mapping[str, Any]]) -> list[str]:

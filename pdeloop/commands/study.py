@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import importlib.util
 import json
 import shlex
@@ -25,6 +26,13 @@ from pdeloop.commands.common import (
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.output import print_json
 
+TLS = {
+    "--tls-ca-file": ("tls_ca_file", "certificate of the authority"),
+    "--tls-cert": ("tls_client_cert", "certificate of this client"),
+    "--tls-key": ("tls_client_key", "its private key"),
+}
+"""Flags for an encrypted scheduler: the name in `distributed.Security`, and what the file is."""
+
 if TYPE_CHECKING:
     from pdeloop.study import Study
 
@@ -38,15 +46,16 @@ def add(commands: Commands) -> None:
         help="run many trainings (problems, variants, seeds) on this machine or a cluster",
         description="Train every problem of a study with every variant and every seed, each in a "
         "process of its own, and compare them. Ctrl-C interrupts; --out DIR of an interrupted study "
-        "continues it. docs/scaling.md shows a study's file.",
+        "continues it. `status DIR` says how far one is. docs/scaling.md shows a study's file.",
         example="pdeloop study examples/study.yaml --out runs/study",
     )
     study.add_argument(
-        "file",
-        nargs="?",
+        "words",
+        nargs="*",
         type=a_path,
         metavar="STUDY.yaml",
-        help="file with problems, seeds, variants and settings",
+        help="file with problems, seeds, variants and settings; or `status DIR`: how far the study in "
+        "DIR is, while it is carried out or later",
     )
     add_set(study, "any parameter, for all trainings")
     add_own_code(study, ("equation", "plant", "optimizer", "law"))
@@ -68,6 +77,22 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="train on the workers of this Dask scheduler (tcp://HOST:PORT) instead",
     )
+    for flag, (_, what) in TLS.items():
+        add(flag, type=a_path, metavar="FILE", help=f"{what}, for a scheduler tls://HOST:PORT")
+    add(
+        "--worker-deaths",
+        type=int,
+        default=20,
+        metavar="N",
+        help="workers that one training may lose before it counts as failed [20]",
+    )
+    add(
+        "--run-folders",
+        nargs="?",
+        const="*",
+        metavar="PATTERN",
+        help="also write the run folders DIR/PROBLEM/VARIANT/SEED of these trainings [all]",
+    )
     add(
         "--any-environment",
         action="store_true",
@@ -77,7 +102,8 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
     add(
         "--again",
         action="store_true",
-        help="train anew what was made with other parameters or another plant than the study has now",
+        help="train anew what has failed, and what was made with other parameters or another plant "
+        "than the study has now",
     )
     add_json(parser, "print the table as JSON; progress goes to stderr")
 
@@ -97,7 +123,8 @@ def carry_out(
     from pdeloop.display import StreamConsole
     from pdeloop.interruption import interruptible
     from pdeloop.progress import Progress
-    from pdeloop.study.executors import cluster, processes
+    from pdeloop.study.executors import local_workers
+    from pdeloop.study.results import reading
     from pdeloop.study.run import run
     from pdeloop.study.table import plot, rows, text
     from tuner_node.results import versions
@@ -108,15 +135,22 @@ def carry_out(
             "--processes is the number of trainings at a time on this machine; expected at least "
             "1, without --scheduler"
         )
+    given = {flag: getattr(options, flag[2:].replace("-", "_")) for flag in TLS}
+    security = {TLS[flag][0]: str(path) for flag, path in given.items() if path is not None}
+    if security and (len(security) < len(TLS) or options.scheduler is None):
+        raise ParameterError(f"expected --scheduler and all of {', '.join(TLS)}, or none of these")
+    if options.worker_deaths < 1:
+        raise ParameterError("--worker-deaths is the most of a training; expected at least 1")
     folder: Path = options.out or Path("runs") / f"{name}-{timestamp()}"
     study = study_in(folder)
     console = StreamConsole(sys.stderr if options.json else sys.stdout)
     progress = Progress(console, name, "trainings")
-    executor = (
-        partial(cluster, options.scheduler)
-        if options.scheduler is not None
-        else partial(processes, options.processes)
-    )
+    if options.scheduler is not None:
+        from pdeloop.study.cluster import cluster
+
+        executor = partial(cluster, options.scheduler, security)
+    else:
+        executor = partial(local_workers, options.processes)
     try:
         with interruptible(shlex.join(["pdeloop", name, "--out", str(folder)])):
             failures = run(
@@ -125,10 +159,15 @@ def carry_out(
                 executor,
                 any_environment=options.any_environment,
                 again=options.again,
+                most_deaths=options.worker_deaths,
                 tell=progress.tell,
             )
     finally:
         progress.close()
+    if options.run_folders is not None:
+        with reading(folder) as results:
+            for name in fnmatch.filter(sorted(results.names()), options.run_folders):
+                results.extract(name, folder)
     table = rows(study, folder)
     content = json.dumps({"rows": table, "versions": versions()}, indent=1)
     write_atomically(folder / "table.json", content.encode())
@@ -148,23 +187,43 @@ def carry_out(
 def _study(options: argparse.Namespace) -> int:
     from loop_interfaces.spec import read_document
     from pdeloop.study.description import Study
-    from pdeloop.study.run import read_study
+    from pdeloop.study.results import read_study
 
+    words: list[Path] = options.words
+    if len(words) == 2 and str(words[0]) == "status":
+        return _status(words[1], options.json)
+    if len(words) > 1:
+        options.refuse("expected one file, or: status DIR")
+    file = words[0] if words else None
     allow_own_code(options)
-    if options.file is None and options.out is None:
+    if file is None and options.out is None:
         raise ParameterError(
             "no study given; expected a YAML file, or --out DIR of one to continue"
         )
 
     settings = read_settings(options.set)
-    if options.file is None and settings:
+    if file is None and settings:
         raise ParameterError(
             "--out DIR alone continues a study with its own parameters; leave out --set"
         )
 
     def study_in(folder: Path) -> Study:
-        if options.file is None:
+        if file is None:
             return read_study(folder)
-        return Study.of(read_document(options.file), options.file.parent).having(settings)
+        return Study.of(read_document(file), file.parent).having(settings)
 
     return carry_out("study", options, study_in)
+
+
+def _status(folder: Path, as_json: bool) -> int:
+    from pdeloop.study.status import status, status_text
+    from pdeloop.study.table import text
+
+    found = status(folder)
+    if as_json:
+        print_json(found)
+    else:
+        print("\n".join(status_text(found)))
+        if found["rows"]:
+            print(f"\n{text(found['rows'])}")
+    return 0

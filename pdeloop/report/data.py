@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch
 from loop_interfaces.action_set import ActionSet
-from loop_interfaces.array_files import checked_array, read_arrays
+from loop_interfaces.array_files import checked_array, unpack_arrays
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_method.laws import Affine
@@ -28,7 +29,7 @@ from pdeloop.finished_run import FinishedRun, field_means, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
-from pdeloop.study.run import STUDY_FILE
+from pdeloop.study.results import MOST, STUDY_FILE, reading
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolderError
@@ -152,8 +153,9 @@ def gather(folder: Path) -> ReportData:
         return ReportData(folder, [of_run(load_run(folder))])
     if (folder / STUDY_FILE).exists():
         raise RunFolderError(
-            f"{folder} holds a study, whose table and figure are its table.json and costs.png; report "
-            f"one of its runs, {folder}/PROBLEM/VARIANT/SEED"
+            f"{folder} holds a study, whose table and figure are its table.json and costs.png; have "
+            f"its runs written with `pdeloop study --out {folder} --run-folders`, and report one of "
+            f"them, {folder}/PROBLEM/VARIANT/SEED"
         )
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
 
@@ -170,13 +172,15 @@ def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
     for controller, run in runs.items():
         seeds = []
         for seed, before, base in zip(study.seeds, run.before, lqt, strict=True):
-            path = folder / name / controller / str(seed) / CURVE
+            path = f"{name}/{controller}/{seed}"
             try:
-                arrays = read_arrays(path)
+                with reading(folder) as results:
+                    content = results.files(path)[CURVE]
+                arrays = unpack_arrays(BytesIO(content), MOST)
                 used = checked_array(arrays, "rollouts", "f", (None,)) - before
                 costs = field_means(checked_array(arrays, "costs", "f", (len(used), None)))
-            except ValueError as error:
-                raise RunFolderError(f"{path} cannot be read: {error}") from error
+            except (ValueError, KeyError) as error:
+                raise RunFolderError(f"{CURVE} of {path} cannot be read: {error}") from error
             seeds.append((used, costs / base))
         curves += _curve(controller, seeds, over_lqt=True)
     ratio = field_means(runs["lqt_po"].costs["adapted"]) / lqt

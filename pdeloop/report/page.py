@@ -29,7 +29,7 @@ from pdeloop.report.dark import darken
 from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
-from pdeloop.study.run import STUDY_FILE
+from pdeloop.study.results import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
@@ -304,7 +304,11 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
 def _figures(problem: ProblemData) -> dict[str, dict[str, Any]]:
     """The row of each adapted controller, as in the table of a study."""
     return {
-        name: {"problem": problem.name, "variant": name, **figures_of([run])}
+        name: {
+            "problem": problem.name,
+            "variant": name,
+            **figures_of(run.costs, [own["total"] for own in run.rollouts]),
+        }
         for name, run in problem.runs.items()
     }
 

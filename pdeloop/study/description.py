@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,8 +136,8 @@ class Study:
             "curves": self.curves,
         }
 
-    def trainings(self) -> dict[str, dict[str, Any]]:
-        """The resolved parameters of every training, by its folder PROBLEM/VARIANT/SEED."""
+    def trainings(self) -> Mapping[str, dict[str, Any]]:
+        """The resolved parameters of every training, by its name PROBLEM/VARIANT/SEED."""
         found: dict[str, dict[str, Any]] = {}
         for problem, file in self.problems.items():
             for variant, table in self.variants.items():
@@ -147,9 +147,27 @@ class Study:
                     build_training(values)
                 except ValueError as error:
                     raise StudyError(f"{problem}, variant '{variant}': {error}") from error
-                for seed in self.seeds:
-                    found[f"{problem}/{variant}/{seed}"] = {**values, "seed": seed}
-        return found
+                found[f"{problem}/{variant}"] = values
+        return _Trainings(found, self.seeds)
+
+
+class _Trainings(Mapping[str, dict[str, Any]]):
+    """The parameters of many trainings, which are made when they are asked for."""
+
+    def __init__(self, values: Mapping[str, Mapping[str, Any]], seeds: Sequence[int]) -> None:
+        self._values, self._seeds = values, dict.fromkeys(seeds)
+
+    def __getitem__(self, name: str) -> dict[str, Any]:
+        whose, _, seed = name.rpartition("/")
+        if not seed.lstrip("-").isdecimal() or int(seed) not in self._seeds:
+            raise KeyError(name)
+        return {**self._values[whose], "seed": int(seed)}
+
+    def __iter__(self) -> Iterator[str]:
+        return (f"{whose}/{seed}" for whose in self._values for seed in self._seeds)
+
+    def __len__(self) -> int:
+        return len(self._values) * len(self._seeds)
 
 
 def _beside(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -1,158 +1,217 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Executors for the trainings of a study: processes of this machine, or a Dask cluster."""
+"""Executors for the trainings of a study on this machine, and what a study knows of any executor."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import multiprocessing
 import os
 import signal
-import warnings
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, ProcessPoolExecutor
-from importlib import metadata
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from functools import partial
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 from loop_interfaces.affinity import usable_cores
-from loop_interfaces.module_path import SAFE_PATH, safe_children
+from loop_interfaces.module_path import safe_children
 from loop_interfaces.start import die_with
 from pdeloop.study import training
-from pdeloop.study.description import StudyError
 from spectral_solver.workers import use_cores
 
-CONNECTING = 10.0
-"""Seconds in which a scheduler has to answer."""
-RETRIES = 3
-"""Number of times that a cluster may restart a training whose worker has gone."""
-WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
-"""The command that starts a worker, which must not run modules of its working directory either."""
+AHEAD = 2
+"""Trainings for each worker that an executor has at a time, the running ones among them."""
+UNKNOWN = 64
+"""Workers of an executor that does not say how many it has."""
+
+Files: TypeAlias = "Mapping[str, bytes]"
+
+
+class Death(NamedTuple):
+    """The worker of a training has died: its last progress, and whether the end was announced."""
+
+    name: str
+    progress: list[Mapping[str, Any]]
+    announced: bool = False
+
+
+class LostWorkerError(RuntimeError):
+    """A training whose worker has died, and which has to be submitted again."""
+
+
+class Workers:
+    """The workers of an executor, for trainings that have names.
+
+    Derived classes know more of theirs: which died, and what they are.
+    """
+
+    environments: Mapping[str, Mapping[str, str]] = {}
+    """The environments of the workers, by a name for each kind; empty: unknown until one answers."""
+
+    def __init__(self, pool: Executor) -> None:
+        self.pool = pool
+        self._waiting: dict[Future[Files], str] = {}
+
+    def kinds(self) -> Mapping[str, int]:
+        """The number of workers by the kinds of `environments`."""
+        return dict.fromkeys(self.environments, 1)
+
+    @property
+    def window(self) -> int:
+        """Trainings that may be submitted at a time."""
+        return AHEAD * (getattr(self.pool, "_max_workers", None) or UNKNOWN)
+
+    def begin(self, study: str) -> None:
+        """Work for the study with this id."""
+
+    def submit(
+        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+    ) -> None:
+        """Have a training carried out by a worker of a kind of `environments`.
+
+        identity: of what it is made with; not another one of that name is taken for it.
+        """
+        self._waiting[self.pool.submit(task, *arguments)] = name
+
+    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+        """The trainings that have ended since, after at most `timeout` seconds."""
+        done, _ = wait(self._waiting, timeout=timeout, return_when=FIRST_COMPLETED)
+        return [(self._waiting.pop(future), future) for future in done]
+
+    def deaths(self) -> list[Death]:
+        """The trainings whose workers have died since."""
+        return []
+
+    def settle(self) -> None:
+        """What was collected is kept now, and all that can be submitted is."""
+
+    def take_back(self, name: str) -> None:
+        """Carry this training out no longer."""
+        for future in [future for future, own in self._waiting.items() if own == name]:
+            future.cancel()
+            del self._waiting[future]
+
+    def remark(self) -> str:
+        """What the user should know of the workers."""
+        return ""
+
+
+class Processes(Workers):
+    """Processes of this machine, each with an executor of its own: one that dies breaks no other."""
+
+    def __init__(self, count: int) -> None:
+        self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._at: dict[str, int] = {}
+        self._died: list[Death] = []
+        self._waiting = {}
+        here = training.environment()
+        self.environments = {here["processor"]: here}
+
+    @property
+    def window(self) -> int:
+        return len(self._pools)
+
+    def submit(
+        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+    ) -> None:
+        # Here and not in a callback: a process dies with the thread that has started it.
+        place = next(i for i in range(len(self._pools)) if i not in self._at.values())
+        pool = self._pools[place]
+        if pool is None:
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(1, context, _begin, (os.getpid(), None))
+            self._pools[place] = pool
+        self._at[name] = place
+        try:
+            future = pool.submit(task, *arguments)
+        except BrokenExecutor:  # its process has died between two trainings
+            self._pools[place] = None
+            del self._at[name]
+            self.submit(name, kind, identity, task, *arguments)
+            return
+        self._waiting[future] = name
+
+    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+        found = []
+        for name, future in super().collect(timeout):
+            place = self._at.pop(name)
+            if isinstance(future.exception(), BrokenExecutor):
+                self._pools[place] = None
+                self._died.append(Death(name, []))
+                future = Future()
+                future.set_exception(LostWorkerError())
+            found.append((name, future))
+        return found
+
+    def deaths(self) -> list[Death]:
+        found, self._died = self._died, []
+        return found
+
+    def shutdown(self, *, wait: bool) -> None:
+        """Let the processes end; wait: until they have."""
+        for pool in self._pools:
+            if pool is not None:
+                pool.shutdown(wait, cancel_futures=not wait)
+
+
+@contextlib.contextmanager
+def local_workers(count: int | None = None) -> Iterator[Workers]:
+    """This many processes on this machine, one core each; by default as many as cores.
+
+    An exception in the block ends them at once, in the middle of what they do.
+    """
+    workers = Processes(count or len(usable_cores()))
+    with safe_children(), _ended_at_once(partial(workers.shutdown, wait=False)):
+        yield workers
+        workers.shutdown(wait=True)
 
 
 @contextlib.contextmanager
 def processes(count: int | None = None) -> Iterator[Executor]:
-    """This many processes on this machine, one core each; by default as many as cores.
+    """The same as an executor, for tasks that are no trainings.
 
-    An exception in the block ends them at once, in the middle of what they do, so their files are in
-    a folder of this process, which it removes.
+    Their files are in a folder of this process, which it removes.
     """
     context = multiprocessing.get_context("spawn")
-    others = {process.pid for process in multiprocessing.active_children()}
     workers = count or len(usable_cores())
     with (
         TemporaryDirectory(prefix="pdeloop-") as folder,
         safe_children(),
         ProcessPoolExecutor(workers, context, _begin, (os.getpid(), folder)) as pool,
+        _ended_at_once(partial(pool.shutdown, wait=False, cancel_futures=True)),
     ):
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                if process.pid not in others:
-                    process.terminate()
-            raise
+        yield pool
 
 
-def _begin(parent: int, folder: str) -> None:
+@contextlib.contextmanager
+def _ended_at_once(shutdown: Callable[[], None]) -> Iterator[None]:
+    """An exception in the block ends the processes that were started in it, after `shutdown`."""
+    others = {process.pid for process in multiprocessing.active_children()}
+    try:
+        yield
+    except BaseException:
+        shutdown()
+        for process in multiprocessing.active_children():
+            if process.pid not in others:
+                process.terminate()
+        raise
+
+
+def _begin(parent: int, folder: str | None) -> None:
     """In a process that is about to train. Ctrl-C is for its parent, which then ends it.
 
-    folder: where its trainings keep their files.
+    folder: where its trainings keep their files, if no other place is named.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with(parent)
     use_cores(usable_cores()[:1])  # the others have trainings of their own
-    training.work_in(folder)
-
-
-@contextlib.contextmanager
-def cluster(address: str) -> Iterator[Executor]:
-    """The workers of the Dask scheduler at `address` (tcp://HOST:PORT).
-
-    StudyError where that is not an address, no scheduler answers there, it or a worker has another
-    version of Dask, there are no workers, or one has no pdeloop.
-    """
-    from distributed import Client
-    from distributed.versions import VersionMismatchWarning
-
-    own = metadata.version("distributed")
-    there = {"scheduler": _version_at(address)}  # first: a client fails in many ways at another one
-    _check_versions(there, own)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", VersionMismatchWarning)
-        client = Client(address, timeout=CONNECTING, set_as_default=False)
-    with client:
-        found: Any = client.get_versions()
-        workers = found["workers"]
-        if not workers:
-            raise StudyError(
-                f"the scheduler at {address} has no workers; start some with: "
-                + WORKER.format(address=address)
-            )
-        known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
-        _check_versions(known, own)
-        # A worker would end at a task of a package that it lacks.
-        installed = client.run(metadata.version, "pdeloop", on_error="return")
-        for at, version in installed.items():
-            if isinstance(version, Exception):
-                raise StudyError(
-                    f"the worker at {at} has no pdeloop; install pdeloop[cluster] there"
-                )
-        pool = client.get_executor(retries=RETRIES)
-        pool.client = client
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False)
-            raise
-
-
-def no_worker(pool: Executor) -> str:
-    """Message that a Dask cluster has no worker left; empty if it has, and for other executors."""
-    client = getattr(pool, "client", None)
-    with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
-        if client is not None and not client.scheduler_info()["workers"]:
-            start = WORKER.format(address=client.scheduler.address)
-            return f"no worker is left; waiting for one to be started: {start}"
-    return ""
-
-
-def _check_versions(versions: Mapping[str, str], own: str) -> None:
-    for whose, version in versions.items():
-        if version != own:
-            raise StudyError(
-                f"the {whose} has Dask {version}, and this machine has {own}; install the same on all"
-            )
-
-
-def _version_at(address: str) -> str:
-    """The version of Dask of the scheduler there."""
-    from distributed.comm.addressing import get_address_host_port
-    from distributed.core import rpc
-    from distributed.security import Security
-
-    async def ask() -> str:
-        security = Security().get_connection_args("client")
-        async with rpc(address, connection_args=security, timeout=CONNECTING) as scheduler:
-            found = await asyncio.wait_for(scheduler.versions(), CONNECTING)
-            return str(found["packages"]["distributed"])
-
-    try:
-        get_address_host_port(address, strict=True)
-        return asyncio.run(ask())
-    except ValueError as error:
-        raise StudyError(
-            f"the scheduler's address is {address!r}; expected one like tcp://localhost:8786"
-        ) from error
-    except TypeError as error:  # distributed's word for a tls:// address without certificates
-        raise StudyError(
-            f"{address} needs certificates, which Dask's configuration does not name: set ca-file, "
-            "client.cert and client.key in distributed.comm.tls"
-        ) from error
-    except OSError as error:
-        raise StudyError(
-            f"no Dask scheduler answers at {address} within {CONNECTING:.0f} s; start one with: "
-            "dask scheduler"
-        ) from error
+    if folder is not None:
+        training.work_in(folder)

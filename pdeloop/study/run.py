@@ -1,49 +1,44 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Carries out a study, or continues it: trains what its folder does not have yet.
 
-DIR/study.json                what was asked for
-DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a finished training, with
-                              `curves` also curve.npz (pdeloop.study.training.curve)
+The folder's files: pdeloop.study.results.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shlex
+import shutil
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
-from contextlib import AbstractContextManager
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from loop_interfaces.files import make_folder, read_json, write_atomically
 from pde_sim_node.build import fingerprint
+from pdeloop.study.deaths import LINES, MOST_DEATHS, Deaths
 from pdeloop.study.description import Study, StudyError
-from pdeloop.study.executors import no_worker
-from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
+from pdeloop.study.executors import Death, Files, LostWorkerError, Processes, Workers
+from pdeloop.study.results import STUDY_FILE, UNFINISHED, Ended, Results, writing
+from pdeloop.study.training import CURVE, FILES, Place, differences, train_one
 from pdeloop.training_run import load_compiled
-from tuner_node.run_folder import RunFolder, parameter_changes
+from tuner_node.run_folder import RunFolder, RunFolderError, parameter_changes
 
-STUDY_FILE = "study.json"
 ATTEMPTS = 3
-"""Executors that may break, as when the system kills a process for its memory."""
-POLL, WORKER_CHECK = 0.1, 2.0
-"""Seconds between two calls of `tell`, and between two checks for workers while no task ends."""
+"""Executors in a row that may break without a result, as when one cannot start its workers."""
+POLL = 0.1
+"""Seconds between two calls of `tell`."""
 
 Progress = Callable[[int, int, str], None]
-Task = Callable[[Mapping[str, Any], Mapping[str, str] | None], dict[str, bytes]]
-"""(resolved parameters, expected environment) -> content of each file, result.json the last."""
+Task = Callable[[Mapping[str, Any]], Files]
+"""(resolved parameters) -> content of each file, result.json among them."""
+Pool = Callable[[], AbstractContextManager[Executor | Workers]]
 _NO_TASKS: Mapping[str, Task] = {}
+_COLUMNS = "name, problem, seed, failure, deaths, plant, parameters, environment"
 
 
 class Failure(NamedTuple):
@@ -53,40 +48,15 @@ class Failure(NamedTuple):
     reason: str
 
 
-def write_study(folder: Path, study: Study) -> None:
-    """Begin a study in `folder`. StudyError if there is another one, or it cannot be written."""
-    if (folder / "parameters.yaml").exists():
-        raise StudyError(f"{folder} holds a run; choose another folder")
-    try:
-        if (folder / STUDY_FILE).exists():
-            if read_study(folder) != study:
-                raise StudyError(
-                    f"{folder} holds another study; choose another folder, or give "
-                    f"--out {shlex.quote(str(folder))} alone to continue the one there"
-                )
-            return
-        make_folder(folder)
-        write_atomically(folder / STUDY_FILE, json.dumps(study.content(), indent=1).encode())
-    except OSError as error:
-        raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
-
-
-def read_study(folder: Path) -> Study:
-    """The study in `folder`. StudyError if there is none."""
-    try:
-        return Study.of(read_json(folder / STUDY_FILE))
-    except (OSError, ValueError, AttributeError) as error:
-        raise StudyError(f"no study in {folder}: {STUDY_FILE} cannot be used ({error})") from error
-
-
 def run(
     study: Study,
     folder: Path,
-    executor: Callable[[], AbstractContextManager[Executor]],
+    executor: Pool,
     *,
     tasks: Mapping[str, Task] = _NO_TASKS,
     any_environment: bool = False,
     again: bool = False,
+    most_deaths: int = MOST_DEATHS,
     tell: Progress = lambda done, total, status: None,
 ) -> list[Failure]:
     """Train what is not finished yet.
@@ -96,10 +66,11 @@ def run(
     study : Study
         What to train.
     folder : Path
-        Of the results; only this process writes there, the workers need no access to it.
+        Of the results; only this process writes them, the workers need no access to it. Those that
+        have it continue what others have begun.
     executor : callable
-        Makes the `concurrent.futures.Executor` that runs the trainings, as a context manager
-        (`pdeloop.study.executors`); called again if an executor breaks.
+        Makes the `concurrent.futures.Executor` that runs the trainings, or the
+        `pdeloop.study.executors.Workers`, as a context manager; called again if an executor breaks.
     tasks : dict of str to callable
         What is carried out instead of a training, by the variant's name. A worker must be able to
         import it, and its result.json have the entry `environment`.
@@ -107,10 +78,12 @@ def run(
         Take results of workers with other versions or another processor, which may differ in the
         last bits; each result.json says which.
     again : bool
-        Train anew where a finished training was made with other parameters or another plant than the
+        Train anew what has failed, and what was made with other parameters or another plant than the
         study has now, which is refused otherwise.
+    most_deaths : int
+        Workers that one training may lose.
     tell : callable
-        Called with the number of trainings that are done, that of all, and what was done last.
+        Called with the number of trainings that are done, that of all, and a few words.
 
     Returns
     -------
@@ -120,111 +93,374 @@ def run(
     Raises
     ------
     StudyError
-        The executor broke `ATTEMPTS` times, a worker has another environment, a finished training
-        was made with something else than the study has now, or the folder cannot be written.
+        The executor broke `ATTEMPTS` times without a result, workers have different environments, a
+        finished training was made with something else than the study has now, another process
+        works on the study, or the folder cannot be written.
     """
     trainings = study.trainings()  # refuses before there is a folder
-    expected = None if any_environment else environment()
-    finished = {name for name in trainings if (folder / name / "result.json").exists()}
-    known = {n: v for n, v in trainings.items() if n in finished and n.split("/")[1] not in tasks}
-    if other := made_otherwise(folder, known):
-        if not again:
-            raise StudyError(_refusal(folder, other))
-        finished -= set(other)
-        for name in other:
-            (folder / name / "result.json").unlink()
-    if expected is not None:
-        _check_finished(folder, finished, expected)
-    train = partial(train_one, curves=study.curves)
-    failures: list[Failure] = []
-    for _ in range(ATTEMPTS):
-        try:
-            with executor() as pool:
-                todo = {n: v for n, v in trainings.items() if n not in finished}
-                if isinstance(pool, ProcessPoolExecutor):  # of this machine: once for all of them
-                    different = {(v["equation"], v["optimizer"]): v for v in todo.values()}
-                    for values in different.values():
-                        load_compiled(values, fits=True)
-                write_study(folder, study)  # not before there are workers
-                waiting = {
-                    pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
-                    for n, v in todo.items()
-                }
-                _collect(pool, waiting, folder, finished, failures, len(trainings), tell)
-            return failures
-        except (BrokenExecutor, CancelledError) as error:
-            broken = error
-    raise StudyError(
-        f"the workers ended {ATTEMPTS} times before their trainings ({broken}); is there enough "
-        f"memory? {len(finished)} of {len(trainings)} are done and kept in {folder}"
-    )
+    with ExitStack() as stack:
+        driver: _Driver | None = None
 
+        def begun() -> _Driver:
+            results = stack.enter_context(writing(folder, study))
+            how = (any_environment, again, most_deaths)
+            return _Driver(study, trainings, results, tasks, tell, *how)
 
-def _collect(
-    pool: Executor,
-    waiting: dict[Future[dict[str, bytes]], str],
-    folder: Path,
-    finished: set[str],
-    failures: list[Failure],
-    total: int,
-    tell: Progress,
-) -> None:
-    """Write every result as it comes."""
-    status, lacking, check_at = "", "", time.monotonic() + WORKER_CHECK
-    while waiting:
-        tell(len(finished), total, lacking or status)
-        done, _ = wait(waiting, timeout=POLL, return_when=FIRST_COMPLETED)
-        if done or time.monotonic() > check_at:
-            check_at = time.monotonic() + WORKER_CHECK
-            lacking = no_worker(pool)
-        for future in done:
-            status = waiting.pop(future)
+        if (folder / STUDY_FILE).exists():
+            driver = begun()
+        attempts = 0
+        while True:
+            before = driver.done if driver else 0
             try:
-                files = future.result()
-            except EnvironmentMismatchError as error:
-                raise StudyError(
-                    f"{error}: its results may differ in the last bits; install the same "
-                    "everywhere, or accept them with --any-environment"
-                ) from error
-            except (BrokenExecutor, CancelledError):
+                with _kept(executor, driver, folder) as pool:
+                    driver = driver or begun()  # no folder before there are workers
+                    driver.carry_out(pool if isinstance(pool, Workers) else Workers(pool))
+                return driver.failures()
+            except (BrokenExecutor, CancelledError) as error:
+                attempts = 0 if driver and driver.done > before else attempts + 1
+                if attempts == ATTEMPTS:
+                    done = driver.done if driver else 0
+                    raise StudyError(
+                        f"the workers ended {ATTEMPTS} times before their trainings ({error}); is "
+                        f"there enough memory? {done} of {len(trainings)} are done and kept in {folder}"
+                    ) from error
+
+
+@contextmanager
+def _kept(executor: Pool, driver: _Driver | None, folder: Path) -> Iterator[Executor | Workers]:
+    """The executor; where it cannot be made again, the error says what is kept."""
+    with ExitStack() as stack:
+        try:
+            pool = stack.enter_context(executor())
+        except StudyError as error:
+            if driver is None:
                 raise
-            except (ValueError, RuntimeError) as error:
-                failures.append(Failure(status, str(error)))
-            except Exception as error:  # of a worker: no memory, no disk, no pdeloop, given up
-                failures.append(Failure(status, f"{type(error).__name__}: {error}"))
+            raise StudyError(
+                f"{error}; {driver.done} trainings are kept in {folder}, which "
+                f"`pdeloop study --out {shlex.quote(str(folder))}` continues"
+            ) from error
+        yield pool
+
+
+class _Driver:
+    """What one process knows of a study that it carries out."""
+
+    def __init__(
+        self,
+        study: Study,
+        trainings: Mapping[str, Mapping[str, Any]],
+        results: Results,
+        tasks: Mapping[str, Task],
+        tell: Progress,
+        any_environment: bool,
+        again: bool,
+        most_deaths: int,
+    ) -> None:
+        self._trainings, self._results, self._tasks, self._tell = trainings, results, tasks, tell
+        self._train = partial(train_one, curves=study.curves)
+        self._files = (CURVE, *FILES) if study.curves else FILES
+        self._deaths = Deaths(most_deaths)
+        self._environments = Environments(any_environment)
+        self._plants: dict[str, int] = {}
+        self._finished: set[str] = set()
+        self._failures: dict[str, str] = {}
+        self._began = time.monotonic()
+        self._ended_here = 0
+        self._read(again)
+
+    @property
+    def done(self) -> int:
+        """The trainings that have ended."""
+        return len(self._finished)
+
+    def failures(self) -> list[Failure]:
+        """Those that cannot be carried out, in the order of the study."""
+        failed = self._failures
+        return [Failure(name, failed[name]) for name in self._trainings if name in failed]
+
+    def _read(self, again: bool) -> None:
+        """Know what is finished, and refuse what was made otherwise."""
+        other: dict[str, str] = {}
+        for row in self._results.rows(_COLUMNS, "1"):
+            name = row["name"]
+            if row["deaths"]:
+                self._deaths.known(name, row["deaths"])
+            if name not in self._trainings or row["parameters"] is None:
+                continue
+            changes = self._changes(name, json.loads(row["parameters"]), row["plant"])
+            if row["failure"] is not None:
+                if again or changes:
+                    continue
+                self._failures[name] = row["failure"]
+            elif changes:
+                other[name] = changes
+                continue
             else:
-                _write(folder / status, files)
-            finished.add(status)
-    tell(len(finished), total, status)
+                self._environments.know(name, json.loads(row["environment"]))
+            self._finished.add(name)
+        found = self._in_folders(other)
+        if other and not again:
+            raise StudyError(_refusal(self._results.folder, other))
+        self._results.forget(other)
+        self._results.add(found)
+        self._finished |= {one.name for one in found}
 
+    def _in_folders(self, other: dict[str, str]) -> list[Ended]:
+        """Trainings that have only a run folder: finished when no driver was there, or by hand."""
+        found = []
+        folder = self._results.folder
+        for name in self._trainings:
+            if name in self._finished or self._task(name) is not None:
+                continue
+            for place in (folder / UNFINISHED / name, folder / name):
+                if (place / FILES[-1]).exists():
+                    run = RunFolder(place)
+                    try:
+                        result, _ = run.result(), run.policies()
+                        changes = self._changes(name, run.parameters(), result.get("plant"))
+                        files = {each: (place / each).read_bytes() for each in self._files}
+                    except (RunFolderError, OSError):
+                        continue  # half copied, or damaged: it is trained anew
+                    if changes and place == folder / name:
+                        other[name] = changes
+                    if not changes:
+                        self._environments.know(name, result.get("environment", {}))
+                        found.append(Ended(name, self._trainings[name], files))
+                        break
+        return found
 
-def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    try:
-        make_folder(folder)
-        for name, content in files.items():  # result.json last: with it the training is finished
-            write_atomically(folder / name, content)
-    except OSError as error:
-        raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
+    def _changes(self, name: str, known: Mapping[str, Any], plant: int | None) -> str:
+        """How a training was made otherwise than it is asked for now, in words; empty: it was not."""
+        if changes := parameter_changes(known, self._trainings[name]):
+            return changes
+        if plant is not None and plant != self._plant(name):
+            return "another plant: its code or its data have changed"
+        return ""
 
-
-def made_otherwise(folder: Path, trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """What finished trainings in `folder` were made with, where that is not what is asked for.
-
-    trainings: the resolved parameters that each is asked to have. Returns the differences in words.
-    """
-    plants: dict[str, int] = {}
-    found = {}
-    for name, values in trainings.items():
+    def _plant(self, name: str) -> int:
         whose = name.rpartition("/")[0]
-        if whose not in plants:  # one for all seeds
-            plants[whose] = fingerprint(values)
-        run = RunFolder(folder / name)
-        changes = parameter_changes(run.parameters(), values)
-        if not changes and run.result().get("plant") != plants[whose]:
-            changes = "another plant: its code or its data have changed"
-        if changes:
-            found[name] = changes
-    return found
+        if whose not in self._plants:  # one for all seeds
+            self._plants[whose] = fingerprint(self._trainings[name])
+        return self._plants[whose]
+
+    def _task(self, name: str) -> Task | None:
+        return self._tasks.get(name.split("/")[1])
+
+    def carry_out(self, workers: Workers) -> None:
+        """Train what is missing."""
+        todo = deque(name for name in self._trainings if name not in self._finished)
+        self._environments.meet(workers.environments, workers.kinds())
+        workers.begin(self._results.study_id)
+        if isinstance(workers, Processes):  # of this machine: once for all of them
+            heads = {name.rpartition("/")[0]: name for name in todo}
+            each = [self._trainings[name] for name in heads.values()]
+            for values in {(v["equation"], v["optimizer"]): v for v in each}.values():
+                load_compiled(values, fits=True)
+        waiting: set[str] = set()
+        while todo or waiting:
+            while todo and len(waiting) < workers.window:
+                name = todo.popleft()
+                self._submit(workers, name)
+                waiting.add(name)
+            workers.settle()
+            self._tell(self.done, len(self._trainings), self._status(workers))
+            ended: list[Ended] = []
+            try:
+                for name, future in workers.collect(POLL):
+                    waiting.discard(name)
+                    one = self._outcome(name, future)
+                    if one is None:
+                        todo.appendleft(name)
+                    else:
+                        ended.append(one)
+                        self._deaths.ended(name)
+                for death in workers.deaths():
+                    reason = self._died(death)
+                    if reason and death.name in todo:
+                        todo.remove(death.name)
+                    elif reason and death.name in waiting:
+                        workers.take_back(death.name)
+                        waiting.discard(death.name)
+                    else:
+                        continue
+                    ended.append(Ended(death.name, self._trainings[death.name], {}, reason))
+            finally:
+                self._keep(ended)
+        self._tell(self.done, len(self._trainings), "")
+
+    def _died(self, death: Death) -> str:
+        """Count a death; why its training is given up, empty: it is not."""
+        rows = death.progress or self._progress(death.name)
+        reason = self._deaths.died(death.name, rows, announced=death.announced)
+        self._results.died(death.name, self._deaths.of(death.name))
+        return reason
+
+    def _submit(self, workers: Workers, name: str) -> None:
+        values, task = self._trainings[name], self._task(name)
+        content = json.dumps([dict(values), self._plant(name)], sort_keys=True)
+        identity = hashlib.sha256(content.encode()).hexdigest()[:16]
+        kind = self._environments.kind_for(name)
+        if task is not None:
+            workers.submit(name, kind, identity, task, values)
+            return
+        root = str((self._results.folder / UNFINISHED).resolve())
+        place = Place(root, self._results.study_id, name)
+        workers.submit(name, kind, identity, self._train, values, place)
+
+    def _outcome(self, name: str, future: Future[Files]) -> Ended | None:
+        """How a training has ended; None: it has to be submitted again."""
+        values = self._trainings[name]
+        try:
+            files = future.result()
+            result = json.loads(files[FILES[-1]])
+        except LostWorkerError:
+            return None
+        except (BrokenExecutor, CancelledError):
+            raise
+        except (ValueError, RuntimeError) as error:
+            return Ended(name, values, {}, str(error))
+        except Exception as error:  # of a worker: no memory, no disk
+            return Ended(name, values, {}, f"{type(error).__name__}: {error}")
+        self._environments.require(name, result.get("environment", {}))
+        if (plant := result.get("plant")) is not None and plant != self._plant(name):
+            raise StudyError(
+                f"a worker has another plant for {name} than this machine: the code or the data of the "
+                "plant differ; have the same on all"
+            )
+        return Ended(name, values, files)
+
+    def _keep(self, ended: list[Ended]) -> None:
+        if not ended:
+            return
+        self._results.add(ended)
+        self._ended_here += len(ended)
+        folder = self._results.folder
+        for one in ended:
+            self._finished.add(one.name)
+            place = folder / UNFINISHED / one.name
+            if one.failure is not None:
+                self._failures[one.name] = one.failure
+                if place.is_dir() and not (folder / one.name).exists():
+                    (folder / one.name).parent.mkdir(parents=True, exist_ok=True)
+                    place.rename(folder / one.name)
+            shutil.rmtree(place, ignore_errors=True)
+            for above in (place.parent, place.parent.parent):
+                if above.is_dir() and not any(above.iterdir()):
+                    above.rmdir()
+
+    def _progress(self, name: str) -> list[Mapping[str, Any]]:
+        """The last rows that a training has left in its folder."""
+        path = self._results.folder / UNFINISHED / name / "progress.jsonl"
+        try:
+            lines = path.read_bytes()[-4096:].splitlines()[-LINES:]
+            return [json.loads(line) for line in lines if line.startswith(b"{")]
+        except (OSError, ValueError):
+            return []
+
+    def _status(self, workers: Workers) -> str:
+        if lacking := workers.remark():
+            return lacking
+        minutes = (time.monotonic() - self._began) / 60
+        words = []
+        if self._ended_here:
+            rate = self._ended_here / minutes
+            left = (len(self._trainings) - self.done) / rate
+            words.append(f"{rate:.3g} a minute, {left:.0f} min left")
+        if self._failures:
+            words.append(f"{len(self._failures)} failed")
+        if self._deaths.total:
+            words.append(f"{self._deaths.total} workers lost")
+        return ", ".join([*words, *filter(None, [self._environments.remark])])
+
+
+class Environments:
+    """The environments of workers, which are compared with each other.
+
+    All have the same versions. The trainings of a problem and a seed are compared with each other, so
+    they are carried out on one kind of processor.
+    """
+
+    def __init__(self, anything: bool) -> None:
+        self._anything = anything
+        self._versions: dict[str, str] | None = None
+        self._kinds: dict[tuple[str, str], str] = {}
+        self._workers: Mapping[str, int] = {}
+        self._given: Counter[str] = Counter()
+        self.remark = ""
+
+    def know(self, name: str, environment: Mapping[str, str]) -> None:
+        """A training was carried out in this environment, before."""
+        versions, kind = _split(environment)
+        self._versions = versions if self._versions is None else self._versions
+        if not self._anything and (other := differences(versions, self._versions)):
+            raise StudyError(f"{name} was trained with {other}: {_OTHER}")
+        self._kinds.setdefault(_group(name), kind)
+
+    def meet(
+        self, environments: Mapping[str, Mapping[str, str]], workers: Mapping[str, int]
+    ) -> None:
+        """These are the workers' environments, and their numbers by kind of processor."""
+        if self._anything:
+            return
+        self._workers = workers
+        for environment in environments.values():
+            self._same_versions(_split(environment)[0])
+        if len(workers) > 1:
+            kinds = ", ".join(f"{number} {kind}" for kind, number in workers.items())
+            self.remark = (
+                f"workers have different processors ({kinds}), so the trainings of a seed of a problem "
+                "stay on one kind"
+            )
+
+    def kind_for(self, name: str) -> str:
+        """The kind of processor that a training is carried out on; empty: any."""
+        if not self._workers:
+            return ""
+        group = _group(name)
+        if group not in self._kinds:
+            kind = min(self._workers, key=lambda own: self._given[own] / self._workers[own])
+            self._kinds[group] = kind
+        kind = self._kinds[group]
+        self._given[kind] += 1
+        if kind not in self._workers:
+            raise StudyError(
+                f"other trainings of seed {group[1]} of {group[0]} were carried out on a processor "
+                f"{kind}, which no worker has: start one that has it, or accept results that may "
+                "differ in the last bits with --any-environment"
+            )
+        return kind
+
+    def require(self, name: str, environment: Mapping[str, str]) -> None:
+        """StudyError unless this environment of a result is that of the others."""
+        if self._anything:
+            return
+        versions, kind = _split(environment)
+        self._same_versions(versions)
+        known = self._kinds.setdefault(_group(name), kind)
+        if kind != known:
+            raise StudyError(f"a worker has the processor {kind} instead of {known}: {_OTHER}")
+
+    def _same_versions(self, versions: dict[str, str]) -> None:
+        self._versions = versions if self._versions is None else self._versions
+        if other := differences(versions, self._versions):
+            raise StudyError(f"a worker has {other}: {_OTHER}")
+
+
+_OTHER = (
+    "results may differ in the last bits; install the same everywhere, or accept them with "
+    "--any-environment"
+)
+
+
+def _split(environment: Mapping[str, str]) -> tuple[dict[str, str], str]:
+    versions = dict(environment)
+    return versions, versions.pop("processor", "")
+
+
+def _group(name: str) -> tuple[str, str]:
+    """Problem and seed of a training."""
+    problem, _, seed = name.split("/")
+    return problem, seed
 
 
 def _refusal(folder: Path, other: Mapping[str, str]) -> str:
@@ -234,14 +470,3 @@ def _refusal(folder: Path, other: Mapping[str, str]) -> str:
         f"{folder / name} was not made with what the study has now ({changes}){more}; choose another "
         "folder, or train anew what differs with --again"
     )
-
-
-def _check_finished(folder: Path, names: set[str], expected: Mapping[str, str]) -> None:
-    """StudyError if a finished training was carried out in another environment."""
-    for name in sorted(names):
-        result: dict[str, Any] = read_json(folder / name / "result.json")
-        if result.get("environment") != expected:
-            raise StudyError(
-                f"{folder / name} was trained with other versions or on another processor: the rest "
-                "may differ from it in the last bits; continue there, or with --any-environment"
-            )

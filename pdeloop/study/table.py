@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from io import BytesIO
@@ -13,17 +15,11 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.controllers import CONTROLLERS
-from pdeloop.finished_run import (
-    CONFIDENCE,
-    FinishedRun,
-    field_means,
-    interval,
-    load_run,
-    reduction,
-)
+from pdeloop.finished_run import CONFIDENCE, field_means, interval, reduction
 from pdeloop.output import aligned
 from pdeloop.study.description import Study
-from pdeloop.study.training import differences, environment
+from pdeloop.study.results import reading
+from pdeloop.study.training import differences
 from tuner_node.rollouts import EVALUATED
 
 CAVEAT = (
@@ -39,38 +35,52 @@ AVERAGES = ("ratio of the means", "mean of the ratios")
 
 
 def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
-    """`figures` of every problem and variant, from the trainings in `folder` that are finished.
+    """`figures` of every problem and variant, from the trainings that are finished so far.
 
-    `other_environments` says how those differ from this process's in which some were carried out.
+    `other_environments` says how those differ from most of the study in which some were carried out.
     """
-    found, here = [], environment()
+    found: dict[tuple[str, str], dict[int, tuple[Any, float]]] = {}
+    environments: dict[tuple[str, str], Counter[str]] = {}
+    with reading(folder) as results:
+        columns = "problem, variant, seed, costs, rollouts, environment"
+        for row in results.rows(columns, "costs IS NOT NULL"):
+            key = row["problem"], row["variant"]
+            found.setdefault(key, {})[row["seed"]] = json.loads(row["costs"]), row["rollouts"]
+            environments.setdefault(key, Counter())[row["environment"]] += 1
+    together = sum(environments.values(), Counter[str]())
+    most = json.loads(together.most_common(1)[0][0]) if together else {}
+    table = []
     for problem in study.problems:
         for variant in study.variants:
-            places = [folder / problem / variant / str(seed) for seed in study.seeds]
-            runs = [load_run(place) for place in places if (place / "result.json").exists()]
-            if runs:
-                own = figures(runs)
-                others = {differences(run.result.get("environment", {}), here) for run in runs}
-                own["other_environments"] = sorted(others - {""})
-                found.append({"problem": problem, "variant": variant, **own})
-    return found
+            own = found.get((problem, variant), {})
+            seeds = [own[seed] for seed in study.seeds if seed in own]
+            if seeds:
+                costs = {n: np.concatenate([np.array(c[n]) for c, _ in seeds]) for n in EVALUATED}
+                others = {
+                    differences(json.loads(each), most) for each in environments[problem, variant]
+                }
+                entries = figures(costs, [paid for _, paid in seeds])
+                entries["other_environments"] = sorted(others - {""})
+                table.append({"problem": problem, "variant": variant, **entries})
+    return table
 
 
-def figures(runs: Sequence[FinishedRun]) -> dict[str, Any]:
-    """The figures of runs over all their seeds, whose models may have different orders.
+def figures(measured: Mapping[str, Array], rollouts: Sequence[float]) -> dict[str, Any]:
+    """The figures of trainings over all their seeds, whose models may have different orders.
+
+    measured: costs (S, fields) of the closing evaluation, by controller; rollouts (S,).
 
     Means are over the seeds without those in which a rollout of the closing evaluation diverged,
     which `diverged` counts; `interval` is the percentile bootstrap over the seeds, and
     `below_lqt_percent` the `pdeloop.finished_run.Reduction`.
     """
-    measured = {name: np.concatenate([run.costs[name] for run in runs]) for name in EVALUATED}
     means = {name: field_means(costs) for name, costs in measured.items()}
     adapted = means["adapted"]
     good = adapted[np.isfinite(adapted)]
     below = reduction(measured["adapted"], measured["lqt"])
     return {
         "seeds": len(adapted),
-        "rollouts": float(np.mean([own["total"] for run in runs for own in run.rollouts])),
+        "rollouts": float(np.mean(rollouts)),
         "cost_by_seed": [float(cost) if np.isfinite(cost) else None for cost in adapted],
         "none": _mean(means["none"]),
         "lqt": _mean(means["lqt"]),

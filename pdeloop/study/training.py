@@ -3,7 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from contextvars import ContextVar
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,12 +21,14 @@ import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.files import make_folder, write_atomically
 from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import built_in
 from tuner_node.build import build_training
 from tuner_node.results import versions
-from tuner_node.run_folder import RunFolder
+from tuner_node.run_folder import RunFolder, RunFolderError, parameter_changes
+from tuner_node.run_store import RunWriter
 
 FILES = ("parameters.yaml", "policy.npz", "result.json")
 """The files of a run folder that a training of a study leaves, in the order of writing."""
@@ -28,10 +37,51 @@ CURVE = "curve.npz"
 _ONE_AT_A_TIME = Lock()
 """A worker that runs tasks in threads: a training uses NumPy's and Numba's own threads."""
 _folder: str | None = None
+_listener: ContextVar[Callable[[Mapping[str, Any]], None]] = ContextVar(
+    "listener", default=lambda row: None
+)
+"""What is told of each batch of the training: its phase, rollouts and memory."""
+CHECKPOINT_PERIOD, CHECKPOINT_SHARE = 10.0, 0.05
+"""Seconds between two checkpoints of a training, and the share of its time that they may take."""
+PLANT_FILE = "plant"
+"""The file of an unfinished training that has the fingerprint of its plant."""
 
 
-class EnvironmentMismatchError(ValueError):
-    """A worker has other versions or another processor than the study."""
+@dataclass(frozen=True)
+class Place:
+    """Where all processes that see it keep the run folder of a training.
+
+    Attributes
+    ----------
+    root : str
+        A folder of the study, whose file `study` has the study's id.
+    study : str
+        That id, by which a worker on another machine knows that it sees the same folder.
+    name : str
+        Of the training: its folder in `root`.
+    """
+
+    root: str
+    study: str
+    name: str
+
+    def run_folder(self) -> Path | None:
+        """The run folder of the training; None where this process does not see it."""
+        root = Path(self.root)
+        try:
+            return root / self.name if (root / "study").read_text() == self.study else None
+        except (OSError, ValueError):
+            return None
+
+
+@contextlib.contextmanager
+def listening(tell: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
+    """Have `tell` called after each batch of the trainings of this thread."""
+    before = _listener.set(tell)
+    try:
+        yield
+    finally:
+        _listener.reset(before)
 
 
 def work_in(folder: str) -> None:
@@ -47,14 +97,6 @@ def environment() -> dict[str, str]:
     return {**known, "processor": str(llvmlite.binding.get_host_cpu_name())}
 
 
-def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
-    """The `environment` of this process; EnvironmentMismatchError if another one is expected."""
-    here = environment()
-    if expected is not None and (other := differences(here, expected)):
-        raise EnvironmentMismatchError(f"a worker has {other}")
-    return here
-
-
 def differences(there: Mapping[str, str], expected: Mapping[str, str]) -> str:
     """Differences of another environment from the expected one, in words; empty if there are none."""
     return ", ".join(
@@ -65,36 +107,96 @@ def differences(there: Mapping[str, str], expected: Mapping[str, str]) -> str:
 
 
 def train_one(
-    parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None, curves: bool = False
+    parameters: Mapping[str, Any], place: Place | None = None, curves: bool = False
 ) -> dict[str, bytes]:
     """Train in this process: a function of the resolved parameters alone.
 
-    expected: the `environment` in which alone the result may be computed, None: any; curves: with
-    the cost of every policy that the training has. Returns the content of each of `FILES`, before
-    them that of `CURVE`; `environment` is an entry of result.json. EnvironmentMismatchError in
-    another environment; ValueError or RuntimeError for a training that cannot be carried out.
+    place: where this process and later ones keep the run folder, so that one continues what another
+    has begun; curves: with the cost of every policy that the training has, for which it begins again.
+    Returns the content of each of `FILES`, before them that of `CURVE`; `environment` is an entry of
+    result.json. ValueError or RuntimeError for a training that cannot be carried out.
     """
-    here = require_environment(expected)
-    with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-", dir=_folder) as place:
-        folder = RunFolder(Path(place) / "run")
-        folder.create(parameters)
-        training = build_training(parameters)
+    with _ONE_AT_A_TIME, ExitStack() as stack:
         pair = LocalPair(parameters)
-        policies: list[NDArray[np.float64]] = []
-        rollouts: list[float] = []
+        folder = _opened(stack, place, parameters, pair.fingerprint, anew=curves)
+        names = (CURVE, *FILES) if curves else FILES
+        if not (folder.path / FILES[-1]).exists():
+            _train(folder, parameters, pair, curves)
+        return {name: (folder.path / name).read_bytes() for name in names}
 
-        def note() -> None:
-            if training.optimizers and training.phase != "done":
-                policies.append(training.policies()[0])
-                rollouts.append(float(training.budget.paid[0]))
 
-        train(training, pair, lambda row: None, max_batch=parameters["max_batch"], after_batch=note)
-        extra = {"transport": "in-process", "controller": built_in(training), "environment": here}
-        folder.finish(training, extra)
-        kept = {name: (folder.path / name).read_bytes() for name in FILES}
-        if curves:
-            kept = {CURVE: curve(parameters, pair, policies, rollouts), **kept}
-        return kept
+def _train(folder: RunFolder, parameters: Mapping[str, Any], pair: LocalPair, curves: bool) -> None:
+    training = build_training(parameters)
+    writer = RunWriter(folder.path, parameters, training, warn=lambda text: None)
+    policies: list[NDArray[np.float64]] = []
+    rollouts: list[float] = []
+    tell, keep_at = _listener.get(), time.monotonic() + CHECKPOINT_PERIOD
+
+    def note() -> None:
+        nonlocal keep_at
+        if training.optimizers and training.phase != "done":
+            policies.append(training.policies()[0])
+            rollouts.append(float(training.budget.paid[0]))
+        row = {
+            "phase": training.phase,
+            "rollouts": float(training.budget.paid[0]),
+            "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        }
+        writer.note(row)
+        tell(row)
+        if (now := time.monotonic()) > keep_at:
+            writer.keep(now=now, force=True)
+            took = time.monotonic() - now
+            keep_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
+
+    train(training, pair, lambda row: None, max_batch=parameters["max_batch"], after_batch=note)
+    if curves:
+        write_atomically(folder.path / CURVE, curve(parameters, pair, policies, rollouts))
+    extra = {"transport": "in-process", "controller": built_in(training)}
+    folder.finish(training, {**extra, "environment": environment()})
+
+
+def _opened(
+    stack: ExitStack,
+    place: Place | None,
+    parameters: Mapping[str, Any],
+    plant: int,
+    *,
+    anew: bool,
+) -> RunFolder:
+    """The run folder of a training, with what an earlier process has left of it; else a temporary one.
+
+    plant: its fingerprint; anew: begin again, unless there is the result.
+    """
+    path = place and place.run_folder()
+    if path:
+        folder = RunFolder(path)
+        with contextlib.suppress(OSError, RunFolderError):  # another process trains it, or no room
+            make_folder(path)
+            stack.enter_context(folder.locked())
+            if not _continues(folder, parameters, plant, anew=anew):
+                for old in path.iterdir():
+                    if old.name != "lock":
+                        shutil.rmtree(old) if old.is_dir() else old.unlink()
+                write_atomically(path / PLANT_FILE, str(plant).encode())
+                folder.begin(parameters)
+            return folder
+    within = stack.enter_context(TemporaryDirectory(prefix="pdeloop-", dir=_folder))
+    folder = RunFolder(Path(within) / "run")
+    folder.create(parameters)
+    return folder
+
+
+def _continues(folder: RunFolder, parameters: Mapping[str, Any], plant: int, *, anew: bool) -> bool:
+    """Whether what is in the folder can be continued as a training with these parameters."""
+    if anew and not (folder.path / FILES[-1]).exists():
+        return False
+    try:
+        known = folder.parameters()
+        there = int((folder.path / PLANT_FILE).read_text())
+    except (OSError, ValueError):
+        return False
+    return there == plant and not parameter_changes(known, parameters)
 
 
 def curve(

@@ -45,7 +45,8 @@ from pde_sim_node.plants.batch import BatchPlant
 from pdeloop import cli
 from pdeloop.episode import projected_law, rollout
 from pdeloop.finished_run import interval
-from pdeloop.study import StudyError
+from pdeloop.study import Study, StudyError
+from pdeloop.study.results import Ended, read_study, reading, writing
 from pdeloop.study.training import train_one
 from tests.support.small import SMALL, parameters
 
@@ -181,10 +182,10 @@ def test_the_interval_is_that_of_all_resamples() -> None:
 
 
 def write(folder: Path, method: str, seed: int, found: list[float], **more: Any) -> None:
-    place = folder / method / str(seed)
-    place.mkdir(parents=True)
     result = {"costs_by_field": {"adapted": [found]}, "rollouts": [{"total": 20}], **more}
-    (place / "result.json").write_text(json.dumps(result))
+    content = json.dumps(result).encode()
+    with writing(folder, Study.of({"problems": [str(SMALL)], "seeds": 4})) as results:
+        results.add([Ended(f"small/{method}/{seed}", {}, {"result.json": content})])
 
 
 def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -> None:
@@ -192,7 +193,7 @@ def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -
         lost = DIVERGED_COST if seed == 3 else 3.0
         write(tmp_path, "worse", seed, [3.0, lost])
         write(tmp_path, "better", seed, [1.0 + seed, 1.0 + seed])
-    rows = baselines.table(tmp_path, 20)
+    rows = baselines.table(tmp_path, "small", 20)
     assert [(row["method"], row["diverged"], row["cost"]) for row in rows] == [
         ("better", 0, 2.5),
         ("worse", 1, 3.0),
@@ -227,7 +228,7 @@ def test_the_table_has_a_column_for_each_budget_and_says_which_methods_diverged(
 def test_results_of_other_constants_are_refused(tmp_path: Path) -> None:
     from functools import partial
 
-    write(tmp_path / "small", "mpc", 0, [1.0], constants={"steps": 5})
+    write(tmp_path, "mpc", 0, [1.0], constants={"steps": 5})
     refuse_other_constants(tmp_path, {"mpc": partial(measure, "mpc", {"steps": 5})})
     with pytest.raises(ValueError, match=r"constants \{'steps': 5\}, not \{'steps': 6\}; give"):
         refuse_other_constants(tmp_path, {"mpc": partial(measure, "mpc", {"steps": 6})})
@@ -261,11 +262,17 @@ def test_a_comparison_is_a_study_that_is_continued(
         ("two-point", 2),
     }
     assert found["rows"][-1]["method"] == "no-control" and found["limits"] == {"small": None}
-    written = {path: path.stat().st_mtime_ns for path in folder.glob("small/9/*/*/*/result.json")}
-    lost = folder / "small/9/small/lqt-again/1/result.json"
-    lost.unlink()
+
+    def ended() -> dict[str, float]:
+        with reading(folder / "small/9") as results:
+            return {row["name"]: row["ended"] for row in results.rows("name, ended")}
+
+    written, lost = ended(), "small/lqt-again/1"
+    with writing(folder / "small/9", read_study(folder / "small/9")) as results:
+        results.forget([lost])
     assert run([str(file)], **how) == found
-    assert [p for p, at in written.items() if p.stat().st_mtime_ns != at] == [lost]
+    now = ended()
+    assert [name for name, at in written.items() if now[name] != at] == [lost]
     with pytest.raises(StudyError, match="holds another study"):
         run([str(file)], **{**how, "seeds": 1})
 

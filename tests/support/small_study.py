@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pdeloop.study.results import reading
 from tests.support.small import FEW_FITS, SMALL
 
 LIMIT = 300.0
@@ -22,11 +23,12 @@ CONTENT: dict[str, Any] = {
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All files of the finished trainings."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "study.json"
-    }
+    with reading(folder) as results:
+        return {
+            f"{row['name']}/{file}": content
+            for row in sorted(results.rows("name"), key=lambda row: str(row["name"]))
+            for file, content in results.files(row["name"]).items()
+        }
 
 
 @contextmanager

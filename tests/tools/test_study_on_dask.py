@@ -11,32 +11,26 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pdeloop.cli import main
 from pdeloop.study import Study, StudyError, run
-from pdeloop.study.executors import cluster
+from pdeloop.study.cluster import cluster
+from pdeloop.study.results import read_study, reading
+from pdeloop.study.status import status
+from tests.support import study_tasks
+from tests.support.dask_cluster import DaskCluster, address_in, dask_cluster
+from tests.support.interpreter import ROOT
+from tests.support.loop_harness import until
 from tests.support.small_study import CONTENT, LIMIT, contents
-
-
-def dask(folder: Path, command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
-    """A Dask process on loopback, in a session of its own, with packages of another folder first.
-
-    folder: for its temporary files, which it leaves when it is killed.
-    """
-    words = [sys.executable, "-m", "distributed.cli." + command, "--host", "127.0.0.1", *options]
-    quiet, own = subprocess.DEVNULL, {"PYTHONPATH": packages, "TMPDIR": str(folder)}
-    environment = {**os.environ, **own}
-    return subprocess.Popen(
-        words, stdout=quiet, stderr=quiet, start_new_session=True, env=environment
-    )
+from tests.support.study_tasks import runs_in
 
 
 def installed_before(name: str, folder: Path, *others: str) -> str:
@@ -50,72 +44,22 @@ def installed_before(name: str, folder: Path, *others: str) -> str:
     return str(folder)
 
 
-def address_in(file: Path) -> str:
-    """The scheduler's address, once it stands in its file: that is made first, and then written."""
-    deadline = time.monotonic() + LIMIT
-    while time.monotonic() < deadline:
-        with suppress(OSError, ValueError):
-            return str(json.loads(file.read_text())["address"])
-        time.sleep(0.05)
-    raise AssertionError("no scheduler")
-
-
-@contextmanager
-def dask_cluster(
-    folder: Path, workers: int, *, scheduler: str = "", worker: str = ""
-) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Address of a real scheduler, and its real workers, one thread each.
-
-    scheduler, worker: folders of packages that these processes have instead of those here.
-    """
-    folder.mkdir(exist_ok=True)
-    file = folder / "scheduler.json"
-    with ExitStack() as stack:
-
-        def started(command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
-            shared = ("--scheduler-file", str(file), "--no-dashboard")
-            process = dask(folder, command, *shared, *options, packages=packages)
-            stack.callback(process.wait, LIMIT)
-            stack.callback(lambda: process.poll() is None and os.kill(process.pid, signal.SIGKILL))
-            return process
-
-        started("dask_scheduler", "--port", "0", packages=scheduler)
-        address = address_in(file)
-        known = [
-            started(
-                "dask_worker",
-                "--no-nanny",
-                "--nthreads",
-                "1",
-                "--local-directory",
-                str(folder),
-                packages=worker,
-            )
-            for _ in range(workers)
-        ]
-        if workers:
-            from distributed import Client
-
-            with Client(address, set_as_default=False) as client:
-                client.wait_for_workers(workers, timeout=LIMIT)
-        yield address, known
-
-
 @pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path, tmp_path: Path):
     out = tmp_path / "out"
-    with dask_cluster(tmp_path, 2) as (address, workers):
+    with dask_cluster(tmp_path, 2) as dask:
+        one, other = dask.workers
 
         def kill_one(done: int, total: int, status: str) -> None:
-            if done and workers[0].poll() is None:
-                os.kill(workers[0].pid, signal.SIGKILL)
+            if done and one.poll() is None:
+                one.kill()
 
-        assert run(Study.of(CONTENT), out, partial(cluster, address), tell=kill_one) == []
-        assert workers[0].wait(LIMIT) == -signal.SIGKILL and workers[1].poll() is None
+        assert run(Study.of(CONTENT), out, partial(cluster, dask.address), tell=kill_one) == []
+        assert one.wait(LIMIT) == -signal.SIGKILL and other.poll() is None
 
         def kill_the_other(done: int, total: int, status: str) -> None:
-            if workers[1].poll() is None:
-                os.kill(workers[1].pid, signal.SIGKILL)
+            if other.poll() is None:
+                other.kill()
             if (
                 "no worker is left; waiting for one to be started: PYTHONSAFEPATH=1 dask worker tcp"
                 in status
@@ -123,7 +67,12 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path,
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            run(Study.of(CONTENT), tmp_path / "no", partial(cluster, address), tell=kill_the_other)
+            run(
+                Study.of(CONTENT),
+                tmp_path / "no",
+                partial(cluster, dask.address),
+                tell=kill_the_other,
+            )
     assert contents(out) == contents(reference)
 
 
@@ -134,20 +83,191 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
     older = installed_before("numpy", tmp_path / "packages")
     file, out = tmp_path / "study.yaml", str(tmp_path / "out")
     file.write_text(json.dumps({**CONTENT, "seeds": 1}))
-    with dask_cluster(tmp_path / "dask", 1, worker=older) as (address, _):
-        words = ["study", str(file), "--out", out, "--scheduler", address]
+    with dask_cluster(tmp_path / "dask", 1, worker=older) as dask:
+        dask.start_worker()
+        dask.await_workers(2)
+        words = ["study", str(file), "--out", out, "--scheduler", dask.address]
         assert main(words) == 1
         said = capsys.readouterr().err.strip().splitlines()[-1]
         assert re.fullmatch(
-            rf"pdeloop: a worker has numpy \S+ instead of {np.__version__}: .* --any-environment",
+            r"pdeloop: a worker has numpy \S+ instead of \S+: .* --any-environment",
             said,
         )
-        assert main([*words, "--any-environment"]) == 0
-    result = json.loads((tmp_path / "out/small/two-point/0/result.json").read_text())
-    numpy = result["environment"]["numpy"]
+        dask.workers[1].kill()
+        # Workers are compared with each other, and not with this machine.
+        assert main(words) == 0
+    numpy = json.loads(contents(Path(out))["small/two-point/0/result.json"])["environment"]["numpy"]
     assert numpy != np.__version__
+    assert "instead of" not in capsys.readouterr().out
+    file.write_text(json.dumps(CONTENT))
+    (tmp_path / "out/study.json").unlink()  # more seeds of the same study
+    assert main(["study", str(file), "--out", out, "--processes", "1"]) == 1
+    assert f"a worker has numpy {np.__version__} instead of {numpy}" in capsys.readouterr().err
+    assert main(["study", "--out", out, "--processes", "1", "--any-environment"]) == 0
     told = capsys.readouterr().out
-    assert "two-point*" in told and f"*: some trainings had numpy {numpy} instead of" in told
+    assert "two-point*" in told and "*: some trainings had numpy " in told
+
+
+DRIVER = """
+import sys
+from functools import partial
+from pathlib import Path
+from pdeloop.study import Study, run
+from pdeloop.study.cluster import cluster
+from pdeloop.study.results import read_study, reading
+from pdeloop.study.status import status
+from tests.support import study_tasks
+from tests.support.small_study import CONTENT
+
+if __name__ == "__main__":
+    address, out, notes, seeds = sys.argv[1:]
+    study = Study.of({**CONTENT, "seeds": int(seeds), "variants": {"noted": {}}})
+    tasks = {"noted": partial(study_tasks.noted, notes, 0.5)}
+    print(run(study, Path(out), partial(cluster, address), tasks=tasks))
+"""
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_driver_that_dies_loses_nothing_and_what_was_finished_is_not_done_again(tmp_path: Path):
+    notes, out = tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    with dask_cluster(tmp_path / "dask", 2) as dask:
+        words = [sys.executable, "-c", DRIVER, dask.address, str(out), str(notes), "6"]
+        own = {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
+        how: dict[str, Any] = {"env": {**os.environ, **own}, "text": True}
+        first = subprocess.Popen(words, **how)
+        until(lambda: len(runs_in(notes)) > 2, LIMIT, "third task")
+        with pytest.raises(StudyError, match="another process is working on the study in"):
+            run(read_study(out), out, partial(cluster, dask.address))
+        assert status(out)["running"]
+        first.kill()
+        first.wait()
+        known = status(out)
+        assert not known["running"] and known["total"] == 6
+        again = subprocess.run(words, capture_output=True, timeout=LIMIT, **how)
+    assert again.returncode == 0 and again.stdout == "[]\n", again.stderr
+    assert runs_in(notes) == [1] * 6 and status(out)["finished"] == 6
+    assert not [*temporary.iterdir()]
+    assert {path.name for path in out.iterdir()} == {"study.json", "results.sqlite", "lock"}
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_kills_its_worker_or_raises_is_told_from_what_a_dying_worker_loses(tmp_path: Path):
+    names = ("killing", "raising", "noted")
+    study = Study.of({**CONTENT, "seeds": 1, "variants": {name: {} for name in names}})
+    places = {name: tmp_path / name for name in study.variants}
+    for place in places.values():
+        place.mkdir()
+    tasks: dict[str, Any] = {
+        "killing": partial(study_tasks.killing, str(places["killing"])),
+        "raising": partial(study_tasks.raising, str(places["raising"])),
+        "noted": partial(study_tasks.noted, str(places["noted"]), 0.0),
+    }
+    with dask_cluster(tmp_path / "dask", 2, nanny=True) as dask:
+        failures = run(study, tmp_path / "out", partial(cluster, dask.address), tasks=tasks)
+    reasons = {failure.training: failure.reason for failure in failures}
+    assert {*reasons} == {"small/killing/0", "small/raising/0"}
+    assert "it kills its workers: 3 died in a row" in reasons["small/killing/0"]
+    assert reasons["small/raising/0"] == "no model can be had"
+    assert [runs_in(places[name]) for name in names] == [[3], [1], [1]]
+    found = status(tmp_path / "out")
+    assert (found["finished"], found["failed"], found["workers_lost"]) == (1, 2, 3)
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    notes, file, out = tmp_path / "notes", tmp_path / "study.yaml", tmp_path / "out"
+    file.write_text(json.dumps(CONTENT))
+    notes.mkdir()
+    with dask_cluster(tmp_path / "dask", 1) as dask:
+        scheduler = dask.scheduler
+        assert scheduler is not None
+
+        def kill(folder: Path) -> None:
+            until(lambda: [*folder.rglob("run.json")], LIMIT, "training that has begun")
+            scheduler.kill()
+
+        killer = threading.Thread(target=kill, args=(out,))
+        killer.start()
+        assert main(["study", str(file), "--out", str(out), "--scheduler", dask.address]) == 1
+        killer.join()
+    told = capfd.readouterr()
+    assert "Traceback" not in told.err + told.out, told
+    (line,) = [line for line in told.err.splitlines() if line.startswith("pdeloop: ")]
+    assert "no Dask scheduler answers at tcp://127.0.0.1:" in line
+    assert f"trainings are kept in {out}, which `pdeloop study --out {out}` continues" in line
+
+
+@pytest.mark.filterwarnings("default")
+def test_workers_with_other_processors_divide_the_study(tmp_path: Path):
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "sitecustomize.py").write_text(
+        "import llvmlite.binding\nllvmlite.binding.get_host_cpu_name = lambda: 'nocona'\n"
+    )
+    study, told = Study.of({**CONTENT, "variants": {"a": {}, "b": {}}, "seeds": 4}), set()
+    tasks = dict.fromkeys(study.variants, study_tasks.result)
+    with dask_cluster(tmp_path / "dask", 1) as dask:
+        dask.start_worker(f"{packages}:{ROOT}")
+        dask.await_workers(2)
+        run(
+            study,
+            tmp_path / "out",
+            partial(cluster, dask.address),
+            tasks=tasks,
+            tell=lambda done, total, status: told.add(status),
+        )
+    processors: dict[int, set[str]] = {}
+    with reading(tmp_path / "out") as results:
+        for row in results.rows("seed, environment"):
+            processors.setdefault(row["seed"], set()).add(
+                json.loads(row["environment"])["processor"]
+            )
+    assert len(processors) == 4 and {len(own) for own in processors.values()} == {1}
+    assert len(set.union(*processors.values())) == 2
+    assert any("workers have different processors (1 " in text for text in told)
+
+
+@pytest.mark.filterwarnings("default")
+def test_an_encrypted_scheduler_is_reached_with_certificates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    request = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        "/CN=localhost",
+    ]
+    files = ["-subj", "/CN=localhost", "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run([*request, *files], check=True, capture_output=True, timeout=LIMIT)
+    own = ("--tls-ca-file", str(certificate), "--tls-cert", str(certificate), "--tls-key", str(key))
+    file = tmp_path / "study.yaml"
+    file.write_text(json.dumps({**CONTENT, "seeds": 1, "variants": {"two-point": {}}}))
+    with ExitStack() as stack:
+        dask = DaskCluster(tmp_path / "dask", stack, ("--protocol", "tls", *own))
+        dask.start_scheduler()
+        assert dask.address.startswith("tls://127.0.0.1:")
+        dask.start_worker()
+        words = ["study", str(file), "--out", str(tmp_path / "out"), "--scheduler", dask.address]
+        assert (
+            main(words) == 1 and "needs certificates: give --tls-ca-file" in capsys.readouterr().err
+        )
+        assert main([*words, *own[:2]]) == 1
+        assert "all of --tls-ca-file, --tls-cert, --tls-key" in capsys.readouterr().err
+        wrong = [*words, *own[:4], "--tls-key", str(file)]
+        assert main(wrong) == 1 and "the certificates for tls://" in capsys.readouterr().err
+        until(lambda: main([*words, *own]) == 0, LIMIT, "worker")
 
 
 @pytest.mark.filterwarnings("default")
@@ -156,11 +276,11 @@ def test_a_scheduler_and_a_worker_with_another_dask_are_refused(tmp_path: Path):
     words = f"has Dask .*, and this machine has {metadata.version('distributed')}; install the same"
     study = Study.of(CONTENT)
     one = dask_cluster(tmp_path / "one", 0, scheduler=older)
-    with one as (address, _), pytest.raises(StudyError, match=f"the scheduler {words}"):
-        run(study, tmp_path / "out", partial(cluster, address))
+    with one as dask, pytest.raises(StudyError, match=f"the scheduler {words}"):
+        run(study, tmp_path / "out", partial(cluster, dask.address))
     other = dask_cluster(tmp_path / "other", 1, worker=older)
-    with other as (address, _), pytest.raises(StudyError, match=f"the worker at tcp://.* {words}"):
-        run(study, tmp_path / "out", partial(cluster, address))
+    with other as dask, pytest.raises(StudyError, match=f"the worker at tcp://.* {words}"):
+        run(study, tmp_path / "out", partial(cluster, dask.address))
 
 
 def test_a_schedulers_file_is_awaited_until_it_is_written(tmp_path: Path):

@@ -1,0 +1,358 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The workers of a Dask cluster, for the trainings of a study."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+import warnings
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future
+from importlib import metadata
+from typing import Any
+from uuid import uuid4
+
+from loop_interfaces.module_path import SAFE_PATH
+from pdeloop.study import training
+from pdeloop.study.deaths import LINES
+from pdeloop.study.description import StudyError
+from pdeloop.study.executors import AHEAD, Death, Files, LostWorkerError, Workers
+
+CONNECTING = 10.0
+"""Seconds in which a scheduler has to answer, and to be found again."""
+WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
+"""The command that starts a worker, which must not run modules of its working directory either."""
+ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
+"""Events of workers, in a topic of the study's, and of the scheduler."""
+PACE = 0.1
+"""Seconds in which results gather; meanwhile workers begin with what waits there."""
+TELL_PERIOD = 0.1
+"""Seconds between two events of a training, at least."""
+
+
+class Cluster(Workers):
+    """The workers that a Dask client has.
+
+    A worker tells by an event which training it begins; when the scheduler removes it, that is the one
+    that has lost its worker, and not the ones that wait there. What is submitted is published, so
+    that the scheduler keeps it, and its result, for the next driver when this one dies.
+    """
+
+    def __init__(self, client: Any, environments: Mapping[str, Mapping[str, str]]) -> None:
+        self._client = client
+        self._study = ""
+        self.environments = {}
+        self._kinds: dict[str, str] = {}
+        self._meet(environments)
+        self._waiting = {}
+        self._at: dict[str, Any] = {}
+        self._only: dict[str, list[str]] = {}
+        self._datasets: dict[str, str] = {}
+        self._left: set[str] = set()
+        self._new: dict[str, Any] = {}
+        self._old: list[str] = []
+        self._progress: dict[str, deque[Mapping[str, Any]]] = {}
+        self._running: dict[str, set[str]] = defaultdict(set)
+        self._events: deque[Mapping[str, Any]] = deque()  # from the client's thread
+
+    def begin(self, study: str) -> None:
+        self._study = study
+
+        def hear(event: tuple[float, Any]) -> None:
+            if isinstance(event[1], dict) and event[1].get("action") in ACTIONS:
+                self._events.append(event[1])
+
+        with _of_the_scheduler():
+            for topic in (self._topic, "all"):
+                self._client.subscribe_topic(topic, hear)
+            mine = f"pdeloop/{study}/"
+            self._left = {n for n in map(str, self._client.list_datasets()) if n.startswith(mine)}
+
+    def kinds(self) -> Mapping[str, int]:
+        return Counter(self._kinds.values())
+
+    @property
+    def window(self) -> int:
+        return AHEAD * max(1, len(self._kinds))
+
+    def submit(
+        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+    ) -> None:
+        dataset = f"pdeloop/{self._study}/{identity}/{name}"
+        only = [at for at, own in self._kinds.items() if own == kind]
+        self._only[name] = only if len(self.environments) > 1 else []
+        with _of_the_scheduler():
+            if dataset in self._left:  # of a driver that has died
+                self._left.discard(dataset)
+                future = self._client.get_dataset(dataset)
+            else:
+                future = self._client.submit(
+                    on_worker,
+                    self._topic,
+                    name,
+                    task,
+                    *arguments,
+                    key=f"pdeloop-{name}-{uuid4().hex}",
+                    retries=0,
+                    workers=self._only[name] or None,
+                )
+                self._new[dataset] = future
+        own: Future[Files] = Future()
+        self._waiting[own], self._at[name], self._datasets[name] = name, future, dataset
+        self._client.loop.add_callback(self._pass_on, future, own)
+
+    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+        time.sleep(PACE)
+        found = super().collect(timeout)
+        for name, _ in found:
+            self._leave(name)
+        return found
+
+    def deaths(self) -> list[Death]:
+        found, changed = [], False
+        while self._events:
+            event = self._events.popleft()
+            worker, name = event.get("worker", ""), event.get("name", "")
+            match event["action"]:
+                case "began":
+                    self._running[worker].add(name)
+                    self._progress[name] = deque(maxlen=LINES)
+                case "row" if name in self._progress:
+                    self._progress[name].append(event["row"])
+                case "ended":
+                    self._running[worker].discard(name)
+                case "add-worker":
+                    changed = True
+                    self._kinds[worker] = next(iter(self.environments))
+                    if len(self.environments) > 1:
+                        here = training.environment
+                        self._meet(self._client.run(here, workers=[worker], on_error="ignore"))
+                case "remove-worker":
+                    changed = True
+                    self._kinds.pop(worker, None)
+                    for lost in self._running.pop(worker, ()):
+                        if lost in self._at:
+                            rows = [*self._progress.get(lost, ())]
+                            found.append(Death(lost, rows, bool(event.get("expected"))))
+        if changed:
+            self._free()
+        return found
+
+    def settle(self) -> None:
+        with _of_the_scheduler():
+            if self._old:
+                self._client.unpublish_dataset([n for n in self._old if n not in self._new])
+                self._old = []
+            if self._new:
+                self._client.publish_dataset(self._new, override=True)
+                self._new = {}
+
+    def take_back(self, name: str) -> None:
+        future = self._at[name]
+        super().take_back(name)
+        self._leave(name)
+        future.cancel()
+
+    def end(self) -> None:
+        """Carry nothing out any longer."""
+        with contextlib.suppress(Exception):  # of a scheduler that has gone
+            for name in [*self._at]:
+                self.take_back(name)
+            self._old += [*self._left]
+            self.settle()
+
+    def remark(self) -> str:
+        if self._kinds:
+            return ""
+        start = WORKER.format(address=self._client.scheduler.address)
+        return f"no worker is left; waiting for one to be started: {start}"
+
+    def _meet(self, environments: Mapping[str, Mapping[str, str]]) -> None:
+        """Know these workers, by their addresses."""
+        for at, environment in environments.items():
+            kind = environment["processor"]
+            self.environments = {kind: environment, **self.environments}
+            self._kinds[at] = kind
+
+    @property
+    def _topic(self) -> str:
+        return f"pdeloop-{self._study}"
+
+    def _leave(self, name: str) -> None:
+        """A training is not this object's any longer."""
+        dataset = self._datasets.pop(name)
+        if self._new.pop(dataset, None) is None:
+            self._old.append(dataset)
+        del self._at[name], self._only[name]
+        self._progress.pop(name, None)
+
+    def _free(self) -> None:
+        """Have those submitted again whose workers of one kind have all gone."""
+        for own, name in self._waiting.items():
+            only = self._only[name]
+            if only and not any(at in self._kinds for at in only) and not own.done():
+                self._at[name].cancel()
+                own.set_exception(LostWorkerError())
+
+    async def _pass_on(self, future: Any, own: Future[Files]) -> None:
+        """Give a future of Dask's outcome to one of concurrent.futures."""
+        from distributed import KilledWorker
+
+        try:
+            found = await self._client.gather(future, asynchronous=True)
+        except (CancelledError, asyncio.CancelledError):
+            if own.cancel():
+                own.set_running_or_notify_cancel()
+        except KilledWorker:
+            if own.set_running_or_notify_cancel():
+                own.set_exception(LostWorkerError())
+        except BaseException as error:
+            if own.set_running_or_notify_cancel():
+                own.set_exception(error)
+        else:
+            if own.set_running_or_notify_cancel():
+                own.set_result(found)
+
+
+def on_worker(topic: str, name: str, task: Callable[..., Files], *arguments: Any) -> Files:
+    """Carry out a task on a worker, which tells the driver how far it is."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    told_at = float("-inf")
+
+    def tell(action: str, **entries: Any) -> None:
+        worker.log_event(
+            topic, {"action": action, "worker": worker.address, "name": name, **entries}
+        )
+
+    def hear(row: Mapping[str, Any]) -> None:
+        nonlocal told_at
+        if time.monotonic() > told_at + TELL_PERIOD:
+            told_at = time.monotonic()
+            tell("row", row=dict(row))
+
+    tell("began")
+    training.work_in(worker.local_directory)
+    try:
+        with training.listening(hear):
+            return task(*arguments)
+    finally:
+        tell("ended")
+
+
+@contextlib.contextmanager
+def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator[Workers]:
+    """The workers of the Dask scheduler at `address` (tcp://HOST:PORT or tls://HOST:PORT).
+
+    security: files by the names of `distributed.Security`, such as tls_ca_file, for encryption.
+
+    StudyError where that is not an address, no scheduler answers there, it or a worker has another
+    version of Dask, there are no workers, or one has no pdeloop or another one.
+    """
+    from distributed import Client
+    from distributed.security import Security
+    from distributed.versions import VersionMismatchWarning
+
+    try:
+        secured = Security(**security, require_encryption=True) if security else Security()
+        own = metadata.version("distributed")
+        # First, as a client fails in many ways at another one.
+        there = {"scheduler": _version_at(address, secured)}
+        _check_versions(there, own)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", VersionMismatchWarning)
+            client = Client(address, timeout=CONNECTING, set_as_default=False, security=secured)
+    except OSError as error:  # of a certificate
+        raise StudyError(f"the certificates for {address} cannot be used: {error}") from error
+    with _quiet(), client:
+        known_versions: Any = client.get_versions()
+        workers = known_versions["workers"]
+        if not workers:
+            raise StudyError(
+                f"the scheduler at {address} has no workers; start some with: "
+                + WORKER.format(address=address)
+            )
+        known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
+        _check_versions(known, own)
+        # A worker would end at a task of a package that it lacks.
+        installed = client.run(metadata.version, "pdeloop", on_error="return")
+        for at, version in installed.items():
+            if isinstance(version, Exception):
+                raise StudyError(
+                    f"the worker at {at} has no pdeloop; install pdeloop[cluster] there"
+                )
+            if version != metadata.version("pdeloop"):
+                raise StudyError(
+                    f"the worker at {at} has pdeloop {version}, and this machine has "
+                    f"{metadata.version('pdeloop')}; install the same on all"
+                )
+        pool = Cluster(client, client.run(training.environment))
+        try:
+            yield pool
+        finally:
+            pool.end()
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the library's own words on a lost connection, which is reported in one sentence."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _of_the_scheduler() -> Iterator[None]:
+    """CancelledError where the scheduler has gone."""
+    try:
+        yield
+    except (OSError, RuntimeError, CancelledError, asyncio.CancelledError) as error:
+        raise CancelledError(str(error)) from error
+
+
+def _check_versions(versions: Mapping[str, str], own: str) -> None:
+    for whose, version in versions.items():
+        if version != own:
+            raise StudyError(
+                f"the {whose} has Dask {version}, and this machine has {own}; install the same on all"
+            )
+
+
+def _version_at(address: str, secured: Any) -> str:
+    """The version of Dask of the scheduler there."""
+    from distributed.comm.addressing import get_address_host_port
+    from distributed.core import rpc
+
+    async def ask() -> str:
+        security = secured.get_connection_args("client")
+        async with rpc(address, connection_args=security, timeout=CONNECTING) as scheduler:
+            found = await asyncio.wait_for(scheduler.versions(), CONNECTING)
+            return str(found["packages"]["distributed"])
+
+    try:
+        get_address_host_port(address, strict=True)
+        return asyncio.run(ask())
+    except ValueError as error:
+        raise StudyError(
+            f"the scheduler's address is {address!r}; expected one like tcp://localhost:8786"
+        ) from error
+    except TypeError as error:  # distributed's word for a tls:// address without certificates
+        raise StudyError(
+            f"{address} needs certificates: give --tls-ca-file, --tls-cert and --tls-key, or set "
+            "ca-file, client.cert and client.key in Dask's configuration, distributed.comm.tls"
+        ) from error
+    except OSError as error:
+        raise StudyError(
+            f"no Dask scheduler answers at {address} within {CONNECTING:.0f} s; start one with: "
+            "dask scheduler"
+        ) from error

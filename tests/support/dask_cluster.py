@@ -1,0 +1,109 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A real Dask scheduler on loopback, and real workers, whose processes a test may kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from tests.support.interpreter import ROOT
+from tests.support.small_study import LIMIT
+
+Process = subprocess.Popen[bytes]
+
+
+class DaskCluster:
+    """Processes of a scheduler and its workers, killed at the end of a test.
+
+    Attributes
+    ----------
+    address : str
+        Of the scheduler.
+    scheduler : Popen
+        Its process.
+    workers : list of Popen
+        Those of the workers, which are one thread each.
+    """
+
+    def __init__(self, folder: Path, stack: ExitStack, tls: Sequence[str] = ()) -> None:
+        folder.mkdir(exist_ok=True)
+        self._folder, self._stack, self._tls = folder, stack, tls
+        self.workers: list[Process] = []
+        self.scheduler: Process | None = None
+        self.address = ""
+
+    def start_scheduler(self, packages: str = "") -> None:
+        """packages: a folder of packages that the process has instead of those here."""
+        self._file.unlink(missing_ok=True)
+        self.scheduler = self._started("dask_scheduler", "--port", "0", packages=packages)
+        self.address = address_in(self._file)
+
+    def start_worker(self, packages: str = str(ROOT), *, nanny: bool = False) -> Process:
+        """nanny: start it again where it dies."""
+        options = ("--nthreads", "1", "--local-directory", str(self._folder))
+        without = () if nanny else ("--no-nanny",)
+        process = self._started("dask_worker", *options, *without, packages=packages)
+        self.workers.append(process)
+        return process
+
+    def await_workers(self, count: int, **client: Any) -> None:
+        from distributed import Client
+
+        with Client(self.address, set_as_default=False, **client) as known:
+            known.wait_for_workers(count, timeout=LIMIT)
+
+    @property
+    def _file(self) -> Path:
+        return self._folder / "scheduler.json"
+
+    def _started(self, command: str, *options: str, packages: str) -> Process:
+        words = [sys.executable, "-m", f"distributed.cli.{command}", "--host", "127.0.0.1"]
+        words += ["--scheduler-file", str(self._file), "--no-dashboard", *self._tls, *options]
+        # Of a session of its own; what it leaves when it is killed is in `folder`.
+        own = {"PYTHONPATH": packages, "TMPDIR": str(self._folder)}
+        log = self._stack.enter_context((self._folder / f"{command}.log").open("ab"))
+        process = subprocess.Popen(
+            words, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **own}
+        )
+        self._stack.callback(process.wait, LIMIT)
+        self._stack.callback(_kill_session, process.pid)
+        return process
+
+
+def _kill_session(leader: int) -> None:
+    """A nanny and its worker, or a process by itself."""
+    with suppress(ProcessLookupError):
+        os.killpg(leader, signal.SIGKILL)
+
+
+def address_in(file: Path) -> str:
+    """The scheduler's address, once it stands in its file: that is made first, and then written."""
+    deadline = time.monotonic() + LIMIT
+    while time.monotonic() < deadline:
+        with suppress(OSError, ValueError):
+            return str(json.loads(file.read_text())["address"])
+        time.sleep(0.05)
+    raise AssertionError("no scheduler")
+
+
+@contextmanager
+def dask_cluster(
+    folder: Path, workers: int, *, scheduler: str = "", worker: str = str(ROOT), nanny: bool = False
+) -> Iterator[DaskCluster]:
+    """A scheduler with so many workers; scheduler, worker: folders of packages of theirs."""
+    with ExitStack() as stack:
+        cluster = DaskCluster(folder, stack)
+        cluster.start_scheduler(scheduler)
+        for _ in range(workers):
+            cluster.start_worker(worker, nanny=nanny)
+        if workers:
+            cluster.await_workers(workers)
+        yield cluster

@@ -1,0 +1,137 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Workers that die: whose fault it is, what is continued, and what a killed driver leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdeloop.study import Study, run, training
+from pdeloop.study.deaths import Deaths
+from pdeloop.study.executors import local_workers
+from pdeloop.study.status import status
+from pdeloop.study.training import Place, listening, train_one
+from tests.support.loop_harness import until
+from tests.support.small_study import CONTENT, LIMIT, contents
+
+
+def at(rollouts: float) -> list[dict[str, Any]]:
+    return [{"phase": "adapt", "rollouts": rollouts, "memory_mb": 900.0}]
+
+
+def test_three_deaths_at_the_same_place_are_a_trainings_own():
+    deaths = Deaths()
+    assert (
+        not deaths.died("a", at(4)) and not deaths.died("b", at(2)) and not deaths.died("a", at(4))
+    )
+    reason = deaths.died("a", at(4))
+    assert (
+        "it kills its workers: 3 died in a row at the same place (adapt after 4 rollouts" in reason
+    )
+    assert "900 MB" in reason and deaths.total == 4
+
+
+def test_a_training_that_comes_further_each_time_may_lose_as_many_as_the_limit():
+    deaths = Deaths(most=6)
+    reasons = [deaths.died("a", at(place)) for place in range(6)]
+    assert reasons[:5] == [""] * 5 and "it has lost 6 workers, the most of a training" in reasons[5]
+
+
+def test_retired_workers_are_nobodys_fault():
+    deaths = Deaths()
+    assert not any(deaths.died("a", at(4), announced=True) for _ in range(19))
+
+
+def test_where_workers_die_by_themselves_three_deaths_prove_nothing():
+    """Simulated: each attempt ends with a death with probability 0.3, wherever it is."""
+    draw = np.random.default_rng(0)
+    deaths, given_up = Deaths(most=1000), 0
+    for number in range(20):  # before anything is known of the cluster, three are enough
+        deaths.died(str(number), at(1))
+        deaths.ended(str(number))
+    for number in range(20, 2000):
+        while draw.random() < 0.3:
+            given_up += bool(deaths.died(str(number), at(1)))
+        deaths.ended(str(number))
+    assert given_up == 0 and deaths.total > 600
+    killer = [bool(deaths.died("killer", at(1))) for _ in range(20)]
+    assert killer.index(True) + 1 == 12  # 0.3^n < 1e-6
+
+
+class InterruptedHereError(Exception):
+    """As a process that is killed."""
+
+
+def test_a_training_continues_from_its_checkpoint_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(training, "CHECKPOINT_PERIOD", 0.0)
+    values = Study.of(CONTENT).trainings()["small/two-point/0"]
+    (tmp_path / "study").write_text("id")
+    place = Place(str(tmp_path), "id", "small/two-point/0")
+    batches: list[list[float]] = []
+
+    def attempt(most: int) -> dict[str, bytes]:
+        batches.append([])
+
+        def hear(row: Mapping[str, Any]) -> None:
+            batches[-1].append(row["rollouts"])
+            if len(batches[-1]) > most:
+                raise InterruptedHereError
+
+        with listening(hear):
+            return train_one(values, place)
+
+    with pytest.raises(InterruptedHereError):
+        attempt(2)
+    with pytest.raises(InterruptedHereError):
+        attempt(1)
+    assert attempt(1000) == train_one(values)
+    assert batches[0][0] < batches[1][0] < batches[2][0]  # each begins after what is kept
+    elsewhere = Place(str(tmp_path), "another study's", place.name)
+    assert elsewhere.run_folder() is None
+
+
+def test_a_process_that_is_killed_costs_only_its_training(reference: Path, tmp_path: Path):
+    out, killed = tmp_path / "out", []
+
+    def kill_one(done: int, total: int, status: str) -> None:
+        if not killed and [*out.rglob("progress.jsonl")]:
+            children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+            killed.append(max(map(int, children)))
+            os.kill(killed[0], signal.SIGKILL)
+
+    assert run(Study.of(CONTENT), out, partial(local_workers, 1), tell=kill_one) == []
+    assert killed and contents(out) == contents(reference)
+    found = status(out)
+    assert found["workers_lost"] == 1 and found["finished"] == 4 and not found["failed"]
+
+
+def test_a_killed_driver_leaves_no_temporary_folder_and_is_continued(
+    reference: Path, tmp_path: Path
+):
+    file, out, temporary = tmp_path / "study.yaml", tmp_path / "out", tmp_path / "temporary"
+    file.write_text(json.dumps(CONTENT))
+    temporary.mkdir()
+    words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    driver = subprocess.Popen([*words, "--processes", "1"], env=environment)
+    try:
+        until(lambda: [*out.rglob("progress.jsonl")], LIMIT, "training that has begun")
+    finally:
+        driver.kill()
+        driver.wait(LIMIT)
+    assert not [path for path in temporary.iterdir() if path.name.startswith("pdeloop")]
+    assert run(Study.of(CONTENT), out, partial(local_workers, 1)) == []
+    assert contents(out) == contents(reference)
+    assert {path.name for path in out.iterdir()} == {"study.json", "results.sqlite", "lock"}
