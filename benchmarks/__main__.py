@@ -37,6 +37,7 @@ PROGRAMS = {
     "scale": "messages, bags, fits, memory and files as the state grows",
     "published": "tasks with published figures, which are shown beside ours",
     "optimum": "limits of the policy class and of any controller, by exact gradients",
+    "study": "studies whose processes are killed, and what a study costs by itself",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
     "estimator": "cost with an estimator that knows the true plant, from few sensors and with noise",
     "few_sensors": "trainings with few sensors and noise, seed by seed",

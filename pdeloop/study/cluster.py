@@ -23,6 +23,8 @@ from pdeloop.study.executors import AHEAD, Death, Files, LostWorkerError, Worker
 
 CONNECTING = 10.0
 """Seconds in which a scheduler has to answer, and to be found again."""
+WAITING = 30.0
+"""Seconds in which a first worker has to come."""
 WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
 """The command that starts a worker, which must not run modules of its working directory either."""
 ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
@@ -133,7 +135,10 @@ class Cluster(Workers):
                 case "remove-worker":
                     changed = True
                     self._kinds.pop(worker, None)
-                    for lost in self._running.pop(worker, ()):
+                    # Of a training that had just begun the event may be lost with the worker.
+                    waited = [n for n in self._at if self._at[n].key in event["processing-tasks"]]
+                    only = waited if len(waited) == 1 else []
+                    for lost in self._running.pop(worker, None) or only:
                         if lost in self._at:
                             rows = [*self._progress.get(lost, ())]
                             found.append(Death(lost, rows, bool(event.get("expected"))))
@@ -259,16 +264,18 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
 
     try:
         secured = Security(**security, require_encryption=True) if security else Security()
-        own = metadata.version("distributed")
-        # First, as a client fails in many ways at another one.
-        there = {"scheduler": _version_at(address, secured)}
-        _check_versions(there, own)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", VersionMismatchWarning)
-            client = Client(address, timeout=CONNECTING, set_as_default=False, security=secured)
-    except OSError as error:  # of a certificate
+        arguments = secured.get_connection_args("client")
+    except OSError as error:
         raise StudyError(f"the certificates for {address} cannot be used: {error}") from error
+    own = metadata.version("distributed")
+    # First, as a client fails in many ways at another one.
+    _check_versions({"scheduler": _version_at(address, arguments)}, own)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VersionMismatchWarning)
+        client = Client(address, timeout=CONNECTING, set_as_default=False, security=secured)
     with _quiet(), client:
+        with contextlib.suppress(TimeoutError):  # in a batch job they come later
+            client.wait_for_workers(1, timeout=WAITING)
         known_versions: Any = client.get_versions()
         workers = known_versions["workers"]
         if not workers:
@@ -328,13 +335,12 @@ def _check_versions(versions: Mapping[str, str], own: str) -> None:
             )
 
 
-def _version_at(address: str, secured: Any) -> str:
+def _version_at(address: str, security: Mapping[str, Any]) -> str:
     """The version of Dask of the scheduler there."""
     from distributed.comm.addressing import get_address_host_port
     from distributed.core import rpc
 
     async def ask() -> str:
-        security = secured.get_connection_args("client")
         async with rpc(address, connection_args=security, timeout=CONNECTING) as scheduler:
             found = await asyncio.wait_for(scheduler.versions(), CONNECTING)
             return str(found["packages"]["distributed"])

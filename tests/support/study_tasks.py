@@ -37,7 +37,7 @@ def noted(folder: str, seconds: float, values: Values) -> dict[str, bytes]:
 
 def killing(folder: str, values: Values) -> dict[str, bytes]:
     """End the worker, as one that has no memory left is ended."""
-    noted(folder, 0.0, values)
+    noted(folder, 0.3, values)  # so that what it tells has been sent
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError("alive")
 

@@ -22,6 +22,7 @@ from tests.support.browser import browser
 from tests.support.loop_harness import processes
 from tests.support.made_once import made_once
 from tests.support.small import FEW_FITS, SMALL
+from tests.support.small_study import contents
 
 LIMIT = 300.0
 FIGURES = (
@@ -102,8 +103,11 @@ def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     """What the figure draws against result.json; the paper's optimiser has no such figure."""
     problem = gather(folder).problems[0]
     name = controllers_of(folder)[-1]
-    base = folder if is_run(folder) else folder / "small" / name / str(problem.shown)
-    history = json.loads((base / "result.json").read_text())["history"]
+    if is_run(folder):
+        result = (folder / "result.json").read_bytes()
+    else:
+        result = contents(folder)[f"small/{name}/{problem.shown}/result.json"]
+    history = json.loads(result)["history"]
     before = problem.runs[name].before[problem.shown]
     own = [row for row in history if row["seed"] == problem.shown]
     proposed = [row for row in own if "mismatch" in row]

@@ -1,0 +1,227 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks study`: studies whose processes are killed, and what a study costs by itself.
+
+`killed`: a study on several processes, of which one is killed at random every few seconds, and whose
+driver is killed twice: the same bits as in one process without any kill. `overhead`: seconds per
+training on one process of a study against a bare loop in this one, and the speed-up with two.
+`simulated`: many tasks that sleep, on many simulated workers: processor time and memory of the driver.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks.processes import markdown
+from pdeloop.study import Study
+from pdeloop.study import run as carry_out
+from pdeloop.study.executors import local_workers
+from pdeloop.study.results import reading
+from pdeloop.study.status import status
+from pdeloop.study.training import train_one
+
+SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 40}
+DRIVER_KILLS = 2
+
+
+def run(
+    *,
+    trainings: int = 1000,
+    workers: int = 8,
+    every: float = 2.0,
+    alone: int = 20,
+    tasks: int = 10_000,
+    simulated: int = 64,
+    seconds: float = 1.0,
+    problem: str = "burgers",
+) -> dict[str, Any]:
+    """Kill workers and drivers, and measure what a study adds to its trainings.
+
+    Parameters
+    ----------
+    trainings
+        Trainings of the study whose processes are killed; 0: leave this part out.
+    workers
+        Its processes.
+    every
+        Seconds between two kills of a worker.
+    alone
+        Trainings of the comparison with a bare loop; 0: leave this part out.
+    tasks
+        Tasks that sleep; 0: leave this part out.
+    simulated
+        Simulated workers that carry them out.
+    seconds
+        Seconds that each sleeps.
+    problem
+        The problem of the trainings.
+    """
+    result: dict[str, Any] = {}
+    with TemporaryDirectory(prefix="pdeloop-") as place:
+        folder = Path(place)
+        if alone:
+            result["overhead"] = overhead(_study(problem, alone), folder)
+        if trainings:
+            result["killed"] = killed(_study(problem, trainings), folder, workers, every)
+        if tasks:
+            result["simulated"] = without_work(problem, folder, tasks, simulated, seconds)
+    return result
+
+
+def _study(problem: str, seeds: int) -> Study:
+    content = {"problems": [problem], "seeds": seeds, "settings": SETTINGS}
+    return Study.of({**content, "variants": {"two-point": {}}})
+
+
+def overhead(study: Study, folder: Path) -> dict[str, Any]:
+    """Seconds per training: in a bare loop, and in a study on one process and on two."""
+    values = study.trainings()
+    first = next(iter(values))
+    train_one(values[first])  # compiles
+    times = {}
+    began = time.perf_counter()
+    for name in values:
+        train_one(values[name])
+    times["bare"] = time.perf_counter() - began
+    for count in (1, 2):
+        at: list[float] = []
+
+        def tell(done: int, total: int, status: str, at: list[float] = at) -> None:
+            if done > len(at):
+                at.extend([time.perf_counter()] * (done - len(at)))
+
+        carry_out(study, folder / f"alone{count}", partial(local_workers, count), tell=tell)
+        # From the first that are finished on: processes import and load for some seconds.
+        times[str(count)] = (at[-1] - at[count - 1]) / (len(at) - count) * len(values)
+    each = {name: total / len(values) for name, total in times.items()}
+    return {
+        "trainings": len(values),
+        "bare_seconds": each["bare"],
+        "study_seconds": each["1"],
+        "overhead_percent": 100 * (each["1"] / each["bare"] - 1),
+        "speed_up_two": each["1"] / each["2"],
+    }
+
+
+def killed(study: Study, folder: Path, workers: int, every: float) -> dict[str, Any]:
+    """Results of a study whose workers and drivers are killed, compared with those of a bare loop."""
+    out, file, draw = folder / "killed", folder / "study.json", random.Random(0)
+    file.write_text(json.dumps(study.content()))
+    words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    words += ["--processes", str(workers)]
+    kills, drivers, total = 0, 0, len(study.trainings())
+    began = time.perf_counter()
+    while True:
+        driver = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while driver.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                driver.wait(every)
+            done = status(out)["finished"] if (out / "results.sqlite").exists() else 0
+            if drivers < DRIVER_KILLS and done > total * (drivers + 1) / (DRIVER_KILLS + 1):
+                driver.kill()
+                driver.wait()
+                drivers += 1
+            elif training := _training_processes(driver.pid, out):
+                os.kill(draw.choice(training), signal.SIGKILL)
+                kills += 1
+        if driver.returncode != -signal.SIGKILL:
+            break
+    elapsed = time.perf_counter() - began
+    found = _digests(out)
+    wanted = {name: _digest(train_one(values)) for name, values in study.trainings().items()}
+    counted = status(out)
+    return {
+        "trainings": total,
+        "workers": workers,
+        "workers_killed": kills,
+        "trainings_interrupted": counted["workers_lost"],
+        "most_of_one": max([0, *counted["deaths"].values()]),
+        "drivers_killed": drivers,
+        "failed": counted["failed"],
+        "same_bits": found == wanted,
+        "seconds": elapsed,
+    }
+
+
+def _training_processes(driver: int, out: Path) -> list[int]:
+    """The processes of a driver that have begun to train, once there is a result or two."""
+    if not (out / "unfinished").exists():
+        return []
+    path = Path(f"/proc/{driver}/task/{driver}/children")
+    with contextlib.suppress(OSError):
+        children = [int(word) for word in path.read_text().split()]
+        command = [(pid, Path(f"/proc/{pid}/cmdline").read_bytes()) for pid in children]
+        return [pid for pid, words in command if b"spawn_main" in words]
+    return []
+
+
+def _digests(out: Path) -> dict[str, str]:
+    with reading(out) as results:
+        return {name: _digest(results.files(name)) for name in results.names()}
+
+
+def _digest(files: Mapping[str, bytes]) -> str:
+    content = b"".join(name.encode() + files[name] for name in sorted(files))
+    return hashlib.sha256(content).hexdigest()
+
+
+def without_work(
+    problem: str, folder: Path, tasks: int, simulated: int, seconds: float
+) -> dict[str, Any]:
+    """Processor time and memory of a driver whose trainings are tasks that sleep."""
+    study = _study(problem, tasks)
+    values = study.trainings()
+    files = train_one(values[next(iter(values))])
+
+    def sleep(values: Mapping[str, Any]) -> Mapping[str, bytes]:
+        time.sleep(seconds)
+        return files
+
+    @contextlib.contextmanager
+    def pool() -> Iterator[Executor]:
+        with ThreadPoolExecutor(simulated) as executor:
+            yield executor
+
+    before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    began = time.perf_counter()
+    carry_out(study, folder / "simulated", pool, tasks={"two-point": sleep})
+    elapsed = time.perf_counter() - began
+    spent = time.process_time() - before
+    kept = [path for path in (folder / "simulated").rglob("*") if path.is_file()]
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "tasks": tasks,
+        "workers": simulated,
+        "task_seconds": seconds,
+        "seconds": elapsed,
+        "share_of_workers_percent": 100 * tasks * seconds / (elapsed * simulated),
+        "driver_ms_per_task": 1e3 * spent / tasks,
+        "driver_percent_of_a_core": 100 * spent / elapsed,
+        "memory_mb": most / 1024,
+        "memory_growth_mb": (most - memory) / 1024,
+        "files": len(kept),
+        "megabytes": sum(path.stat().st_size for path in kept) / 1e6,
+    }
+
+
+def text(result: Mapping[str, Any]) -> str:
+    """A Markdown table for each part."""
+    parts = []
+    for name, found in result.items():
+        rows = [(k, f"{v:.3g}" if isinstance(v, float) else v) for k, v in found.items()]
+        parts.append(f"{name}\n\n{markdown(('what', 'measured'), rows)}")
+    return "\n\n".join(parts)
