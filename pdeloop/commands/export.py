@@ -19,17 +19,25 @@ def add(commands: Commands) -> None:
         commands,
         "export",
         _export,
-        help="export a run's law as .npz or C, its learning curve as .csv or for TensorBoard",
+        help="export a run's law as .npz, C or a ROS 2 package, its learning curve as .csv or for "
+        "TensorBoard",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: "
         "as .npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` also reads, or "
         "as a C99 function; the laws `feedforward` and `observer` as a C99 function of the step, "
-        "or with a memory; any other law's parameters as .npz; and the cost after each step "
-        "of the training as .csv or as event files of TensorBoard.",
+        "or with a memory; any other law's parameters as .npz; those in C also as a ROS 2 package of "
+        "rclpy and NumPy; and the cost after each step of the training as .csv or as event files of "
+        "TensorBoard.",
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )
     add_argument = export.add_argument
     add_argument("folder", type=a_path, metavar="RUN", help="folder of a finished run")
     add_argument("--out", type=a_path, metavar="FILE", help="write the law to this .npz or .c")
+    add_argument(
+        "--ros2",
+        type=a_path,
+        metavar="DIR",
+        help="write the law as a ROS 2 package, with the name of this new folder, of rclpy and NumPy",
+    )
     add_argument(
         "--controller", choices=LAWS, help="the adapted law, or the first one (lqt) [adapted]"
     )
@@ -52,14 +60,16 @@ def _export(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
-    if options.out is None and options.curve is None and options.tensorboard is None:
+    of_laws = options.out, options.ros2
+    if all(path is None for path in (*of_laws, options.curve, options.tensorboard)):
         options.refuse(
-            "expected --out FILE for the law, --curve FILE or --tensorboard DIR for the curve"
+            "expected --out FILE or --ros2 DIR for the law, --curve FILE or --tensorboard DIR for the "
+            "curve"
         )
     if options.law is not None:
         print("WARNING: --law of export is now called --controller", file=sys.stderr)
     which = options.controller or options.law
-    if options.out is None and not (which is None and options.seed is None):
+    if all(path is None for path in of_laws) and not (which is None and options.seed is None):
         options.refuse("--controller and --seed choose a law: give --out FILE, or leave them out")
     for flag, (path, suffixes) in files.items():
         if path is not None and path.suffix.lower() not in suffixes:
@@ -68,6 +78,11 @@ def _export(options: argparse.Namespace) -> int:
             )
     run = load_run(options.folder)
     contents = {}
+    if options.ros2 is not None:
+        from pdeloop.ros2_package import write_package
+
+        write_package(run, options.ros2, which or LAWS[0], options.seed)
+        print(f"written to {options.ros2}")
     if options.out is not None:
         law = law_of(run, which or LAWS[0], options.seed)
         contents[options.out] = law.c() if options.out.suffix.lower() == ".c" else law.npz()

@@ -1,0 +1,211 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law as a ROS 2 package of its own, of rclpy, std_msgs and NumPy."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from controller_node.law_batch import LawBatch
+from loop_interfaces import action_set
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.arrays import Array
+from loop_interfaces.files import write_atomically
+from loop_interfaces.spec import ParameterError
+from loop_interfaces.text import shown
+from loop_method.laws.extended_kalman import ExtendedKalman
+from loop_method.laws.observer import Observer
+from pdeloop.finished_run import FinishedRun
+
+_NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+_TEMPLATES = Path(__file__).parent / "commands" / "template"
+_FORMULAS = {
+    "affine": "    a = K U^T y + constant",
+    "observer": "    a = K p + D s + b,    p <- F p + G s + B a + c,    s = U^T y,    p = s at first",
+}
+_MANIFEST = """<?xml version="1.0"?>
+<package format="3">
+  <name>$package</name>
+  <version>0.1.0</version>
+  <description>$name</description>
+  <maintainer email="user@localhost">user</maintainer>
+  <license>TODO: License declaration</license>
+  <exec_depend>rclpy</exec_depend>
+  <exec_depend>std_msgs</exec_depend>
+  <exec_depend>python3-numpy</exec_depend>
+  <export><build_type>ament_python</build_type></export>
+</package>
+"""
+_SETUP = """from setuptools import setup
+
+setup(
+    name="$package",
+    version="0.1.0",
+    packages=["$package"],
+    package_data={"$package": ["law.npz"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/$package"]),
+        ("share/$package", ["package.xml", "README.md"]),
+        ("share/$package/config", ["config/parameters.yaml"]),
+        ("share/$package/launch", ["launch/law.launch.py"]),
+    ],
+    entry_points={"console_scripts": ["law = $package.node:main"]},
+)
+"""
+_CONFIGURED = """[develop]
+script_dir=$$base/lib/$package
+[install]
+install_scripts=$$base/lib/$package
+"""
+_RESOURCES = "resource"
+
+
+def write_package(
+    run: FinishedRun, folder: Path, which: str = "adapted", seed: int | None = None
+) -> None:
+    """Write the package of a law of a run, which has the name of its folder.
+
+    Parameters
+    ----------
+    run
+        The run.
+    folder
+        A new or empty folder.
+    which, seed
+        As for `FinishedRun.law`.
+
+    Raises
+    ------
+    ValueError
+        The law has no such form, the folder has contents, or its name is none of a package.
+    """
+    package = folder.absolute().name
+    if not _NAME.fullmatch(package):
+        raise ParameterError(
+            f"{shown(package)} cannot be the name of a ROS 2 package; expected small letters, digits "
+            "and _, beginning with a letter"
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ParameterError(f"{folder} exists; give a new folder for the package")
+    kind, arrays = _arrays(run, which, seed)
+    allowed = ActionSet.of(run.values)
+    low, high = (np.broadcast_to(part, run.values["n_a"]) for part in (allowed.low, allowed.high))
+    m = run.index(seed)
+    words = {
+        "package": package,
+        "name": f"The {which} law of {run.values['problem']}, seed {run.seeds[m]}",
+        "kind": kind,
+        "formula": _FORMULAS[kind],
+        "action_set": _projection(),
+        "n_y": len(arrays["U"]),
+        "n_a": len(low),
+        "sample_time": f"{run.values['sample_time']:g}",
+        "safe": [0.0] * len(low),
+        "low": _yaml(low),
+        "high": _yaml(high),
+    }
+    content = BytesIO()
+    np.savez(
+        content,
+        low=low,
+        high=high,
+        zero_mean=np.array(allowed.zero_mean),
+        sample_time=np.array(run.values["sample_time"]),
+        n_y=np.array(words["n_y"]),
+        **arrays,
+    )
+    files = {
+        "package.xml": _filled(_MANIFEST, words),
+        "setup.py": _filled(_SETUP, words),
+        "setup.cfg": _filled(_CONFIGURED, words),
+        f"{_RESOURCES}/{package}": b"",
+        "README.md": _template("ros2_readme.md", words),
+        "config/parameters.yaml": _template("ros2_parameters.yaml", words),
+        "launch/law.launch.py": _template("ros2_launch.py", words),
+        f"{package}/__init__.py": b"",
+        f"{package}/law.py": _template("ros2_law.py", words),
+        f"{package}/node.py": _template("ros2_node.py", words),
+        f"{package}/law.npz": content.getvalue(),
+    }
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text)
+
+
+def _arrays(run: FinishedRun, which: str, seed: int | None) -> tuple[str, dict[str, Array]]:
+    """The form of a law, and its arrays; ParameterError for one that the package cannot compute."""
+    theta, m = run.theta(which, seed).ravel(), run.index(seed)
+    law, model = run.laws[m], run.models[m]
+    if law.compiled:
+        batch = LawBatch([law], run._target(model))
+        assert batch.compiled is not None
+        gains, n_s = law.gains(theta), model.U.shape[1]
+        constant: Array = np.zeros(len(gains))
+        for j, number in enumerate(batch.compiled.reduced_targets[0]):  # as the loop adds them
+            constant += gains[:, n_s + j] * number
+        return "affine", {"U": model.U, "K": gains[:, :n_s], "constant": constant}
+    if type(law) is Observer or (isinstance(law, ExtendedKalman) and not law.estimates(theta)):
+        parts = law.parts(theta)
+        own = {name: parts[name] for name in ("K", "D", "b", "F", "G", "c")}
+        return "observer", {"U": model.U, "B": model.B, **own}
+    raise ParameterError(
+        f"the law '{law.name}' has no form for a ROS 2 package; train with --law affine or observer"
+    )
+
+
+def _projection() -> str:
+    """The source of the methods by which actions are made admissible."""
+    methods = ActionSet.project, ActionSet._shifts, ActionSet._balance
+    sources = [_bare(textwrap.dedent(inspect.getsource(method))) for method in methods]
+    text = "\n".join(sources).replace("_BALANCED", repr(action_set._BALANCED))
+    return textwrap.indent(text, "    ")
+
+
+def _bare(source: str) -> str:
+    """A method without annotations, whose names its new module does not have."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            node.returns = None
+            for argument in (*node.args.args, *node.args.kwonlyargs):
+                argument.annotation = None
+            node.body = [part for part in node.body if not _is_docstring(part)]
+    return ast.unparse(_Plain().visit(tree)) + "\n"
+
+
+class _Plain(ast.NodeTransformer):
+    """Annotated assignments as plain ones."""
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:  # noqa: N802
+        assert node.value is not None
+        return ast.copy_location(ast.Assign([node.target], node.value), node)
+
+
+def _is_docstring(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+def _yaml(numbers: Array) -> str:
+    return f"[{', '.join(_number(float(number)) for number in numbers)}]"
+
+
+def _number(number: float) -> str:
+    return ("" if number > 0 else "-") + ".inf" if np.isinf(number) else repr(number)
+
+
+def _template(name: str, words: Mapping[str, Any]) -> bytes:
+    return _filled((_TEMPLATES / f"{name}.txt").read_text(), words)
+
+
+def _filled(text: str, words: Mapping[str, Any]) -> bytes:
+    return Template(text).substitute(words).encode()
