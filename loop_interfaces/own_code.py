@@ -31,6 +31,8 @@ from loop_interfaces.text import shown
 
 FMU = ".fmu"
 """Ending of a Functional Mock-up Unit, whose name is code as a whole."""
+PROCESS = "process:"
+"""Beginning of a name that is a command, of a program that serves a plant."""
 _handed_over: dict[tuple[str, str], type] = {}
 """Classes of this program, by the kind of code and the names that stand for them."""
 _executing: list[Path] = []
@@ -54,7 +56,7 @@ class OwnCode:
     shipped : mapping
         What comes with the project, by name; no package takes these names.
     files : mapping
-        By the ending of names that are files as a whole, what loads one.
+        By the ending, or the beginning, of names that are code as a whole, what loads one.
     """
 
     word: str
@@ -108,7 +110,7 @@ class OwnCode:
     def require(self, name: str, environment: Mapping[str, str] = os.environ) -> None:
         """A ValueError if the name is code that is not allowed."""
         allowed = {identity(item.strip()) for item in environment.get(self.variable, "").split(",")}
-        code = ":" in name or name.endswith(tuple(self.files))
+        code = ":" in name or self.whole(name) is not None
         if code and identity(name) not in allowed:
             quoted = shlex.quote(name)
             raise ValueError(
@@ -129,9 +131,8 @@ class OwnCode:
             return self.shipped[name]
         if (self.word, name) in _handed_over:
             return _handed_over[self.word, name]
-        for ending, load in self.files.items():
-            if name.endswith(ending):
-                return load(name)
+        if (load := self.whole(name)) is not None:
+            return load(name)
         source, separator, name_in_it = name.rpartition(":")
         if not separator:
             return self._load_entry_point(name)
@@ -142,6 +143,13 @@ class OwnCode:
                 f"{self.word} {shown(name)}: there is no {shown(name_in_it)} in {source}"
             )
         return found
+
+    def whole(self, name: str) -> Callable[[str], Any] | None:
+        """What loads a name that is code as a whole."""
+        for end, load in self.files.items():
+            if name.endswith(end) or name.startswith(end):
+                return load
+        return None
 
     def _load_entry_point(self, name: str) -> Any:
         """Load the entry point of that name."""
@@ -193,10 +201,20 @@ class OwnCode:
 
 def identity(name: str) -> tuple[str, str]:
     """Module or file, and the name in it: equal for equal code."""
+    if name.startswith(PROCESS):
+        return PROCESS + absolute_words(name.removeprefix(PROCESS), Path.cwd()), ""
     if name.endswith(FMU):
         return str(Path(name).resolve()), ""
     module, _, name_in_it = name.rpartition(":")
     return (str(Path(module).resolve()) if module.endswith(".py") else module), name_in_it
+
+
+def absolute_words(command: str, folder: Path) -> str:
+    """A command whose words that are files in a folder have whole paths; ValueError for a bad one."""
+    if "," in command:
+        raise ValueError(f"the command {shown(command)} must have no comma: put it into a script")
+    words = shlex.split(command)
+    return shlex.join(str(folder / word) if (folder / word).is_file() else word for word in words)
 
 
 def name_of(kind: type) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.own_code import FMU
+from loop_interfaces.own_code import FMU, PROCESS, absolute_words
 from loop_interfaces.parameters import (
     OF_THE_PLANT,
     POINTS,
@@ -155,6 +155,8 @@ def _physical(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def code_from(folder: Path, code: str) -> str:
     """The name of code, with a relative file taken from there."""
+    if code.startswith(PROCESS):
+        return PROCESS + absolute_words(code.removeprefix(PROCESS), folder)
     if code.endswith(FMU):
         return str(folder / code)
     file, colon, name = code.rpartition(":")
@@ -165,7 +167,8 @@ def code_from(folder: Path, code: str) -> str:
 
 def _words(plant: str) -> str:
     """The name of a problem that has no file: path/to/rod.py:HeatedRod is heated-rod."""
-    plant = Path(plant).stem if plant.endswith(FMU) else plant
+    if plant.startswith(PROCESS) or plant.endswith(FMU):
+        return _words(f":{Path(plant.split()[-1]).stem}")
     name = plant.rpartition(":")[2].rpartition(".")[2]
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "-", name)
     return words.strip("-").lower() or "plant"

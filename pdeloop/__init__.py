@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from pde_sim_node.plant import Plant as Plant
     from pde_sim_node.plants.fmu import from_fmu as from_fmu
     from pde_sim_node.plants.gymnasium_plant import from_gymnasium as from_gymnasium
+    from pde_sim_node.plants.process import from_process as from_process
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
     from pdeloop.api import problem as problem
@@ -69,6 +70,7 @@ _NAMES = {
     "pde_sim_node.plant": ("Plant",),
     "pde_sim_node.plants.fmu": ("from_fmu",),
     "pde_sim_node.plants.gymnasium_plant": ("from_gymnasium",),
+    "pde_sim_node.plants.process": ("from_process",),
     "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),
     "pdeloop.episode": ("projected_law", "rollout"),

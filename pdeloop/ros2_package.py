@@ -15,16 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from controller_node.law_batch import LawBatch
 from loop_interfaces import action_set
 from loop_interfaces.action_set import ActionSet
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import write_atomically
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
-from loop_method.laws.extended_kalman import ExtendedKalman
-from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
+from pdeloop.law_form import law_form
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TEMPLATES = Path(__file__).parent / "commands" / "template"
@@ -96,33 +94,29 @@ def write_package(
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ParameterError(f"{folder} exists; give a new folder for the package")
-    kind, arrays = _arrays(run, which, seed)
-    allowed = ActionSet.of(run.values)
-    low, high = (np.broadcast_to(part, run.values["n_a"]) for part in (allowed.low, allowed.high))
-    m = run.index(seed)
+    law = law_form(run, which, seed)
     words = {
         "package": package,
-        "name": f"The {which} law of {run.values['problem']}, seed {run.seeds[m]}",
-        "kind": kind,
-        "formula": _FORMULAS[kind],
+        "name": law.name,
+        "kind": law.kind,
+        "formula": _FORMULAS[law.kind],
         "action_set": _projection(),
-        "n_y": len(arrays["U"]),
-        "n_a": len(low),
-        "sample_time": f"{run.values['sample_time']:g}",
-        "safe": [0.0] * len(low),
-        "low": _yaml(low),
-        "high": _yaml(high),
+        "n_y": law.n_y,
+        "n_a": law.n_a,
+        "sample_time": f"{law.sample_time:g}",
+        "safe": [0.0] * law.n_a,
+        "low": _yaml(law.low),
+        "high": _yaml(law.high),
+    }
+    numbers = {
+        "low": law.low,
+        "high": law.high,
+        "zero_mean": np.array(law.zero_mean),
+        "sample_time": np.array(law.sample_time),
+        "n_y": np.array(law.n_y),
     }
     content = BytesIO()
-    np.savez(
-        content,
-        low=low,
-        high=high,
-        zero_mean=np.array(allowed.zero_mean),
-        sample_time=np.array(run.values["sample_time"]),
-        n_y=np.array(words["n_y"]),
-        **arrays,
-    )
+    np.savez(content, **{**law.arrays, **numbers})  # type: ignore[arg-type]
     files = {
         "package.xml": _filled(_MANIFEST, words),
         "setup.py": _filled(_SETUP, words),
@@ -140,27 +134,6 @@ def write_package(
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, text)
-
-
-def _arrays(run: FinishedRun, which: str, seed: int | None) -> tuple[str, dict[str, Array]]:
-    """The form of a law, and its arrays; ParameterError for one that the package cannot compute."""
-    theta, m = run.theta(which, seed).ravel(), run.index(seed)
-    law, model = run.laws[m], run.models[m]
-    if law.compiled:
-        batch = LawBatch([law], run._target(model))
-        assert batch.compiled is not None
-        gains, n_s = law.gains(theta), model.U.shape[1]
-        constant: Array = np.zeros(len(gains))
-        for j, number in enumerate(batch.compiled.reduced_targets[0]):  # as the loop adds them
-            constant += gains[:, n_s + j] * number
-        return "affine", {"U": model.U, "K": gains[:, :n_s], "constant": constant}
-    if type(law) is Observer or (isinstance(law, ExtendedKalman) and not law.estimates(theta)):
-        parts = law.parts(theta)
-        own = {name: parts[name] for name in ("K", "D", "b", "F", "G", "c")}
-        return "observer", {"U": model.U, "B": model.B, **own}
-    raise ParameterError(
-        f"the law '{law.name}' has no form for a ROS 2 package; train with --law affine or observer"
-    )
 
 
 def _projection() -> str:
@@ -186,7 +159,7 @@ def _bare(source: str) -> str:
 class _Plain(ast.NodeTransformer):
     """Annotated assignments as plain ones."""
 
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:  # noqa: N802
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
         assert node.value is not None
         return ast.copy_location(ast.Assign([node.target], node.value), node)
 

@@ -7,13 +7,14 @@ import copy
 import json
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from loop_interfaces.long_calls import LONG_CALLS
 from loop_interfaces.own_code import OwnCodeError, called
@@ -21,10 +22,12 @@ from loop_interfaces.text import shown
 from pde_sim_node.definition import Definition, described, source_of
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.batch import BatchPlant
+from pde_sim_node.plants.gymnasium_spaces import Boxes
 
 if TYPE_CHECKING:
     from gymnasium import Env
 
+Numbers: TypeAlias = ArrayLike | Mapping[str, ArrayLike]
 _OUTCOMES = ("reward", "terminated", "truncated")
 _TERMINATIONS = ("success", "failure")
 _SUCCESS = ("is_success", "success")
@@ -36,29 +39,32 @@ _STEP = f"observation, {', '.join(_OUTCOMES)}, info"
 def from_gymnasium(
     env: Env[Any, Any] | str,
     *,
-    target: ArrayLike | None = None,
-    state_weight: float = 1.0,
-    action_weight: float = 1.0,
+    target: Numbers | None = None,
+    state_weight: Numbers = 1.0,
+    action_weight: Numbers = 1.0,
     horizon: int = 0,
     sample_time: float = 1.0,
     divergence_bound: float = 1e6,
     termination: str | None = None,
 ) -> GymnasiumPlant:
-    """A plant from a Gymnasium environment with box spaces.
+    """A plant from a Gymnasium environment with box spaces, also in Dict and Tuple spaces.
 
-    Its state is the observation, and its actions saturate at the bounds of the action space. With a
-    target the stage cost is that of every plant, q |o - o_r|^2 + r |a|^2. Without one it is minus the
-    reward, from which only optimisers that need costs alone can learn, such as two_point. The mean
-    field is the initial state of seed 0.
+    Its state is the observation, the boxes one after the other, and its actions saturate at the bounds
+    of the action space. With a target the stage cost is that of every plant, q |o - o_r|^2 + r |a|^2.
+    Without one it is minus the reward, from which only optimisers that need costs alone can learn, such
+    as two_point. The mean field is the initial state of seed 0.
 
     Parameters
     ----------
     env
         The environment, which is copied, or its id for `gymnasium.make`.
-    target : (n_z,), optional
-        Observation to be tracked.
-    state_weight, action_weight
-        q and r.
+    target : (n_z,) or mapping, optional
+        Observation to be tracked; or, of a Dict or Tuple, numbers by key ("tank.level"), and what has
+        no key is not tracked.
+    state_weight : number, (n_z,) or mapping
+        q: of all, of each number, or by key (0 for keys that are left out).
+    action_weight : number, (n_a,) or mapping
+        r: the same, with 1 for keys that are left out.
     horizon
         Steps of an episode; 0: the limit in the environment's specification, or of its TimeLimit.
     sample_time
@@ -98,9 +104,6 @@ def from_gymnasium(
             f"termination is {shown(termination)}; expected 'success' or 'failure', or None: as the "
             "environment's info says"
         )
-    for what, space in (("observation", made.observation_space), ("action", made.action_space)):
-        if not isinstance(space, gymnasium.spaces.Box):
-            raise ValueError(f"the {what} space of {made} must be a Box, got {space}")
     if not (horizon or limit):
         raise ValueError(f"{made} has no limit on the length of an episode: give horizon")
     return GymnasiumPlant(
@@ -124,23 +127,32 @@ class GymnasiumPlant(BatchPlant):
         self,
         env: Env[Any, Any],
         *,
-        target: ArrayLike | None,
+        target: Numbers | None,
         termination: str | None,
         **settings: Any,
     ) -> None:
-        observed, acted = env.observation_space.shape or (), env.action_space.shape or ()
-        n_z, self.quadratic = int(np.prod(observed)), target is not None
-        wanted = float_array("target", np.zeros(n_z) if target is None else target).ravel()
+        self._observed = Boxes("observation", env.observation_space)
+        self._acted = Boxes("action", env.action_space)
+        n_z, n_a, self.quadratic = self._observed.size, self._acted.size, target is not None
+        given = self._observed.by_name("target", np.zeros(n_z) if target is None else target, 0.0)
+        wanted = np.ravel(given)
         if wanted.shape != (n_z,) or not np.isfinite(wanted).all():
             raise ValueError(f"target must be {n_z} finite numbers, got shape {wanted.shape}")
-        self._first, self._shape, self._space = env, acted, env.action_space
+        if isinstance(target, Mapping) and isinstance(
+            weight := settings["state_weight"], int | float
+        ):
+            settings["state_weight"] = dict.fromkeys(target, weight)  # others are not tracked
+        weights = {
+            "state_weight": self._observed.by_name("state_weight", settings["state_weight"], 0.0),
+            "action_weight": self._acted.by_name("action_weight", settings["action_weight"], 1.0),
+        }
+        cost = Cost(n_z, n_a, settings["horizon"], target=wanted, **weights)
+        settings["state_weight"], settings["action_weight"] = cost.size
+        self._first = env
         self._envs: list[Env[Any, Any]] = []
         self.termination, self._said = termination, False
-        n_a = int(np.prod(acted))
-        super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, **settings)
-        space: Any = self._space
-        low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
-        self.action_set = ActionSet(n_a, low, high)
+        super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, cost=cost, **settings)
+        self.action_set = ActionSet(n_a, self._acted.low, self._acted.high)
 
     def __repr__(self) -> str:
         return (
@@ -155,6 +167,8 @@ class GymnasiumPlant(BatchPlant):
         names = ("horizon", "sample_time", "state_weight", "action_weight", "divergence_bound")
         values = {name: getattr(self, name) for name in names}
         values["target"] = self.target.tolist() if self.quadratic else None
+        if not self.cost.plain:
+            values["cost"] = self.cost.texts
         if self.termination is not None:
             values["termination"] = self.termination
         values["environment"] = (
@@ -220,18 +234,19 @@ class GymnasiumPlant(BatchPlant):
 
     def _numbers(self, method: str, observation: Any) -> Array:
         try:
-            numbers = np.array(observation, dtype=np.float64)  # a copy: it may be reused
-        except (TypeError, ValueError, OverflowError) as error:
+            numbers = self._observed.vector(observation)  # a copy: it may be reused
+        except (TypeError, ValueError, OverflowError, LookupError) as error:
             raise OwnCodeError(
                 f"{self._first}.{method} returned the observation {shown(observation)}; expected "
                 f"{self.n_z} numbers"
             ) from error
         if numbers.size != self.n_z:
+            one = self._observed.names == [""]
+            got = f"shape {np.shape(observation)}" if one else f"{numbers.size} numbers"
             raise OwnCodeError(
-                f"{self._first}.{method} returned an observation of shape {numbers.shape}; expected "
-                f"{self.n_z} numbers"
+                f"{self._first}.{method} returned an observation of {got}; expected {self.n_z} numbers"
             )
-        return numbers.ravel()
+        return numbers
 
     def _advance(self) -> None:
         self.action_set.project(self.actions, out=self.actions)
@@ -239,7 +254,7 @@ class GymnasiumPlant(BatchPlant):
             over = self._terminated[m] >= 0
             if over and not self.quadratic:
                 continue
-            action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
+            action = self._acted.member(self.actions[m])
             try:
                 observation, *rest = self._returned("step", self._envs[m].step, action, names=_STEP)
             except OwnCodeError as error:
@@ -257,12 +272,13 @@ class GymnasiumPlant(BatchPlant):
                     f"{self._first} ends an episode after {self.step_index + 1} steps, and its horizon "
                     f"is {self.horizon}: give a horizon of {self.step_index + 1} or less"
                 )
-            cost = -reward
             if self.quadratic:
-                error_squared = np.square(self.states[m] - self.target).sum()
-                cost = self.state_weight * float(error_squared)
-                cost += self.action_weight * float(np.square(self.actions[m]).sum())
-            self.totals[m] += cost
+                own = slice(m, m + 1)
+                self.cost.add(
+                    self.totals[own], self.states[own], self.actions[own], self.step_index
+                )
+            else:
+                self.totals[m] -= reward
             new = self._numbers("step", observation)
             good = (np.abs(new) <= self.divergence_bound).all() and np.isfinite(self.totals[m])
             failed = bool(terminated) and not over and self._terminates(int(m), rest[3])

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loop_interfaces.own_code import FAILURES, FMU, OwnCode, located, name_of
+from loop_interfaces.own_code import FAILURES, FMU, PROCESS, OwnCode, located, name_of
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
 from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
-from pde_sim_node.plants import fmu
+from pde_sim_node.plants import fmu, process
 from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
@@ -57,7 +57,7 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
     }
 )
 """Those that are shipped, by name."""
-OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS, {FMU: fmu.maker})
+OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS, {FMU: fmu.maker, PROCESS: process.maker})
 OBJECT = "object of a Python program:"
 """The prefix of parameters that no file can hold."""
 PHYSICAL = "physical."
@@ -108,7 +108,7 @@ def make(values: Mapping[str, Any]) -> Made:
     try:
         made = maker(**arguments)
     except FAILURES as error:
-        argument = isinstance(error, ValueError) and name.endswith(FMU)
+        argument = isinstance(error, ValueError) and OWN_PLANTS.whole(name) is not None
         told = str(error) if argument else located(error)
         raise ValueError(f"the plant {shown(name)} cannot be made: {told}") from error
     if not isinstance(made, Dynamics | Plant):
@@ -157,7 +157,11 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     require_complete(plant)
     kind = type(plant)
     arguments = dict(arguments_of(plant)) if isinstance(plant, Dynamics) else {}
-    path = arguments.pop("path") if isinstance(plant, fmu.Fmu) else ""
+    own = ""
+    if isinstance(plant, fmu.Fmu):
+        own = arguments.pop("path")
+    elif isinstance(plant, process.Process):
+        own = f"{PROCESS}{arguments.pop('command')}"
     stored = {
         name: described(name, value) if _storable(value) else f"{OBJECT} {described(name, value)}"
         for name, value in arguments.items()
@@ -165,7 +169,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     }
     if not isinstance(plant, Dynamics):  # its arguments are unknown
         stored = {"plant": f"{OBJECT} {plant.definition.fingerprint}"}
-    name = OWN_PLANTS.allow(path or name_of(kind))
+    name = OWN_PLANTS.allow(own or name_of(kind))
     _objects[_key(name, stored)] = Made(plant, stored)
     return {"plant": name} | {f"{PHYSICAL}{own}": value for own, value in stored.items()}
 

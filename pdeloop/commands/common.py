@@ -60,7 +60,7 @@ def a_path(text: str) -> Path:
 
 _OWN_CODE = {
     "equation": "the problem's PDE",
-    "plant": "a plant instead of an equation, or the file of an FMU",
+    "plant": "a plant instead of an equation, the file of an FMU, or process:COMMAND",
     "optimizer": "the method of the adapt phase",
     "law": "the control law",
 }

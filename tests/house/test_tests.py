@@ -24,6 +24,7 @@ SKIPS = {
         "needs a C compiler, the command cc (make packages)",
         "pythonfmu is not installed: extra fmi",
     ],
+    "tests/plant/test_process.py": ["needs a C compiler, the command cc (make packages)"],
     "tests/topics/test_isolation.py": ["needs root, and the right to make namespaces"],
     "tests/topics/test_pairs.py": [
         "needs root, iproute2, and a kernel with veth",

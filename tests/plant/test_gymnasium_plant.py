@@ -67,7 +67,7 @@ def test_what_cannot_be_done_with_it_is_refused() -> None:
         InstrumentedPlant(plant, Instruments(process_noise=0.1))
     with pytest.raises(ValueError, match="has no derivatives"):
         pdeloop.Gradients(plant)
-    with pytest.raises(ValueError, match=r"the action space of .* must be a Box"):
+    with pytest.raises(ValueError, match=r"the action space must be a Box"):
         pdeloop.from_gymnasium("CartPole-v1")
     with pytest.raises(ValueError, match="target must be 3 finite numbers"):
         pdeloop.from_gymnasium("Pendulum-v1", target=[1.0])
@@ -242,3 +242,61 @@ def test_the_limit_of_an_episode_is_the_horizon_of_a_specification_or_of_a_wrapp
     assert pdeloop.from_gymnasium(limited).horizon == 12
     with pytest.raises(ValueError, match="termination is 'won'; expected 'success' or 'failure'"):
         pdeloop.from_gymnasium(limited, termination="won")
+
+
+class Tanks(gymnasium.Env[Any, Any]):
+    """Two tanks: levels by name and a tuple of readings, one valve and one heater."""
+
+    def __init__(self, mode: bool = False) -> None:
+        box = gymnasium.spaces.Box
+        parts: dict[str, Any] = {
+            "levels": box(-9.0, 9.0, (2,), np.float64),
+            "readings": gymnasium.spaces.Tuple([box(-9.0, 9.0, (1,)), box(-9.0, 9.0, (1, 1))]),
+        }
+        if mode:
+            parts["mode"] = gymnasium.spaces.Discrete(3)
+        self.observation_space = gymnasium.spaces.Dict(parts)
+        self.action_space = gymnasium.spaces.Dict(
+            {"heater": box(0.0, 2.0, (1,), np.float64), "valve": box(-1.0, 1.0, (1,), np.float64)}
+        )
+
+    def _observation(self) -> dict[str, Any]:
+        levels = self.levels.copy()
+        return {"levels": levels, "readings": (levels[:1], 2.0 * levels[1:].reshape(1, 1))}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.levels = self.np_random.standard_normal(2)
+        return self._observation(), {}
+
+    def step(self, action: Any) -> Any:
+        self.levels = 0.9 * self.levels + np.array([action["valve"][0], action["heater"][0]])
+        return self._observation(), -float(abs(self.levels).sum()), False, False, {}
+
+
+def test_spaces_of_names_and_tuples_are_one_vector_with_targets_and_weights_by_key() -> None:
+    plant = pdeloop.from_gymnasium(
+        Tanks(), target={"levels": [1.0, 0.5]}, action_weight={"heater": 4.0}, horizon=5
+    )
+    assert (plant.n_z, plant.n_a) == (4, 2)
+    assert plant.action_set.low.tolist() == [0.0, -1.0]
+    z = plant.reset([3])[0].copy()
+    assert z[2] == np.float32(z[0]) or z[2] == z[0]
+    heater, valve = 0.5, 0.25
+    plant.step(np.array([[heater, valve]]))
+    assert np.allclose(plant.states[0, :2], 0.9 * z[:2] + [valve, heater], rtol=1e-15)
+    expected = (z[0] - 1.0) ** 2 + (z[1] - 0.5) ** 2 + 4.0 * heater**2 + valve**2
+    assert plant.totals[0] == pytest.approx(expected, rel=1e-14)
+    run = pdeloop.train(plant=plant, rollouts=8, evaluation_fields=2, optimizer="two_point")
+    assert run.costs["lqt"].mean() < run.costs["none"].mean()
+
+
+def test_parts_of_a_space_that_do_not_fit_are_named() -> None:
+    with pytest.raises(ValueError, match=r"the part 'mode' of the observation space must be a Box"):
+        pdeloop.from_gymnasium(Tanks(mode=True), horizon=5)
+    with pytest.raises(
+        ValueError, match=r"target has the key 'level'; the observation has levels, "
+    ):
+        pdeloop.from_gymnasium(Tanks(), target={"level": 1.0}, horizon=5)
+    with pytest.raises(ValueError, match=r"target\['levels'\] must be 2 numbers, got 3"):
+        pdeloop.from_gymnasium(Tanks(), target={"levels": [1.0, 2.0, 3.0]}, horizon=5)

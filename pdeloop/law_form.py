@@ -1,0 +1,102 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law of a run as matrices, for exports that compute it elsewhere.
+
+    affine:    a = P(K s + constant),       s = U^T y
+    observer:  a = P(K p + D s + b),        p <- F p + G s + B a + c,    p = s at first
+
+with the nearest admissible action P(a).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.arrays import Array
+from loop_interfaces.spec import ParameterError
+from loop_method.laws.extended_kalman import ExtendedKalman
+from loop_method.laws.observer import Observer
+from pdeloop.finished_run import FinishedRun
+
+
+@dataclass(frozen=True, eq=False)
+class LawForm:
+    """A law as matrices.
+
+    Attributes
+    ----------
+    kind : str
+        affine or observer.
+    arrays : mapping
+        By the names above.
+    low, high : (n_a,)
+        Bounds of the actions.
+    zero_mean : bool
+        Whether actions have mean zero.
+    sample_time : float
+        Time (s) of a step.
+    name : str
+        What it is the law of, in words.
+    spectral_radius : float
+        Largest magnitude of an eigenvalue of the closed loop on the identified model, without bounds.
+    """
+
+    kind: str
+    arrays: Mapping[str, Array]
+    low: Array
+    high: Array
+    zero_mean: bool
+    sample_time: float
+    name: str
+    spectral_radius: float
+
+    @property
+    def n_y(self) -> int:
+        """Numbers of a measurement."""
+        return len(self.arrays["U"])
+
+    @property
+    def n_a(self) -> int:
+        """Actuators."""
+        return len(self.low)
+
+
+def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) -> LawForm:
+    """The matrices of a law; ParameterError for one that has none, or a seed that there is not."""
+    theta, m = run.theta(which, seed).ravel(), run.index(seed)
+    law, model = run.laws[m], run.models[m]
+    if law.compiled:
+        batch = LawBatch([law], run._target(model))
+        assert batch.compiled is not None
+        gains, n_s = law.gains(theta), model.U.shape[1]
+        constant: Array = np.zeros(len(gains))
+        for j, number in enumerate(batch.compiled.reduced_targets[0]):  # as the loop adds them
+            constant += gains[:, n_s + j] * number
+        kind, arrays = "affine", {"U": model.U, "K": gains[:, :n_s], "constant": constant}
+        loop = model.A + model.B @ arrays["K"]
+    elif type(law) is Observer or (isinstance(law, ExtendedKalman) and not law.estimates(theta)):
+        parts = law.parts(theta)
+        own = {name: parts[name] for name in ("K", "D", "b", "F", "G", "c")}
+        kind, arrays = "observer", {"U": model.U, "B": model.B, **own}
+        B, K, D = model.B, own["K"], own["D"]
+        loop = np.block([[model.A + B @ D, B @ K], [own["G"] + B @ D, own["F"] + B @ K]])
+    else:
+        raise ParameterError(
+            f"the law '{law.name}' has no such form; train with --law affine or observer, or write its "
+            "parameters as .npz"
+        )
+    allowed, n_a = ActionSet.of(run.values), run.values["n_a"]
+    return LawForm(
+        kind,
+        arrays,
+        np.broadcast_to(allowed.low, n_a).copy(),
+        np.broadcast_to(allowed.high, n_a).copy(),
+        allowed.zero_mean,
+        float(run.values["sample_time"]),
+        f"The {which} law of {run.values['problem']}, seed {run.seeds[m]}",
+        float(np.abs(np.linalg.eigvals(loop)).max()),
+    )
