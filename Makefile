@@ -77,7 +77,7 @@ test-extras: setup packages
 	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
 	$(PYTEST) $(EXTRAS)
 
-EXTRAS := tests/plant/test_fmu.py
+EXTRAS := tests/plant/test_fmu.py tests/tools/test_model_files.py
 
 # The tests without topics, with their coverage of the pure modules (pyproject.toml).
 coverage: setup packages

@@ -5,12 +5,24 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, command
 
+if TYPE_CHECKING:
+    from pdeloop.finished_run import FinishedRun
+
 LAWS = ("adapted", "lqt")
 """The laws of a run, the first being the default."""
+
+
+MODEL_FILES = {
+    "fmu": (".fmu", "the law as an FMU for co-simulation, which a C compiler makes,"),
+    "onnx": (".onnx", "the law as an ONNX model"),
+    "matlab": (".mat", "the law's matrices, for MATLAB, Simulink and python-control,"),
+}
+"""Exports of laws made of matrices: the ending of the file, and what it holds."""
 
 
 def add(commands: Commands) -> None:
@@ -38,6 +50,10 @@ def add(commands: Commands) -> None:
         metavar="DIR",
         help="write the law as a ROS 2 package, with the name of this new folder, of rclpy and NumPy",
     )
+    for name, (ending, what) in MODEL_FILES.items():
+        add_argument(
+            f"--{name}", type=a_path, metavar="FILE", help=f"write {what} to this {ending}"
+        )
     add_argument(
         "--controller", choices=LAWS, help="the adapted law, or the first one (lqt) [adapted]"
     )
@@ -60,11 +76,13 @@ def _export(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
-    of_laws = options.out, options.ros2
+    models = {name: getattr(options, name) for name in MODEL_FILES}
+    files |= {f"--{name}": (path, (MODEL_FILES[name][0],)) for name, path in models.items()}
+    of_laws = options.out, options.ros2, *models.values()
     if all(path is None for path in (*of_laws, options.curve, options.tensorboard)):
         options.refuse(
-            "expected --out FILE or --ros2 DIR for the law, --curve FILE or --tensorboard DIR for the "
-            "curve"
+            "expected --out FILE or another form for the law, --curve FILE or --tensorboard DIR for "
+            "the curve"
         )
     if options.law is not None:
         print("WARNING: --law of export is now called --controller", file=sys.stderr)
@@ -88,6 +106,9 @@ def _export(options: argparse.Namespace) -> int:
         contents[options.out] = law.c() if options.out.suffix.lower() == ".c" else law.npz()
         if run.result.get("controller", {}).get("law") == "not seen":
             print("WARNING: the run's controller was not seen to use this law", file=sys.stderr)
+    for name, path in models.items():
+        if path is not None:
+            contents[path] = _model_file(name, run, which or LAWS[0], options.seed)
     if options.curve is not None:
         contents[options.curve] = curve_csv(run)
     for path, content in contents.items():
@@ -102,3 +123,18 @@ def _export(options: argparse.Namespace) -> int:
         write_events(run, options.tensorboard)
         print(f"written to {options.tensorboard}")
     return 0
+
+
+def _model_file(name: str, run: FinishedRun, which: str, seed: int | None) -> bytes:
+    """The content of one of `MODEL_FILES`."""
+    from pdeloop import model_files
+    from pdeloop.export import law_of
+    from pdeloop.law_form import law_form
+
+    law = law_form(run, which, seed)
+    if name == "fmu":
+        return model_files.fmu(law, law_of(run, which, seed).c())
+    if name == "onnx":
+        return model_files.onnx(law)
+    print(f"spectral radius of the closed loop on the identified model: {law.spectral_radius:.4g}")
+    return model_files.matlab(law)

@@ -25,6 +25,12 @@ SKIPS = {
         "pythonfmu is not installed: extra fmi",
     ],
     "tests/plant/test_process.py": ["needs a C compiler, the command cc (make packages)"],
+    "tests/tools/test_model_files.py": [
+        "FMPy is not installed: extra fmi",
+        "needs a C compiler, the command cc (make packages)",
+        "onnx and onnxruntime are not installed: extra onnx",
+        "python-control is not installed: extra extras",
+    ],
     "tests/topics/test_isolation.py": ["needs root, and the right to make namespaces"],
     "tests/topics/test_pairs.py": [
         "needs root, iproute2, and a kernel with veth",
