@@ -80,9 +80,11 @@ class LawBatch:
             Which of the models an environment uses; the first one if not given.
         """
         theta, shape = np.asarray(policies, dtype=np.float64), self._laws[0].shape
-        if theta.shape[1:] != shape or not len(theta):
+        longer = self._laws[0].extends and theta.ndim == 2 and theta.shape[1:] > shape
+        if not (theta.shape[1:] == shape or longer) or not len(theta):
+            more = " or more" if self._laws[0].extends else ""
             raise ValueError(
-                f"policies must have shape (environments, {', '.join(map(str, shape))}) for the law "
+                f"policies must have shape (environments, {', '.join(map(str, shape))}{more}) for the law "
                 f"'{self._laws[0].name}' of these models, but the shape is {theta.shape}."
             )
         if not np.isfinite(theta).all():

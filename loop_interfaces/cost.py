@@ -134,6 +134,28 @@ class Cost:
         on_actions = self._action.slope(actions, self.action_target)
         return self._state.slope(states, self.wanted(k)), on_actions
 
+    def along(self, states: Array, actions: Array, first: int) -> tuple[Array, Array, Array]:
+        """The cost of H steps from step `first` on, and its derivatives by states and actions.
+
+        Parameters
+        ----------
+        states, actions : (M, H, n_z), (M, H, n_a)
+
+        Returns
+        -------
+        (M,), (M, H, n_z), (M, H, n_a)
+        """
+        rows = self.target
+        if rows.ndim > 1:
+            rows = rows[np.minimum(first + np.arange(states.shape[1]), len(rows) - 1)]
+        of_states, on_states = self._state.along(states, rows)
+        of_actions, on_actions = self._action.along(actions, self.action_target)
+        return (of_states + of_actions).sum(axis=1), on_states, on_actions
+
+    def at_end(self, states: Array) -> tuple[Array, Array]:
+        """The cost of the last states (M, n_z), (M,), and its derivative, (M, n_z)."""
+        return self._terminal.along(states, self.wanted(self.horizon))
+
     def terminal_slope(self, states: Array) -> Array:
         """The derivative of the cost of the last states, (M, n_z)."""
         return self._terminal.slope(states, self.wanted(self.horizon))
@@ -242,6 +264,16 @@ class _Square:
             return 2.0 * self._weight * (values - wanted)
         slope: Array = 2.0 * (values @ self._E.T - self.scaled(wanted)) @ self._E
         return slope
+
+
+    def along(self, values: Array, wanted: Array) -> tuple[Array, Array]:
+        """The squares (...) of values (..., n), and their derivatives (..., n)."""
+        if self._E is None:
+            error = values - wanted
+            slope = 2.0 * self._weight * error
+            return 0.5 * (slope * error).sum(axis=-1), slope
+        error = values @ self._E.T - self.scaled(wanted)
+        return (error * error).sum(axis=-1), 2.0 * error @ self._E
 
 
 def _finite(name: str, values: ArrayLike) -> Array:

@@ -97,6 +97,17 @@ class PolynomialStep:
         """Made anew from the equation: the plan has addresses."""
         return PolynomialStep, (self._equation,)
 
+    @property
+    def plan(self) -> np.void:
+        """The plan that `polynomial` carries out."""
+        plan: np.void = self._plans[0]
+        return plan
+
+    @property
+    def compiled_spectra(self) -> bool:
+        """Whether spectra of this grid are compiled, which `polynomial_sweep` needs."""
+        return self._whole
+
     def step(self, states: Array, actions: Array) -> Array:
         """The states (M, n_x) a sampling time later under actions (M, n_a)."""
         spectra = self.spectra(states)

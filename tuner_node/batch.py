@@ -164,10 +164,20 @@ class TrainingSettings:
         return list(range(self.seed, self.seed + self.seeds))
 
 
+def stacked(policies: Sequence[Array]) -> Array:
+    """Policies as one array; vectors of several lengths with zeros at their ends (`Law.extends`)."""
+    if len({policy.shape for policy in policies}) == 1:
+        return np.stack(policies)
+    found = np.zeros((len(policies), max(policy.size for policy in policies)))
+    for row, policy in zip(found, policies, strict=True):
+        row[: policy.size] = policy
+    return found
+
+
 def batch_of(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
     """A batch of rollouts, each with the index of the model of its policy."""
     rows = np.empty((len(wanted), START_COLUMNS))
     for row, (model, rollout) in zip(rows, wanted, strict=True):
         row[:] = (rollout.field_seed, -1, 0.0, model)
-    policies = np.stack([rollout.policy for _, rollout in wanted])
+    policies = stacked([rollout.policy for _, rollout in wanted])
     return Batch(rows, np.clip(policies, -MAX_GAIN, MAX_GAIN), trajectories)

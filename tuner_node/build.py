@@ -21,6 +21,7 @@ from loop_interfaces.spec import ParameterError
 from loop_method.adapt import Context, Optimizer
 from loop_method.adapt.in_coordinates import InCoordinates, is_large
 from loop_method.laws import Affine, Law
+from loop_method.laws.predictive import Predictive
 from loop_method.laws.registry import law_kind
 from loop_method.method_settings import field_model_settings
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
@@ -124,9 +125,19 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
     if law.needs_model and law.name not in kind.also_improves:
         raise ParameterError(
             f"the parameters of the law '{law.name}' include a model of the plant, which the "
-            f"optimizer '{values['optimizer']}' does not support; choose model_based, or the law "
-            "'observer'"
+            f"optimizer '{values['optimizer']}' does not support; choose model_based, or another law"
         )
+    if issubclass(law, Predictive):
+        if sensors := few_sensors(values):
+            raise ParameterError(
+                f"the law '{law.name}' plans from the whole state, but {sensors} sensors measure the "
+                "plant; give --law extended_kalman"
+            )
+        if law.settings.steps > values["horizon"]:
+            raise ParameterError(
+                f"parameter 'law_settings.steps' is {law.settings.steps}; expected at most the steps "
+                f"of an episode, {values['horizon']}"
+            )
     if values["identification"] == "subspace" and not law.filtered:
         raise ParameterError(
             f"the identification 'subspace' designs a filter, which the law '{law.name}' does not "

@@ -39,7 +39,7 @@ def check_law(
         with np.errstate(over="ignore", invalid="ignore"):
             expected = _actions(law, theta, states, actions)
             allowed = np.zeros(len(actions))
-            if not law.compiled:
+            if not law.compiled and not np.array_equal(expected, actions):
                 near = _actions(law, theta, (1.0 + NEARBY) * states, actions)
                 moved = np.abs(near - expected).max(axis=1, initial=0.0)
                 allowed = MARGIN * np.maximum.accumulate(moved)

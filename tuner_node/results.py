@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.topics import COMPLETED
 from loop_method.laws import Affine
+from tuner_node.batch import stacked
 from tuner_node.budget import PURPOSES
 from tuner_node.readings import found_noise, seeming_noise
 from tuner_node.rollouts import EVALUATED
@@ -138,7 +139,7 @@ def summarise(training: Training) -> dict[str, Any]:
     mean = costs.mean(axis=2)
     none, lqt, adapted = (mean[:, EVALUATED.index(name)] for name in EVALUATED)
     changed = [
-        bool((own != start).any())
+        not np.array_equal(*stacked([own, start]))
         for own, start in zip(training.policies(), training.starts(), strict=True)
     ]
     return {

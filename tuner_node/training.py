@@ -33,7 +33,14 @@ from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, c
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
 from tuner_node import event_rows, rollouts, void_exploration
-from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
+from tuner_node.batch import (
+    UNKNOWN_PLANT,
+    Batch,
+    BatchResult,
+    TrainingSettings,
+    batch_of,
+    stacked,
+)
 from tuner_node.budget import Budget
 from tuner_node.errors import NoModelError
 from tuner_node.law_check import check_law
@@ -108,9 +115,8 @@ class Training:
         elif self.phase == "check":
             batch = batch_of(self._check_rollouts(), self.settings.trajectories)
         elif self.phase == "adapt":
-            shape = self.warm_starts().shape[1:]
             wanted = [
-                (m, replace(rollout, policy=np.reshape(rollout.policy, shape)))
+                (m, replace(rollout, policy=self._shaped(rollout.policy)))
                 for m, asked in enumerate(self._asked())
                 for rollout in asked
             ]
@@ -177,9 +183,14 @@ class Training:
         return model_rows.unpack(rows, self.settings.n_a, self.settings.law.filtered)
 
     def policies(self) -> Array:
-        """The adapted policies, of the shape of the warm starts."""
-        shape = self.warm_starts().shape[1:]
-        return np.stack([optimizer.policy.reshape(shape) for optimizer in self.optimizers])
+        """The adapted policies, of the shape of the warm starts, or longer (`Law.extends`)."""
+        return stacked([self._shaped(optimizer.policy) for optimizer in self.optimizers])
+
+    def _shaped(self, policy: Array) -> Array:
+        """A policy, which may be a vector, as messages have it."""
+        if self.settings.law.extends:
+            return policy.ravel()
+        return policy.reshape(self.warm_starts().shape[1:])
 
     def warm_starts(self) -> Array:
         """The initial parameters of the models' laws, (S, *shape)."""
@@ -365,7 +376,7 @@ class Training:
     def _asked(self) -> list[list[Rollout]]:
         """The rollouts that each optimiser asks for; its policies may be vectors."""
         return [
-            [] if optimizer.done else calls.ask(optimizer, law.size)
+            [] if optimizer.done else calls.ask(optimizer, law.size, extends=law.extends)
             for optimizer, law in zip(self.optimizers, self.laws(), strict=True)
         ]
 

@@ -20,8 +20,11 @@ _COUNTED = ("cost", "rollouts", "diverged")
 """Keys of a report that others read as numbers."""
 
 
-def ask(optimizer: Optimizer, size: int) -> list[Rollout]:
-    """The rollouts that it asks for, their policies being `size` finite numbers; OwnCodeError."""
+def ask(optimizer: Optimizer, size: int, *, extends: bool = False) -> list[Rollout]:
+    """The rollouts that it asks for, their policies being `size` finite numbers; OwnCodeError.
+
+    extends: or more numbers (`Law.extends`).
+    """
     name, asked = type(optimizer).__name__, _called(optimizer, "ask")
     if not isinstance(asked, Sequence) or not all(isinstance(r, Rollout) for r in asked):
         raise OwnCodeError(f"{name}.ask returned {_kinds(asked)}; expected a list of Rollout")
@@ -31,9 +34,10 @@ def ask(optimizer: Optimizer, size: int) -> list[Rollout]:
         except ValueError:
             got = f"{type(rollout.policy).__name__}, which is not an array of real numbers"
         else:
-            if policy.size == size and np.isfinite(policy).all():
+            fits = policy.size == size or (extends and policy.size > size)
+            if fits and np.isfinite(policy).all():
                 continue
-            got = f"an array of shape {policy.shape}" if policy.size != size else "NaN or infinity"
+            got = "NaN or infinity" if fits else f"an array of shape {policy.shape}"
         raise OwnCodeError(f"{name}.ask: a policy is {got}; expected {size} finite numbers")
     return list(asked)
 

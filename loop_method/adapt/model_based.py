@@ -67,6 +67,7 @@ from loop_method.adapt.verdict import (
 )
 from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
+from loop_method.laws.predictive import Predictive
 from loop_method.seeds import field_seed
 
 __all__ = ["ModelBased"]
@@ -102,7 +103,7 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
-    also_improves = ("observer", "extended_kalman", "feedforward")
+    also_improves = ("observer", "extended_kalman", "feedforward", "predictive")
     in_coordinates = True
     judges_first_law = True
     explorations = 2
@@ -140,11 +141,14 @@ class ModelBased(Optimizer):
 
     @classmethod
     def for_context(cls, context: Context) -> type[Optimizer]:
-        """Another one for a law that estimates the state from few readings."""
-        # Not at the top: it is derived from this class.
+        """Another one for a law that plans, or estimates the state from few readings."""
+        # Not at the top: they know this class.
+        from loop_method.adapt.model_based_predictive import ModelBasedPredictive
         from loop_method.adapt.model_based_readings import ModelBasedReadings
         from loop_method.adapt.model_based_sensed import ModelBasedSensed
 
+        if isinstance(context.law, Predictive):
+            return ModelBasedPredictive
         if not (context.sensors and isinstance(context.law, Observer)):
             return cls
         return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings
@@ -158,6 +162,21 @@ class ModelBased(Optimizer):
     def policy(self) -> Array:
         """The present law, and at the end the chosen one."""
         return self._progress.policy.copy()
+
+    @property
+    def belief(self) -> Belief | None:
+        """The model that the law was improved on last; None: there is none."""
+        return self._progress.belief
+
+    @property
+    def records(self) -> list[Record]:
+        """The rollouts that it was told of."""
+        return self._records.all()
+
+    @property
+    def fields(self) -> Array:
+        """The initial fields of all rollouts, (n, n_z)."""
+        return self._fields()
 
     @property
     def tells(self) -> int:

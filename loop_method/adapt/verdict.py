@@ -38,8 +38,13 @@ from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
 
-FIRST, ADAPTED, NONE = "first", "adapted", "none"
-NAMES = {FIRST: "the first law", ADAPTED: "the adapted law", NONE: "no control"}
+FIRST, ADAPTED, NONE, PREDICTIVE = "first", "adapted", "none", "predictive"
+NAMES = {
+    FIRST: "the first law",
+    ADAPTED: "the adapted law",
+    NONE: "no control",
+    PREDICTIVE: "the law that plans",
+}
 NO_OTHER = "no other law is better by more than chance"
 ALL_AGREE = "which may be chance, but every estimate agrees"
 
@@ -92,8 +97,8 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
         if name == base or not np.isfinite(own.change.value):
             continue
         if np.isinf(own.excess).any():
-            if name == ADAPTED:
-                stays = Verdict(base, 0.0, 0.0, "a rollout of the adapted law diverged")
+            if name in (ADAPTED, PREDICTIVE):
+                stays = Verdict(base, 0.0, 0.0, f"a rollout of {NAMES[name]} diverged")
             continue
         change = own.change + _correction(own) - of_base
         size = change.value, change.error

@@ -52,14 +52,24 @@ def finite_horizon_of(
     A target over time counts with its mean, and the terminal weight does not count.
     """
     whole, inputs = _extended(A, B, drift + B @ cost.action_target)
+    P, R = cost_to_go(A, B, drift, cost, point), cost.action_matrix
+    gains = -linalg.solve(R + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos")
+    return gains[:, : len(A)], gains[:, len(A)] + cost.action_target
+
+
+def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Array:
+    """P of the least cost [e; 1]^T P [e; 1] of the horizon, for `finite_horizon_of`.
+
+    Returns
+    -------
+    (n + 1, n + 1)
+    """
+    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
     E = cost.residual(np.eye(len(A)))
     offset = E @ point - cost.residual_target().mean(axis=0)
     rows = np.column_stack([E, offset])
-    R = cost.action_matrix
-    G = inputs @ linalg.solve(R, inputs.T, assume_a="pos")
-    P = _doubled(whole, G, rows.T @ rows, cost.horizon)
-    gains = -linalg.solve(R + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos")
-    return gains[:, : len(A)], gains[:, len(A)] + cost.action_target
+    G = inputs @ linalg.solve(cost.action_matrix, inputs.T, assume_a="pos")
+    return _doubled(whole, G, rows.T @ rows, cost.horizon)
 
 
 def action_curvature(

@@ -6,3 +6,4 @@ from loop_method.laws.base import Law as Law
 from loop_method.laws.extended_kalman import ExtendedKalman as ExtendedKalman
 from loop_method.laws.feedforward import FeedForward as FeedForward
 from loop_method.laws.observer import Observer as Observer
+from loop_method.laws.predictive import Predictive as Predictive

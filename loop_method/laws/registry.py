@@ -18,12 +18,18 @@ from loop_method.laws.base import Law
 from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
+from loop_method.laws.predictive import Predictive
 from loop_method.settings import settings_from
 
 OWN_LAWS = OwnCode(
     "law",
     "PDELOOP_LAWS",
-    MappingProxyType({kind.name: kind for kind in (Affine, FeedForward, Observer, ExtendedKalman)}),
+    MappingProxyType(
+        {
+            kind.name: kind
+            for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive)
+        }
+    ),
 )
 
 

@@ -89,7 +89,7 @@ class SpectralModel:
         return self._compiled(self.substeps)
 
     @cached_property
-    def _steps(self) -> list[PolynomialStep]:
+    def steps(self) -> list[PolynomialStep]:
         """With the steps of each row of `fewer`, and with all of them."""
         return [*(self._compiled(int(steps)) for steps in self.fewer[:, 1]), self.compiled]
 
@@ -114,7 +114,7 @@ class SpectralModel:
         level = np.searchsorted(self.fewer[:, 0], np.abs(states).max(axis=1, initial=0.0))
         level = np.minimum(level, len(self.fewer))  # NaN is beyond infinity
         for i in np.unique(level):
-            yield self._steps[i], level == i
+            yield self.steps[i], level == i
 
     def step(self, states: Array, actions: Array) -> Array:
         after = np.empty(states.shape)

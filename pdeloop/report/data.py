@@ -31,6 +31,7 @@ from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
 from pdeloop.study.results import MOST, STUDY_FILE, reading
 from pdeloop.study.training import CURVE
+from tuner_node.batch import stacked
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolderError
 
@@ -262,7 +263,7 @@ def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) 
     laws = laws_of(law_kind(values["law"], values), used, values["horizon"], values.get("cost", ()))
     law = LawBatch(laws, plant.target, ActionSet.of(values))
     count = len(policies)
-    law.set(np.stack([*policies.values()]), np.arange(count))
+    law.set(stacked([*policies.values()]), np.arange(count))
     starts, noise = np.full(count, field), np.full(count, noise_seed, dtype=np.int64)
     episode = rollout(plant, law.actions, starts, noise)
     costs, found = episode.costs, []

@@ -1,0 +1,166 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Many sampling times of a polynomial equation under a feedback, and the adjoint of all of them.
+
+    r_i = K z_i + b + v_i,        a_i = clip(r_i, low, high),        z_{i+1} = f(z_i, a_i),
+
+in one compiled call, and from derivatives by z_i and a_i, backwards, those by v_i in another. What the
+step keeps of its stages stays on a tape between the two, so that nothing is computed twice. The step is
+that of `polynomial_step`; of several equations that differ in their internal steps the first one acts
+whose reach contains the field.
+
+References
+----------
+Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.arrays import Array, read_only
+from loop_interfaces.jit.cache import cached_njit
+from loop_interfaces.jit.simd import read, splat, write
+from spectral_solver import polynomial
+from spectral_solver.kernel import force
+from spectral_solver.memory import aligned
+from spectral_solver.polynomial import PLAN, SOURCES, integrate, pull_back_internal
+from spectral_solver.polynomial_step import PolynomialStep
+from spectral_solver.spectra import analyse, get, put, synthesise
+
+
+@cached_njit(*SOURCES, polynomial)
+def roll(
+    v: Array, feedback: Array, constant: Array, bounds: Array, reach: Array,
+    plans: NDArray[np.void], levels: NDArray[np.int64], states: Array, requested: Array,
+    actions: Array,
+) -> None:  # fmt: skip
+    """Write the states (H + 1, n_x) from the first of them, r (H, n_a) and a, 1 (H, n_a + 1)."""
+    H, n_a = v.shape
+    n_x = states.shape[1]
+    for i in range(H):
+        largest, level = 0.0, 0
+        for x in range(n_x):
+            largest = max(largest, abs(states[i, x]))
+        while level < reach.size and not largest <= reach[level]:
+            level += 1
+        levels[i] = level
+        for j in range(n_a):
+            total = constant[j] + v[i, j]
+            for x in range(n_x):
+                total += feedback[j, x] * states[i, x]
+            requested[i, j] = total
+            actions[i, j] = min(max(total, bounds[0, j]), bounds[1, j])
+        actions[i, n_a] = 1.0
+        plan = plans[level]
+        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+        block = 4 * plan.fine.m
+        tape = plan.tape + i * plan.steps * block
+        analyse(states.ctypes.data + 8 * n_x * i, w, d, plan, c, e)
+        force(actions.ctypes.data + 8 * (n_a + 1) * i, w, d, plan, c, e)
+        for n in range(plan.steps):
+            integrate(w, d, plan, c, e, tape + n * block)
+        synthesise(states.ctypes.data + 8 * n_x * (i + 1), w, d, plan, c, e)
+
+
+@cached_njit(*SOURCES, polynomial)
+def roll_back(
+    free: Array, on_states: Array, on_actions: Array, feedback: Array, plans: NDArray[np.void],
+    levels: NDArray[np.int64], eta: Array, found: Array,
+) -> None:  # fmt: skip
+    """Write the derivatives (H, n_a) by v; eta (n_x,): that by the last state, overwritten.
+
+    free (H, n_a): 1, or 0 where an action does not depend on what is requested.
+    """
+    H, n_a = found.shape
+    n_x = eta.size
+    last, even = n_x // 2, n_x % 2 == 0
+    for i in range(H - 1, -1, -1):
+        plan = plans[levels[i]]
+        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+        block = 4 * plan.fine.m
+        tape = plan.tape + i * plan.steps * block
+        analyse(eta.ctypes.data, w, d, plan, c, e)
+        for k in range(0, plan.modes, 8):
+            put(w, plan.covector + k, d, get(w, plan.x + k, d))
+            put(w, plan.on_force + k, d, (splat(0.0), splat(0.0)))
+        if even:  # as in `PolynomialStep.pull_back`
+            write(w, plan.covector + last, 0.5 * read(w, plan.covector + last))
+            write(w, plan.covector + d + last, 0.0)
+        for n in range(plan.steps - 1, -1, -1):
+            pull_back_internal(w, d, plan, c, e, tape + n * block)
+        for k in range(0, plan.modes, 8):
+            put(w, plan.x + k, d, get(w, plan.covector + k, d))
+        if even:
+            write(w, plan.x + last, 2.0 * read(w, plan.x + last))
+        synthesise(eta.ctypes.data, w, d, plan, c, e)
+        for x in range(n_x):
+            eta[x] += on_states[i, x]
+        for j in range(n_a):
+            at, total = plan.supports + j * plan.modes, 0.0
+            for k in range(last + 1):
+                own = read(w, plan.on_force + k) * read(c, at + k)
+                own += read(w, plan.on_force + d + k) * read(c, at + e + k)
+                total += own if k == 0 else 2.0 * own
+            g = (n_x * total + on_actions[i, j]) * free[i, j]
+            found[i, j] = g
+            for x in range(n_x):
+                eta[x] += feedback[j, x] * g
+
+
+class PolynomialSweep:
+    """The two for one equation, or several that differ in their internal steps.
+
+    One thread may use it at a time.
+
+    Parameters
+    ----------
+    steps : sequence of PolynomialStep
+        Those for small fields first; all of them on a grid whose length has a compiled transform.
+    reach : (n,) array
+        The largest magnitude of a field for each but the last.
+    horizon : int
+        Most sampling times H.
+    """
+
+    def __init__(self, steps: Sequence[PolynomialStep], reach: Array, horizon: int) -> None:
+        self._steps, self._reach = tuple(steps), read_only(reach)  # alive: plans have addresses
+        self._plans, self._scratch = np.zeros(len(steps), PLAN), list[Array]()
+        for i, step in enumerate(steps):
+            plan = step.plan.copy()
+            stages = 4 * int(plan["steps"]) * int(plan["fine"]["m"])
+            apart = int(plan["scratch_apart"]) + (horizon - 1) * stages  # the tape comes last
+            self._scratch.append(aligned(2 * apart))
+            plan["scratch"], plan["scratch_apart"] = self._scratch[-1].ctypes.data, apart
+            self._plans[i] = plan
+        self._levels = np.zeros(horizon, dtype=np.int64)
+
+    def roll(
+        self, z: Array, v: Array, feedback: Array, constant: Array, bounds: Array
+    ) -> tuple[Array, Array, Array]:
+        """States (H + 1, n_x) from z (n_x,), requested and applied actions (H, n_a).
+
+        v (H, n_a), feedback K (n_a, n_x), constant b (n_a,), bounds (2, n_a).
+        """
+        H, n_a = v.shape
+        states, requested = np.empty((H + 1, len(z))), np.empty((H, n_a))
+        actions = np.empty((H, n_a + 1))
+        states[0] = z
+        given = (read_only(v), read_only(feedback), read_only(constant), read_only(bounds))
+        roll(*given, self._reach, self._plans, self._levels, states, requested, actions)
+        return states, requested, actions[:, :-1]
+
+    def roll_back(
+        self, free: Array, on_states: Array, on_actions: Array, feedback: Array, eta: Array
+    ) -> Array:
+        """Derivatives (H, n_a) by v of the last `roll`, of a function of its states and actions.
+
+        free (H, n_a): 1, or 0 where an action is at a bound; on_states (H, n_x) and on_actions (H,
+        n_a): its derivatives by z_i and a_i, i < H; eta (n_x,): that by z_H.
+        """
+        found, last = np.empty(on_actions.shape), np.array(eta)
+        given = read_only(free), read_only(on_states), read_only(on_actions), read_only(feedback)
+        roll_back(*given, self._plans, self._levels, last, found)
+        return found

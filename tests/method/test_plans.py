@@ -1,0 +1,175 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Plans on a model: their gradient, the optimum of a linear plant, bounds, and a target over time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
+from loop_method.laws.plans import ModelSweep, Planner, SpectralSweep
+from loop_method.models.base import FieldModel
+from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
+from loop_method.models.linear import LinearModel
+from loop_method.models.spectral import SpectralModel
+
+N_Z, N_A, T = 16, 2, 30
+
+
+def linear(seed: int = 0, n_z: int = N_Z, radius: float = 1.1) -> LinearModel:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n_z, n_z))
+    A *= radius / np.abs(np.linalg.eigvals(A)).max()
+    return LinearModel("linear", A, rng.standard_normal((n_z, N_A)), np.zeros(n_z))
+
+
+def spectral() -> SpectralModel:
+    """Burgers with a linear instability, in fewer steps where the field is small."""
+    k = 1j * np.arange(N_Z // 2 + 1)
+    B = np.random.default_rng(1).standard_normal((N_Z, N_A))
+    few = np.array([[0.8, 2.0]])
+    linear, polynomials = 0.05 + 0.05 * k**2, np.array([[-0.1]])
+    return SpectralModel("poly2", linear, k[None], polynomials, B, np.full(N_Z, 0.02), 4, 3.0, few)
+
+
+def differences() -> FiniteDifferenceModel:
+    features = Feature((0,)), Feature((0,), 2), Feature((0, 0, 0))
+    C = np.tile(np.array([0.3, 0.1, -0.2])[:, None, None], (1, 1, N_Z))
+    B = 0.3 * np.random.default_rng(1).standard_normal((N_Z, N_A))
+    return FiniteDifferenceModel("x-shared", features, C, B, np.full(N_Z, 0.02), 3)
+
+
+def planner(model: FieldModel, cost: Cost | None = None, **changed: object) -> Planner:
+    rng = np.random.default_rng(2)
+    given = {
+        "cost": cost or Cost(model.n_z, N_A, T, action_weight=0.5, target=0.3),
+        "actions": ActionSet(N_A),
+        "K": 0.05 * rng.standard_normal((N_A, model.n_z)),
+        "b": 0.1 * rng.standard_normal(N_A),
+        "around": True,
+        "steps": 12,
+        "terminal": True,
+    }
+    return Planner(model, **{**given, **changed})  # type: ignore[arg-type]
+
+
+def general_cost() -> Cost:
+    """Matrices, outputs, a target over time and one of the actions, and a terminal weight."""
+    rng = np.random.default_rng(3)
+    C, root = rng.standard_normal((5, N_Z)), rng.standard_normal((2, 2))
+    return Cost(
+        N_Z,
+        N_A,
+        T,
+        state_weight=np.arange(1.0, 6.0),
+        action_weight=root @ root.T + np.eye(2),
+        target=rng.standard_normal((T, 5)),
+        output=C,
+        action_target=[0.2, -0.1],
+        terminal_weight=2.0,
+    )
+
+
+@pytest.mark.parametrize("k", [0, T - 12])
+@pytest.mark.parametrize("model", [linear(), spectral(), differences()], ids=lambda m: m.kind)
+@pytest.mark.parametrize("cost", [None, general_cost()], ids=["plain", "general"])
+def test_the_gradient_is_that_of_the_cost(model: FieldModel, cost: Cost | None, k: int) -> None:
+    """Also with actions at their bounds, and where the plan ends with the episode."""
+    own = planner(model, cost, actions=ActionSet(N_A, [-0.4, -np.inf], [0.5, 0.6]))
+    rng = np.random.default_rng(k)
+    z, v = rng.standard_normal((3, N_Z)), 0.5 * rng.standard_normal((3, 12, N_A))
+    d = rng.standard_normal(v.shape)
+    J, g, kept = own.gradient(v, z, k)
+    assert not np.allclose(kept, v)  # some are projected
+    np.testing.assert_allclose(J, own.costs(v, z, k), rtol=1e-12)
+    np.testing.assert_allclose(J, own.costs(kept, z, k), rtol=1e-9)
+    slopes = (own.costs(v + 1e-6 * d, z, k) - own.costs(v - 1e-6 * d, z, k)) / 2e-6
+    np.testing.assert_allclose((g * d).sum(axis=(1, 2)), slopes, rtol=1e-5)
+
+
+def test_a_spectral_model_is_compiled_and_gives_what_its_steps_give() -> None:
+    model, rng = spectral(), np.random.default_rng(4)
+    own, other = planner(model), planner(model)
+    assert isinstance(own._sweep, SpectralSweep)
+    other.__dict__["_sweep"] = ModelSweep(model, other.actions)
+    z, v = rng.standard_normal((2, N_Z)), rng.standard_normal((2, 12, N_A))
+    for found, expected in zip(own.gradient(v, z, 3), other.gradient(v, z, 3), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_of_a_linear_plant_it_is_the_regulator_of_the_riccati_equation(around: bool) -> None:
+    """With the cost to go the plan's first action is optimal whatever its length."""
+    model, cost = linear(), Cost(N_Z, N_A, 4096, action_weight=0.5)
+    A, B = model.A, model.B
+    P = linalg.solve_discrete_are(A, B, np.eye(N_Z), 0.5 * np.eye(N_A))
+    K = -linalg.solve(0.5 * np.eye(N_A) + B.T @ P @ B, B.T @ P @ A)
+    own = planner(model, cost, around=around, K=0.9 * K, b=np.zeros(N_A), steps=3, first=60)
+    z = np.random.default_rng(5).standard_normal((2, N_Z))
+    a, _, fell = own.step(np.zeros((2, 3, N_A)), z, 0)
+    np.testing.assert_allclose(a, z @ K.T, rtol=1e-3, atol=1e-3)
+    assert not fell.any()
+
+
+def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:
+    """The Karush-Kuhn-Tucker conditions: no slope but outwards at a bound."""
+    actions = ActionSet(N_A, [-0.05, -np.inf], [0.02, 0.03])
+    own = planner(linear(radius=0.9), actions=actions, around=False)
+    z = np.random.default_rng(6).standard_normal((1, N_Z))
+    v, _ = own.improved(np.zeros((1, 12, N_A)), z, 0, 300)
+    _, on_v, v = own.gradient(v, z, 0)
+    free = replace(own, actions=ActionSet(N_A))
+    _, g, _ = free.gradient(v, z, 0)
+    low, high = v <= actions.low + 1e-9, v >= actions.high - 1e-9
+    assert low.any() and high.any() and not (low | high).all()
+    small = 1e-2 * np.abs(g).max()
+    assert np.abs(on_v).max() < small and np.abs(g[~(low | high)]).max() < small
+    assert g[low].min() > -small and g[high].max() < small
+
+
+def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where_it_is_better() -> None:
+    model = linear()
+    own = planner(model)
+    z = np.random.default_rng(7).standard_normal((1, N_Z))
+    a, _, fell = own.step(np.full((1, 12, N_A), 1e200), z, 1)
+    assert fell.all() and np.abs(a).max() < 100
+    lost = planner(LinearModel("linear", np.full((N_Z, N_Z), 1e200), model.B, model.constant))
+    a, plan, fell = lost.step(np.zeros((1, 12, N_A)), z, 1)
+    np.testing.assert_allclose(a, z @ lost.K.T + lost.b)
+    assert fell.all() and not plan.any()
+
+
+def test_a_target_over_time_is_foreseen() -> None:
+    """It is worth moving before the target does."""
+    rows = np.repeat([0.0, 1.0], T // 2)[:, None] * np.ones(1)
+    cost = Cost(1, N_A, T, target=rows, action_weight=0.5)
+    model = LinearModel("linear", np.eye(1), np.ones((1, N_A)), np.zeros(1))
+    own = planner(
+        model, cost, around=False, terminal=False, K=np.zeros((N_A, 1)), b=np.zeros(N_A)
+    )
+    acted = np.zeros(T)
+    z, plan = np.zeros((1, 1)), np.zeros((1, 12, N_A))
+    for k in range(T):
+        a, plan, _ = own.step(plan, z, k)
+        plan, z, acted[k] = own.shifted(plan), model.step(z, a), a[0, 0]
+    assert acted[T // 2 - 1] > 0.05 > abs(acted[0])
+
+
+def test_plans_side_by_side_are_those_of_each() -> None:
+    own = planner(spectral())
+    z = np.random.default_rng(8).standard_normal((3, N_Z))
+
+    def rolled(z: Array) -> Array:
+        plan, found = np.zeros((len(z), 12, N_A)), []
+        for k in range(3):
+            a, plan, _ = own.step(plan, z, k)
+            plan, z = own.shifted(plan), own.model.step(z, a)
+            found.append(a)
+        return np.stack(found, axis=1)
+
+    np.testing.assert_allclose(rolled(z)[1:2], rolled(z[1:2]), rtol=1e-9)

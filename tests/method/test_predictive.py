@@ -1,0 +1,274 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The law that plans on a model: what its theta holds, its memory, and the training that makes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pdeloop
+from controller_node.law_batch import LawBatch
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.cost import Cost
+from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.spec import ParameterError
+from loop_method.adapt.base import Context, Rollout, RolloutResult, Trajectory
+from loop_method.adapt.model_based import ModelBased
+from loop_method.adapt.model_based_predictive import ModelBasedPredictive
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.laws import Affine, Predictive
+from loop_method.laws.calls import action, updated
+from loop_method.laws.plans import Planner
+from loop_method.models.settings import FieldModelSettings
+from loop_method.models.files import LARGEST, packed, unpacked
+from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
+
+RNG = np.random.default_rng(1)
+U = np.linalg.qr(RNG.standard_normal((N_Z, 3)))[0]
+GAINS = 0.02 * RNG.standard_normal((N_A, 6))
+ROWS = ModelRows(np.eye(3), np.ones((3, N_A)), U, GAINS[:, :3], GAINS[:, 3:], U.T @ np.ones(N_Z))
+STATES = RNG.standard_normal((6, N_Z))
+
+
+def law(cost: Cost | None = None) -> Predictive:
+    made = Predictive(ROWS, T)
+    made.cost = cost
+    return made
+
+
+def theta(own: Predictive, **changed: object) -> np.ndarray:
+    model = spectral()
+    K = np.ascontiguousarray(ROWS.K_a @ U.T)
+    cost = own.cost or Cost(N_Z, N_A, T, action_weight=0.5, target=np.full(N_Z, 0.3))
+    made = Planner(
+        model,
+        cost,
+        ActionSet(N_A, -0.5, [0.4, np.inf]),
+        K,
+        ROWS.K_b @ ROWS.s_r,
+        around=True,
+        steps=10,
+        terminal=True,
+    )
+    return own.theta_of(GAINS, replace(made, **changed))  # type: ignore[arg-type]
+
+
+def actions_of(own: Predictive, theta: np.ndarray, states: np.ndarray = STATES) -> np.ndarray:
+    batch = LawBatch([own], np.zeros(N_Z))
+    batch.set(theta[None])
+    return np.stack([batch.actions(k, z[None])[0] for k, z in enumerate(states)])
+
+
+def test_without_a_model_it_is_the_affine_law() -> None:
+    own, affine = law(), Affine(ROWS, T)
+    assert np.array_equal(own.theta_start, affine.theta_start)
+    expected = STATES @ U @ GAINS[:, :3].T + GAINS[:, 3:] @ ROWS.s_r
+    np.testing.assert_allclose(actions_of(own, own.theta_start), expected, atol=1e-12)
+
+
+def test_arrays_come_back_from_numbers_to_the_bit() -> None:
+    arrays = {
+        "complex": np.array([[1.5 - 2j, 3j]]),
+        "text": np.array("a model of u²"),
+        "flag": np.array(True),
+        "count": np.array([3, -4]),
+        "large": np.array([1e300, -np.inf, 0.1, 5e-324]),
+        "none": np.empty((0, 2)),
+    }
+    numbers = packed(arrays)
+    assert np.abs(numbers).max() <= LARGEST and np.isfinite(numbers).all()
+    found = unpacked(np.append(numbers, np.zeros(7)))
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype and found[name].shape == array.shape
+        assert found[name].tobytes() == array.tobytes()
+    with pytest.raises(ValueError, match="no arrays"):
+        unpacked(numbers[:20])
+
+
+@pytest.mark.parametrize("cost", [None, general_cost()], ids=["plain", "general"])
+def test_what_theta_holds_is_the_planner_and_zeros_at_its_end_mean_nothing(
+    cost: Cost | None,
+) -> None:
+    own = law(cost)
+    whole = theta(own)
+    assert own.plans(whole) and not own.plans(own.theta_start)
+    found = own.planner(own.parts(whole))
+    z, v = STATES[:2], RNG.standard_normal((2, 10, N_A))
+    expected = replace(found, model=spectral()).costs(v, z, 0)
+    assert np.array_equal(found.costs(v, z, 0), expected)
+    acted = actions_of(own, whole)
+    assert np.array_equal(actions_of(law(cost), np.append(whole, np.zeros(9))), acted)
+    assert (acted >= -0.5).all() and (acted[:, 0] <= 0.4).all()
+
+
+def test_its_memory_is_a_function_of_the_states_of_the_episode() -> None:
+    """Another controller that is given the same states answers with the same bits."""
+    own = law()
+    whole = theta(own)
+    parts, memory = own.parts(whole), own.memory_start()
+    for k, (z, expected) in enumerate(zip(STATES, actions_of(law(), whole), strict=True)):
+        for asked in (own, law()):
+            assert np.array_equal(action(asked, parts, z, memory, k), expected)
+        memory = updated(own, parts, z, memory, expected, k)
+        assert memory.shape == (own.memory_size,)
+
+
+def test_a_memory_counts_how_often_the_affine_plan_was_better() -> None:
+    own = law()
+    parts, memory = own.parts(theta(own, iterations=0)), own.memory_start()
+    memory[:-1] = 50.0  # no plan of anybody
+    assert updated(own, parts, STATES[0], memory, np.zeros(N_A), 1)[-1] == 1.0
+
+
+@pytest.mark.parametrize("wrong", [{"steps": T + 60}, {"model": spectral().__class__}])
+def test_numbers_that_are_no_planner_are_refused(wrong: dict[str, object]) -> None:
+    own = law()
+    if "steps" in wrong:
+        whole = theta(own, **wrong)
+    else:
+        whole = theta(own)
+        whole[own.size + 3] += 40.0  # in the directory
+    with pytest.raises(ValueError):
+        own.planner(own.parts(whole))
+
+
+TRAINED = {
+    "n_z": 32,
+    "n_a": 3,
+    "actuator_width": 0.1,
+    "horizon": 15,
+    "reduced_order": 6,
+    "rollouts": 12,
+    "evaluation_fields": 3,
+    "law": "predictive",
+    "law_settings": {"steps": 6, "first_iterations": 20, "starts": 2},
+}
+
+
+@pytest.fixture(scope="module")
+def run() -> pdeloop.FinishedRun:
+    return pdeloop.train("allen-cahn-modes", **TRAINED)
+
+
+def test_a_training_ends_with_the_law_that_measured_better(run: pdeloop.FinishedRun) -> None:
+    *_, last = run.result["history"]
+    assert last["rollouts"] == 12 and last["chosen"] in ("predictive", "adapted", "first")
+    own, chosen = run.laws[0], run.policies[0]
+    assert own.plans(chosen) == (last["chosen"] == "predictive")
+    assert run.costs["adapted"].mean() <= run.costs["lqt"].mean()
+
+
+def test_the_law_of_a_run_acts_as_it_was_measured(run: pdeloop.FinishedRun) -> None:
+    plant = pdeloop.problem("allen-cahn-modes", **TRAINED).plant()
+    fields, noise = run.evaluation
+    again = pdeloop.rollout(plant, run.law(), fields, noise)
+    assert np.array_equal(again.costs.mean, run.costs["adapted"][0])
+
+
+def optimizer(rollouts: int = 10) -> ModelBasedPredictive:
+    """Of a plant that is the spectral model, judged by rollouts of it."""
+    explored = [explored_trajectory(seed) for seed in range(2)]
+    context = Context(
+        U=U,
+        target=np.full(N_Z, 0.3),
+        state_weight=1.0,
+        action_weight=0.5,
+        horizon=T,
+        exploration=explored[0],
+        further=explored[1:],
+        field_models=FieldModelSettings(folds=2, largest_degree=2),
+        law=type("Short", (Predictive,), {"settings": SHORT})(ROWS, T),
+    )
+    kind = ModelBased.for_context(context)
+    settings = ModelBasedSettings(judging=2, iterations=10)
+    made = kind(GAINS.ravel(), seed=3, rollouts=rollouts, settings=settings, context=context)
+    assert isinstance(made, ModelBasedPredictive)
+    return made
+
+
+SHORT = replace(Predictive.settings, steps=6, first_iterations=10, starts=1)
+
+
+def explored_trajectory(seed: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    actions, z = 0.3 * rng.standard_normal((T, N_A)), start(seed)
+    states = [z]
+    for a in actions:
+        states.append(spectral_step(states[-1], a))
+    return Trajectory(np.array(states), actions)
+
+
+def start(seed: int) -> np.ndarray:
+    rng, x = np.random.default_rng([9, seed]), 2 * np.pi * np.arange(N_Z) / N_Z
+    waves = [rng.normal() * np.cos(j * x) + rng.normal() * np.sin(j * x) for j in (1, 2)]
+    return 0.5 * np.sum(waves, axis=0)
+
+
+PLANT = spectral()
+
+
+def spectral_step(z: np.ndarray, a: np.ndarray) -> np.ndarray:
+    return PLANT.step(z[None], a[None])[0]
+
+
+def measured(own: ModelBasedPredictive, rollout: Rollout) -> RolloutResult:
+    law = own._law
+    parts, memory = law.parts(rollout.policy.ravel()), law.memory_start()
+    cost, z = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3), start(rollout.field_seed)
+    states, actions, total = [z], [], np.zeros(1)
+    for k in range(T):
+        a = action(law, parts, z, memory, k)
+        memory = updated(law, parts, z, memory, a, k)
+        cost.add(total, z[None], a[None], k)
+        z = spectral_step(z, a)
+        states.append(z)
+        actions.append(a)
+    return RolloutResult(total[0] / T, False, Trajectory(np.array(states), np.array(actions)))
+
+
+def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
+    own, other = optimizer(), None
+    rows = []
+    while not own.done:
+        asked = own.ask()
+        if other is not None:
+            assert all(
+                np.array_equal(a.policy, b.policy)
+                for a, b in zip(asked, other.ask(), strict=True)
+            )
+        results = [measured(own, rollout) for rollout in asked]
+        rows.append(own.tell(results))
+        other = optimizer()
+        other.restore(own.state())
+        assert np.array_equal(other.policy, own.policy) and other.done == own.done
+    assert rows[-1]["rollouts"] == 10 and rows[-1]["role"] == "judging"
+    assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
+
+
+def test_without_a_model_the_affine_law_stays_and_says_why() -> None:
+    own = optimizer()
+    rng, row = np.random.default_rng(0), {}
+    while not own.done:
+        results = [
+            RolloutResult(
+                float(rng.uniform(1, 2)),
+                False,
+                Trajectory(rng.standard_normal((T + 1, N_Z)), rng.standard_normal((T, N_A))),
+            )
+            for _ in own.ask()
+        ]
+        row = own.tell(results)
+    assert "the affine law stays: no model of the whole field was accepted" in str(row["reason"])
+    assert own.policy.size == own._law.size
+
+
+def test_what_it_does_not_support_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ParameterError, match=r"'law_settings.steps' is 60; expected at most .* 50"):
+        pdeloop.train("burgers", law="predictive", law_settings={"steps": 60}, horizon=50)
+    with pytest.raises(ParameterError, match="plans from the whole state, but 8 sensors"):
+        pdeloop.train("burgers", law="predictive", sensors=8)
+    with pytest.raises(ParameterError, match="choose model_based, or another law"):
+        pdeloop.train("burgers", law="predictive", optimizer="two_point")
