@@ -84,8 +84,8 @@ class LawBatch:
         if not (theta.shape[1:] == shape or longer) or not len(theta):
             more = " or more" if self._laws[0].extends else ""
             raise ValueError(
-                f"policies must have shape (environments, {', '.join(map(str, shape))}{more}) for the law "
-                f"'{self._laws[0].name}' of these models, but the shape is {theta.shape}."
+                f"policies must have shape (environments, {', '.join(map(str, shape))}{more}) for the "
+                f"law '{self._laws[0].name}' of these models, but the shape is {theta.shape}."
             )
         if not np.isfinite(theta).all():
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")

@@ -140,6 +140,9 @@ class Cost:
         Parameters
         ----------
         states, actions : (M, H, n_z), (M, H, n_a)
+            Those of each step.
+        first : int
+            The number of the first one.
 
         Returns
         -------
@@ -264,7 +267,6 @@ class _Square:
             return 2.0 * self._weight * (values - wanted)
         slope: Array = 2.0 * (values @ self._E.T - self.scaled(wanted)) @ self._E
         return slope
-
 
     def along(self, values: Array, wanted: Array) -> tuple[Array, Array]:
         """The squares (...) of values (..., n), and their derivatives (..., n)."""

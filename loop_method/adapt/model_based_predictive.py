@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`model_based` for a law that plans: the affine law first, then plans on its model, judged by rollouts.
+"""`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
 
 The affine law is trained as ever. On the last model that predicts the rollouts, plans of 20, 40 and 80
 steps are simulated in closed loop from a few measured initial fields, as actions or as deviations from
@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.action_set import ActionSet
 from loop_interfaces.array_files import checked_array
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
@@ -49,8 +48,8 @@ SHORTER = 0.02
 FEW = 4
 """Measured initial fields from which plans are simulated."""
 RESTS = 0.01
-"""The target is an equilibrium of the model if a step from there moves the state by less than this share
-of its mean distance from the target."""
+"""The target is an equilibrium of the model if a step from there moves the state by at most this share
+of its mean distance from it."""
 _TRAINING, _JUDGING, _ENDED = "training", "judging", "ended"
 _OWN = "own."
 
@@ -209,7 +208,7 @@ class ModelBasedPredictive(Optimizer):
         plain = Planner(
             model,
             cost,
-            ActionSet(model.n_a, limit=context.action_limit),
+            context.action_set,
             np.ascontiguousarray(policy[:, :n_s] @ context.U.T),
             policy[:, n_s:] @ s_r,
             around=False,

@@ -90,7 +90,7 @@ class Law(ABC):
     """True if its theta has a model of the plant, so that only an optimiser that knows it can adapt it
     (`Optimizer.also_improves`)."""
     extends: ClassVar[bool] = False
-    """True if its theta may be longer than `size`: an optimiser adds what it identified. Zeros at the end
+    """True if its theta may be longer than `size`, by what an optimiser identified. Zeros at the end
     mean nothing, so that thetas of several lengths can stand in one array."""
     memory_size: int = 0
     cost: Cost | None = None

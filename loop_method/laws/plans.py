@@ -6,10 +6,9 @@ At step k a plan v_0 .. v_{H-1} from the state z_k costs
     J(v) = sum_{i < H} l_{k+i}(z_i, a_i) + V(z_H),
     z_{i+1} = f(z_i, a_i),        a_i = P(K z_i + b + v_i),
 
-with f the model, l the stage cost, P the projection to the actions that actuators can take, and V the
-cost to go of the linear-quadratic problem at the target, or nothing. K and b are those of an affine law,
-from which v is then the deviation, or zero. The gradient is the adjoint of all of it, about three times
-as much work as J:
+with f the model, l the stage cost, P(a) the nearest admissible action, and V the cost to go of the
+linear-quadratic problem at the target, or nothing. K and b are those of an affine law, from which v is
+then the deviation, or zero. The gradient is the adjoint of all of it, about three times as much work:
 
     eta_H = dV/dz,    g_i = P'^T ((df/da)^T eta_{i+1} + dl/da),
     eta_i = (df/dz)^T eta_{i+1} + dl/dz + K^T g_i,    dJ/dv_i = g_i.
@@ -74,7 +73,7 @@ class Planner:
         f.
     cost : Cost
         Of an episode of T steps.
-    actions : ActionSet
+    action_set : ActionSet
         What actuators can take.
     K, b : (n_a, n_z) and (n_a,) arrays
         The affine law a = K z + b.
@@ -92,7 +91,7 @@ class Planner:
 
     model: FieldModel
     cost: Cost
-    actions: ActionSet
+    action_set: ActionSet
     K: Array
     b: Array
     around: bool
@@ -108,7 +107,7 @@ class Planner:
         return min(self.steps, left) if left > 0 else self.steps
 
     def begin(self, z: Array, k: int = 0) -> tuple[Array, Array]:
-        """The cheapest plan (M, H, n_a) from states z (M, n_z) of those found from all starts, and J."""
+        """The cheapest plan (M, H, n_a) from states z (M, n_z) of those from all starts, and J."""
         M, H = len(z), self.length(k)
         affine = self._affine_plan(z, H)
         own = self.actions_of(affine, z)
@@ -122,7 +121,7 @@ class Planner:
         best, least = affine, np.full(M, np.inf)
         for start in starts[: self.starts]:
             found, J = self.improved(start, z, k, min(self.first, BEFORE))
-            best = np.where((J < least)[:, None, None], found, best)
+            best = np.where((least > J)[:, None, None], found, best)
             least = np.minimum(J, least)
         return self.improved(best, z, k, self.first - BEFORE)
 
@@ -146,7 +145,7 @@ class Planner:
             affine = self._affine_plan(z, H)
             of_affine = self.costs(affine, z, k)
             J, g, kept = self.gradient(plan[:, :H], z, k)
-            fell = ~(J <= of_affine)
+            fell = ~(of_affine >= J)
             plan = np.where(fell[:, None, None], affine, kept)
             if fell.any():
                 J, g, plan = self.gradient(plan, z, k)
@@ -154,7 +153,7 @@ class Planner:
         lost = ~np.isfinite(J)
         of_law = self._affine(z)
         base = of_law if self.around else 0.0
-        a = self.actions.project(np.where(lost[:, None], of_law, base + plan[:, 0]))
+        a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]))
         plan = np.where(lost[:, None, None], 0.0, plan)
         return a, plan, fell | lost
 
@@ -192,13 +191,15 @@ class Planner:
                 seen = np.where(close, actions, requested)
                 own = self._sweep.roll_back(seen, on_states, on_actions, K, eta)
                 g[rows] = np.where(self._leaves(actions, own), 0.0, own)
-        lost = ~(np.isfinite(J) & np.isfinite(g).all(axis=(1, 2)) & np.isfinite(kept).all(axis=(1, 2)))
+        lost = ~(
+            np.isfinite(J) & np.isfinite(g).all(axis=(1, 2)) & np.isfinite(kept).all(axis=(1, 2))
+        )
         J[lost], g[lost], kept[lost] = np.inf, 0.0, v[lost]
         return J, g, kept
 
     def _leaves(self, actions: Array, g: Array) -> Flags:
         """Which actions are at a bound that the descent -g would leave the set at."""
-        low, high = self.actions.low, self.actions.high
+        low, high = self.action_set.low, self.action_set.high
         down = actions <= low + _CLOSE * (1.0 + np.abs(low))
         up = actions >= high - _CLOSE * (1.0 + np.abs(high))
         held: Flags = (down & (g > 0.0)) | (up & (g < 0.0))
@@ -301,10 +302,10 @@ class Planner:
     def _sweep(self) -> Sweep:
         steps = min(self.steps, self.cost.horizon)
         model = self.model
-        if isinstance(model, SpectralModel) and not self.actions.zero_mean:
-            if model.compiled.compiled_spectra:
-                return SpectralSweep(model, self.actions, max(steps, 1))
-        return ModelSweep(model, self.actions)
+        separate = not self.action_set.zero_mean
+        if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
+            return SpectralSweep(model, self.action_set, max(steps, 1))
+        return ModelSweep(model, self.action_set)
 
     @cached_property
     def _to_go(self) -> Array | None:
@@ -396,7 +397,9 @@ class SpectralSweep:
     def __init__(self, model: SpectralModel, actions: ActionSet, horizon: int) -> None:
         self._compiled = PolynomialSweep(model.steps, model.fewer[:, 0], horizon)
         self._set = actions
-        self._bounds = np.stack([np.broadcast_to(x, model.n_a) for x in (actions.low, actions.high)])
+        self._bounds = np.stack(
+            [np.broadcast_to(x, model.n_a) for x in (actions.low, actions.high)]
+        )
 
     def batches(self, count: int) -> Iterator[slice]:
         for m in range(count):

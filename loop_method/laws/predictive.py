@@ -36,7 +36,10 @@ class PredictiveSettings(Settings):
     """Constants of the law `predictive`."""
 
     steps: int = setting(
-        0, "steps H of a plan; 0: the shortest of 20, 40 and 80 that suffices on the model", 0, LONGEST
+        0,
+        "steps H of a plan; 0: the shortest of 20, 40 and 80 that suffices on the model",
+        0,
+        LONGEST,
     )
     iterations: int = setting(2, "iterations of the search at a step", 0, 100)
     first_iterations: int = setting(60, "iterations of the first search from each start", 0, 1000)
@@ -49,7 +52,7 @@ class Predictive(Law):
         a_k = P(K z_k + b + v_0),        v_0 .. v_{H-1} = argmin of the cost of the next H steps
 
     (`loop_method.laws.plans`). It begins as the affine law, without a model. An optimiser that
-    identifies one writes it into theta, with the cost, the bounds of the actions, H and the constants of
+    identifies one writes it into theta, with the cost, the admissible actions, H and the constants of
     the search: `model_based` does. theta is then longer than `size`; zeros at its end mean nothing.
 
     Its memory is the plan for the next steps, and how often the affine law's plan was the cheaper one
@@ -96,7 +99,7 @@ class Predictive(Law):
         ValueError for a model of too many numbers.
         """
         arrays: Arrays = {_MODEL + name: own for name, own in planner.model.arrays().items()}
-        cost, actions = planner.cost, planner.actions
+        cost, actions = planner.cost, planner.action_set
         if self.cost is None:
             arrays |= {
                 "weights": np.array([float(cost.state_weight), float(cost.action_weight)]),
@@ -143,9 +146,7 @@ class Predictive(Law):
         if cost is None:
             q, r = checked_array(arrays, "weights", "f", (2,)).tolist()
             target = checked_array(arrays, "target", "f", (n_z,))
-            cost = Cost(
-                n_z, n_a, self.horizon, state_weight=q, action_weight=r, target=target
-            )
+            cost = Cost(n_z, n_a, self.horizon, state_weight=q, action_weight=r, target=target)
         low, high = checked_array(arrays, "bounds", "f", (2, n_a), finite=False)
         zero_mean = bool(checked_array(arrays, "zero_mean", "b", ()))
         steps, iterations, first, starts = checked_array(arrays, "search", "i", (4,)).tolist()

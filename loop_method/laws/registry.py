@@ -25,10 +25,7 @@ OWN_LAWS = OwnCode(
     "law",
     "PDELOOP_LAWS",
     MappingProxyType(
-        {
-            kind.name: kind
-            for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive)
-        }
+        {kind.name: kind for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive)}
     ),
 )
 

@@ -48,10 +48,10 @@ _BITS = 22
 
 
 def packed(arrays: Arrays) -> Array:
-    """Arrays as one vector of finite numbers of at most `LARGEST`, from which `unpacked` makes them.
+    """Arrays as a vector of finite numbers of at most `LARGEST`, from which `unpacked` makes them.
 
-    A directory, with all texts, comes first, as character codes. Arrays of numbers that are infinite, or
-    larger, are written as bits.
+    A directory, with all texts, comes first, as character codes. Arrays of numbers that are infinite,
+    or larger, are written as bits.
 
     >>> found = unpacked(np.append(packed({"a": np.array([1.0, np.inf])}), np.zeros(3)))
     >>> found["a"]

@@ -48,7 +48,7 @@ def planner(model: FieldModel, cost: Cost | None = None, **changed: object) -> P
     rng = np.random.default_rng(2)
     given = {
         "cost": cost or Cost(model.n_z, N_A, T, action_weight=0.5, target=0.3),
-        "actions": ActionSet(N_A),
+        "action_set": ActionSet(N_A),
         "K": 0.05 * rng.standard_normal((N_A, model.n_z)),
         "b": 0.1 * rng.standard_normal(N_A),
         "around": True,
@@ -80,7 +80,7 @@ def general_cost() -> Cost:
 @pytest.mark.parametrize("cost", [None, general_cost()], ids=["plain", "general"])
 def test_the_gradient_is_that_of_the_cost(model: FieldModel, cost: Cost | None, k: int) -> None:
     """Also with actions at their bounds, and where the plan ends with the episode."""
-    own = planner(model, cost, actions=ActionSet(N_A, [-0.4, -np.inf], [0.5, 0.6]))
+    own = planner(model, cost, action_set=ActionSet(N_A, [-0.4, -np.inf], [0.5, 0.6]))
     rng = np.random.default_rng(k)
     z, v = rng.standard_normal((3, N_Z)), 0.5 * rng.standard_normal((3, 12, N_A))
     d = rng.standard_normal(v.shape)
@@ -96,7 +96,7 @@ def test_a_spectral_model_is_compiled_and_gives_what_its_steps_give() -> None:
     model, rng = spectral(), np.random.default_rng(4)
     own, other = planner(model), planner(model)
     assert isinstance(own._sweep, SpectralSweep)
-    other.__dict__["_sweep"] = ModelSweep(model, other.actions)
+    other.__dict__["_sweep"] = ModelSweep(model, other.action_set)
     z, v = rng.standard_normal((2, N_Z)), rng.standard_normal((2, 12, N_A))
     for found, expected in zip(own.gradient(v, z, 3), other.gradient(v, z, 3), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)
@@ -119,11 +119,11 @@ def test_of_a_linear_plant_it_is_the_regulator_of_the_riccati_equation(around: b
 def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:
     """The Karush-Kuhn-Tucker conditions: no slope but outwards at a bound."""
     actions = ActionSet(N_A, [-0.05, -np.inf], [0.02, 0.03])
-    own = planner(linear(radius=0.9), actions=actions, around=False)
+    own = planner(linear(radius=0.9), action_set=actions, around=False)
     z = np.random.default_rng(6).standard_normal((1, N_Z))
     v, _ = own.improved(np.zeros((1, 12, N_A)), z, 0, 300)
     _, on_v, v = own.gradient(v, z, 0)
-    free = replace(own, actions=ActionSet(N_A))
+    free = replace(own, action_set=ActionSet(N_A))
     _, g, _ = free.gradient(v, z, 0)
     low, high = v <= actions.low + 1e-9, v >= actions.high - 1e-9
     assert low.any() and high.any() and not (low | high).all()
@@ -132,7 +132,9 @@ def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:
     assert g[low].min() > -small and g[high].max() < small
 
 
-def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where_it_is_better() -> None:
+def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where_it_is_better() -> (
+    None
+):
     model = linear()
     own = planner(model)
     z = np.random.default_rng(7).standard_normal((1, N_Z))
@@ -149,9 +151,7 @@ def test_a_target_over_time_is_foreseen() -> None:
     rows = np.repeat([0.0, 1.0], T // 2)[:, None] * np.ones(1)
     cost = Cost(1, N_A, T, target=rows, action_weight=0.5)
     model = LinearModel("linear", np.eye(1), np.ones((1, N_A)), np.zeros(1))
-    own = planner(
-        model, cost, around=False, terminal=False, K=np.zeros((N_A, 1)), b=np.zeros(N_A)
-    )
+    own = planner(model, cost, around=False, terminal=False, K=np.zeros((N_A, 1)), b=np.zeros(N_A))
     acted = np.zeros(T)
     z, plan = np.zeros((1, 1)), np.zeros((1, 12, N_A))
     for k in range(T):

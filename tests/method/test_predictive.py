@@ -21,8 +21,8 @@ from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.laws import Affine, Predictive
 from loop_method.laws.calls import action, updated
 from loop_method.laws.plans import Planner
-from loop_method.models.settings import FieldModelSettings
 from loop_method.models.files import LARGEST, packed, unpacked
+from loop_method.models.settings import FieldModelSettings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
 
 RNG = np.random.default_rng(1)
@@ -236,8 +236,7 @@ def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
         asked = own.ask()
         if other is not None:
             assert all(
-                np.array_equal(a.policy, b.policy)
-                for a, b in zip(asked, other.ask(), strict=True)
+                np.array_equal(a.policy, b.policy) for a, b in zip(asked, other.ask(), strict=True)
             )
         results = [measured(own, rollout) for rollout in asked]
         rows.append(own.tell(results))
