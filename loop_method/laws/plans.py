@@ -144,7 +144,7 @@ class Planner:
         else:
             affine = self._affine_plan(z, H)
             of_affine = self.costs(affine, z, k)
-            J, g, kept = self.gradient(plan[:, :H], z, k)
+            J, g, kept = self.gradient(self._extended(plan[:, :H], z), z, k)
             fell = ~(of_affine >= J)
             plan = np.where(fell[:, None, None], affine, kept)
             if fell.any():
@@ -158,8 +158,19 @@ class Planner:
         return a, plan, fell | lost
 
     def shifted(self, plan: Array) -> Array:
-        """A plan (M, H, n_a) without its first action, and with none at the end."""
+        """A plan (M, H, n_a) without its first action, and with a zero at the end."""
         return np.concatenate([plan[:, 1:], np.zeros_like(plan[:, :1])], axis=1)
+
+    def _extended(self, plan: Array, z: Array) -> Array:
+        """The plan (M, H, n_a) that ends as the affine law acts."""
+        if self.around:
+            return plan
+        found = plan.copy()
+        with np.errstate(all="ignore"):
+            for rows in self._sweep.batches(len(z)):
+                states, _, _ = self._sweep.roll(z[rows], plan[rows], *self._feedback)
+                found[rows, -1] = self.action_set.project(self._affine(states[:, -2]))
+        return found
 
     def costs(self, v: Array, z: Array, k: int) -> Array:
         """J (M,) of plans v (M, H, n_a) from states z (M, n_z) at step k; infinite if not finite."""
