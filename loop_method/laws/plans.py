@@ -272,7 +272,7 @@ class Planner:
             size = (y * np.einsum("mij,jl->mil", y, self._metric)).sum(axis=(1, 2))
             known = np.isfinite(product) & (size > 0.0)
             scale = np.where(known, product / np.where(known, size, 1.0), scale)
-        d = scale[:, None, None] * np.einsum("mij,jl->mil", d, self._metric)
+        d[...] = scale[:, None, None] * np.einsum("mij,jl->mil", d, self._metric)
         for (s, y, product), alpha in zip(pairs, reversed(alphas), strict=True):
             beta = (y * d).sum(axis=(1, 2)) / product
             d += (alpha - beta)[:, None, None] * s
@@ -374,7 +374,7 @@ class ModelSweep:
 
     def __init__(self, model: FieldModel, actions: ActionSet) -> None:
         self._model, self._set = model, actions
-        self._states = self._actions = np.empty(0)
+        self._states = self._actions = np.empty((0, 0, 0))
 
     def batches(self, count: int) -> Iterator[slice]:
         yield slice(0, count)

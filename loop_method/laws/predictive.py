@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from threading import get_ident
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -65,6 +65,7 @@ class Predictive(Law):
     extends = True
     needs_model = True
     Settings = PredictiveSettings
+    settings: ClassVar[PredictiveSettings] = PredictiveSettings()
 
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)

@@ -6,8 +6,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.documents import parse_json
@@ -59,7 +61,7 @@ def packed(arrays: Arrays) -> Array:
     """
     directory, numbers = list[list[object]](), list[Array]()
     for name, array in arrays.items():
-        kind, values = array.dtype.kind, np.ascontiguousarray(array).ravel()
+        kind, values = str(array.dtype.kind), np.ascontiguousarray(array).ravel()
         if kind == "U":
             directory.append([name, kind, array.item()])
             continue
@@ -82,15 +84,16 @@ def unpacked(numbers: Array) -> Arrays:
             if kind == "U":
                 arrays[name] = np.array(str(shape))
                 continue
-            dtype, count = _KINDS[kind.lower()], math.prod(shape)
+            dtype: type[Any] = _KINDS[kind.lower()]
+            count = math.prod(shape)
             words = count * np.dtype(dtype).itemsize // 8 if kind.lower() in "cf" else count
             size = words if kind.islower() else 3 * words
             own = numbers[at : at + size]
             at += size
-            if kind.isupper():
-                values = _of_bits(own).view(dtype)
-            else:
-                values = own.view(dtype) if kind in "cf" else own.astype(dtype)
+            as_stored = _of_bits(own) if kind.isupper() else own
+            values: NDArray[Any] = as_stored.view(dtype)[:count]
+            if kind in "ib":
+                values = own.astype(dtype)
             arrays[name] = values.reshape(shape).copy()
         return arrays
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
