@@ -37,6 +37,7 @@ TUNING_SEEDS = 100
 EVALUATION = 2000
 """Evaluation seed of the held-out fields in a table; `TUNING` has others."""
 TUNING_EVALUATION = 1000
+AFFINE = "affine"
 BOUNDS = Path(__file__).parent / "families" / "bounds.json"
 
 
@@ -46,6 +47,7 @@ def run(
     seeds: int = 6,
     budgets: Sequence[int] = (20, 40),
     fields: int = 10,
+    laws: Sequence[str] = (AFFINE,),
     tuning: bool = False,
     bounds: bool = False,
     jobs: int | None = None,
@@ -64,6 +66,8 @@ def run(
         Rollouts of a training, including explorations and checks.
     fields
         Number of held-out initial fields.
+    laws
+        Laws that each training adapts, in turn.
     tuning
         Use the seeds and held-out fields with which constants may be chosen.
     bounds
@@ -86,8 +90,9 @@ def run(
     evaluation = TUNING_EVALUATION if tuning else EVALUATION
     first = TUNING_SEEDS if tuning else TABLE_SEEDS
     tasks = [
-        (name, budget, seed)
+        (name, budget, seed, law)
         for name in chosen
+        for law in laws
         for budget in budgets
         for seed in range(first, first + seeds)
     ]
@@ -107,30 +112,39 @@ def run(
 
 
 def train(
-    task: tuple[str, int, int], *, fields: int, evaluation: int, folder: Path
+    task: tuple[str, int, int, str], *, fields: int, evaluation: int, folder: Path
 ) -> dict[str, Any]:
     """One training; its costs on the held-out fields, or the error that ended it."""
-    name, budget, seed = task
+    name, budget, seed, law = task
     label = f"{name}, {budget}, {seed}, {evaluation}, {fields}"
+    label += f", {law}" if law != AFFINE else ""
     path = folder / f"{hashlib.sha256(label.encode()).hexdigest()[:16]}.json"
 
     def costs() -> dict[str, Any]:
         began = time.process_time()
-        given = {"rollouts": budget, "seed": seed, "evaluation_fields": fields}
+        given: dict[str, Any] = {"rollouts": budget, "seed": seed, "evaluation_fields": fields}
+        given |= {"law": law} if law != AFFINE else {}
         done = trained(CASES[name], evaluation_seed=evaluation, **given)
         means = {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
         by_field = {key: done.costs[key][0].tolist() for key in ("lqt", "adapted")}
         seconds = time.process_time() - began
         return {**means, "by_field": by_field, "spent": done.rollouts[0], "seconds": seconds}
 
-    return kept_row(path, {"case": name, "budget": budget, "seed": seed}, costs)
+    task_row = {"case": name, "budget": budget, "seed": seed, "law": law}
+    return kept_row(path, task_row, costs)
 
 
 def line(rows: Sequence[Mapping[str, Any]]) -> str:
     """What is said of a training."""
     (row,) = rows
     cost = row.get("error") or number(row["adapted"])
-    return f"{row['case']}, {row['budget']} rollouts, seed {row['seed']}: {cost}"
+    return f"{of_law(row)}, {row['budget']} rollouts, seed {row['seed']}: {cost}"
+
+
+def of_law(row: Mapping[str, Any]) -> str:
+    """The case of a training, with its law if that is not the affine one."""
+    law = row.get("law", AFFINE)
+    return str(row["case"]) if law == AFFINE else f"{row['case']}, {law}"
 
 
 def trained(case: Case, **settings: Any) -> Any:
@@ -156,10 +170,10 @@ def keep_bound(name: str, found: Mapping[str, float]) -> None:
 def summaries(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A row for each case: means over the seeds, and the worst seed against its own first law."""
     found = []
-    names = dict.fromkeys(row["case"] for row in result["rows"])
-    for name in names:
-        own = [row for row in result["rows"] if row["case"] == name]
-        summary: dict[str, Any] = {"case": name, "group": CASES[name].group}
+    names = {of_law(row): row["case"] for row in result["rows"]}
+    for named, name in names.items():
+        own = [row for row in result["rows"] if of_law(row) == named]
+        summary: dict[str, Any] = {"case": named, "group": CASES[name].group}
         summary |= result["bounds"].get(name, {})
         good = [row for row in own if "error" not in row]
         summary["failed"] = len(own) - len(good)

@@ -101,11 +101,11 @@ def test_a_case_is_a_problem_that_can_be_trained_on(name: str) -> None:
 @pytest.mark.parametrize("name", ["allen-cahn", "lorenz-96"])
 def test_finished_trainings_are_kept_and_errors_are_rows(name: str, tmp_path: Path) -> None:
     options = {"fields": 1, "evaluation": 3, "folder": tmp_path}
-    failed = general.train((name, 1, 0), **options)  # one rollout is no budget
+    failed = general.train((name, 1, 0, "affine"), **options)  # one rollout is no budget
     assert "rollouts" in failed["error"]
     (path,) = tmp_path.iterdir()
     path.write_text(json.dumps({**failed, "error": "kept"}))
-    assert general.train((name, 1, 0), **options)["error"] == "kept"
+    assert general.train((name, 1, 0, "affine"), **options)["error"] == "kept"
 
 
 def test_the_table_begins_with_what_lost_most() -> None:
@@ -126,8 +126,8 @@ def test_the_table_begins_with_what_lost_most() -> None:
 def test_a_name_is_that_case_and_a_beginning_all_that_have_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def row(task: tuple[str, int, int], **_: object) -> dict[str, object]:
-        case, budget, seed = task
+    def row(task: tuple[str, int, int, str], **_: object) -> dict[str, object]:
+        case, budget, seed, _ = task
         return {"case": case, "budget": budget, "seed": seed, "adapted": 1.0}
 
     class Here:
@@ -149,3 +149,13 @@ def test_a_name_is_that_case_and_a_beginning_all_that_have_it(
     assert trained("burgers") == ["burgers"]
     assert len(trained("burgers", "kdv-modes,")) > 2
     assert set(trained()) == set(CASES)
+
+
+def test_laws_are_rows_side_by_side() -> None:
+    own = {"case": "kdv-modes", "budget": 20, "seed": 200, "none": 4.0, "lqt": 3.0}
+    rows = [
+        own | {"law": law, "adapted": cost} for law, cost in (("affine", 2.0), ("predictive", 1.0))
+    ]
+    found = general.summaries({"rows": rows, "bounds": {"kdv-modes": {"limit": 0.5}}})
+    costs = {each["case"]: (each["adapted 20"], each["limit"]) for each in found}
+    assert costs == {"kdv-modes": (2.0, 0.5), "kdv-modes, predictive": (1.0, 0.5)}
