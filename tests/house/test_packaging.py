@@ -122,7 +122,6 @@ def test_a_package_that_a_distribution_lacks_does_not_stop_the_tests(tmp_path: P
 
 def test_the_citation_says_what_the_project_says() -> None:
     assert CITATION["version"] == PROJECT["version"]
-    assert CITATION["repository-code"] == PROJECT["urls"]["Repository"]
     assert [author["name"] for author in CITATION["authors"]] == [
         author["name"] for author in PROJECT["authors"]
     ]

@@ -132,9 +132,9 @@ def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
 
 def test_an_unknown_problem_lists_the_known_ones():
     with pytest.raises(
-        Refused, match="'burger'; expected one of allen-cahn, allen-cahn-modes, burgers, burgers-m"
+        Refused, match="'rocket'; expected one of allen-cahn, allen-cahn-modes, burgers, burgers-m"
     ):
-        load_parameters("burger", {})
+        load_parameters("rocket", {})
 
 
 @pytest.mark.parametrize("n_z", [7, 6, 65538])
