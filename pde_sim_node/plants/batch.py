@@ -90,7 +90,7 @@ class BatchPlant(ABC):
     def reset(self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None) -> Array:
         """Begin an episode; see `pde_sim_node.plant.Plant.reset`."""
         given = np.asarray(seeds)
-        states = self._initial_states(given, np.arange(len(given)))
+        states = self._initial_states(given, np.arange(given.shape[0] if given.ndim else 0))
         if self.batch != len(states):
             self._allocate(len(states))
         self.step_index = 0

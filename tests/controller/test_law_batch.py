@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -164,7 +166,9 @@ def test_a_policy_of_another_law_is_refused() -> None:
 def test_where_a_model_a_policy_or_a_state_lies_in_memory_does_not_matter(kind: type[Law]) -> None:
     """Numbers in a message lie at an odd address, for which a product rounds otherwise."""
 
-    def moved(array: np.ndarray) -> np.ndarray:
+    def moved(array: np.ndarray | None) -> Any:
+        if array is None:
+            return None
         raw = np.frombuffer(b"\0\0\0\0" + array.tobytes(), np.uint8)
         return raw[4:].view(np.float64).reshape(array.shape)
 

@@ -67,6 +67,7 @@ def test_nothing_but_the_registry_names_a_plant(name: str) -> None:
 
 def test_nothing_but_the_registry_and_model_based_name_a_law() -> None:
     own = {f"loop_method/adapt/{name}.py" for name in KNOWING_FEED_FORWARD}
+    own |= {"pdeloop/export.py"}  # its form in C
     assert who_names(OWN_LAWS.shipped["feedforward"]) <= {*TABLE["a law"], *own}
 
 

@@ -42,6 +42,7 @@ SKIPS = {
     "tests/support/browser.py": ["needs a real browser, the command `chromium` (make packages)"],
     "tests/support/small_disk.py": ["mounting a small disk needs root, and the right to mount"],
     "tests/tools/test_terminal.py": ["needs {command[0]} (make packages)"],
+    "tests/tools/test_exported_bounds.py": ["needs a C compiler, the command cc (make packages)"],
     "tests/tools/test_compare_and_export.py": [
         "needs a C compiler, the command cc (make packages)"
     ],

@@ -145,7 +145,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
     basis, gradients = np.eye(n_z)[:, :2], pdeloop.Gradients(plant)
     holes = np.where(np.arange(n_a) < 1, np.nan, np.zeros((plant.horizon, 1, n_a)))
     for refused, words in (
-        (lambda: pdeloop.problem("burgerz"), "unknown problem 'burgerz'; expected one of"),
+        (lambda: pdeloop.problem("burgerz"), "unknown problem 'burgerz'; did you mean 'burgers'?"),
         (lambda: pdeloop.problem(n_zz=4), "n_zz"),
         (lambda: pdeloop.problem(physical={"viscousity": 1.0}), "unknown parameter 'physical"),
         (lambda: pdeloop.problem(physical={"viscosity": np.nan}), "must lie between .* got nan"),

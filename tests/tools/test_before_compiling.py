@@ -46,7 +46,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ((*TRAIN, "--sensor-delays", "2"), "--sensor-delays needs --sensors"),
         ((*TRAIN, "--actuator-positions", "0.5"), "actuator"),
         ((*TRAIN, "--model", "nowhere.npz"), "nowhere.npz"),
-        ((*TRAIN, "--model", "file"), "holds no reduced model"),
+        ((*TRAIN, "--model", "file"), "holds no arrays"),
         ((*TRAIN, "--out", "taken"), "already holds a run"),
         ((*TRAIN, "--out", "file"), "file is not a folder"),
         ((*TRAIN, "--out", "file/below"), "file is not a folder"),

@@ -173,7 +173,7 @@ def test_a_file_alone_does_not_run_it(
 @pytest.mark.parametrize(
     ("optimizer", "adapted"),
     [
-        ("model_based", "affine, observer, extended_kalman and feedforward"),
+        ("model_based", "affine, observer, extended_kalman, feedforward and predictive"),
         ("gauss_newton", "affine"),
     ],
 )

@@ -123,6 +123,7 @@ def test_study_and_reproduce_set_a_parameter_of_all_trainings(
     }
     file.write_text(yaml.safe_dump(study))
     words = ("--processes", "1", "--set", "evaluation_fields=2", "--set", "horizon=10")
+    words += ("--run-folders",)
     assert main(["study", str(file), "--out", str(out), *words]) == 0
     (parameters,) = out.glob("*/one/0/parameters.yaml")
     values = yaml.safe_load(parameters.read_text())["/**"]["ros__parameters"]

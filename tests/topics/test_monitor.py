@@ -113,7 +113,7 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
         )
         assert page.ask(f"document.getElementById({name!r}).getAttribute('aria-label')")
     page.until(f"{ROLLOUTS} >= 3", LIMIT)
-    assert page.ask("document.querySelector('#problem').textContent") == "small"
+    page.until("document.querySelector('#problem').textContent === 'small'", LIMIT)
     for role in ("plant", "controller", "tuner"):
         # The graph is read once a second, and a node may be heard before.
         page.wait_for(lambda role=role: present(page, role) == "true", LIMIT, role)
