@@ -71,7 +71,9 @@ def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:
     return np.array(result["costs_by_field"]["adapted"][0]), result["rollouts"][0]["total"]
 
 
-@pytest.mark.parametrize("method", sorted({*METHODS, "gauss-newton"} - {"no-control", "dfo-ls", *AGENTS}))
+@pytest.mark.parametrize(
+    "method", sorted({*METHODS, "gauss-newton"} - {"no-control", "dfo-ls", *AGENTS})
+)
 def test_a_method_improves_on_no_control_pays_for_each_rollout_and_sees_no_field_of_a_table(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
