@@ -11,6 +11,7 @@ import resource
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
@@ -63,8 +64,9 @@ def begin(program: str) -> None:
     os.environ.update(OWN)
     _open_streams()
     for stream in (sys.stdout, sys.stderr):  # PYTHONIOENCODING=ascii, LC_ALL=C
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+        if isinstance(stream, TextIOWrapper) and stream.errors != "backslashreplace":
+            with suppress(OSError):  # of a terminal that is open for reading as well
+                stream.reconfigure(errors="backslashreplace")
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
         print(

@@ -283,7 +283,7 @@ class ClosedLoop(ClosedLoopProblem):
 
     def _start(self, fields: Array) -> Array:
         """The model's state at the beginning; replayed rollouts have innovations after it."""
-        return fields[:, : self.model.n_z]
+        return fields[:, : len(self.U)]
 
     def _outputs(self, k: int, z: Array, fields: Array) -> Array:
         """What U^T is applied to, and the target is of."""
@@ -294,7 +294,7 @@ class ClosedLoop(ClosedLoopProblem):
         return by_outputs
 
     def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
-        after, n_z = self.model.step(z, a), self.model.n_z
+        after, n_z = self.model.step(z, a), len(self.U)
         if fields.shape[1] > n_z:
             after = after + fields[:, n_z * (k + 1) : n_z * (k + 2)]
         return after

@@ -68,6 +68,8 @@ from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
 EXACT = 1e-6
 """E of a model that counts as exact."""
+NOISY = 0.3
+"""Largest error of an accepted model with measurement noise, which leaves initial states uncertain."""
 FAR = 3.0
 """Distance of the target from the mean state, relative to that of the farthest measured state, above
 which it is outside of the data."""
@@ -313,7 +315,8 @@ def field_law(
             limits, n_s, scale, models, noise, constant=other.d is not None
         )
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    accepted = _accepted(known, settings.field_error, models.better)
+    most = max(settings.field_error, NOISY) if noise else settings.field_error
+    accepted = _accepted(known, most, models.better)
     report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
     if fitted.error > settings.field_error:
         return report

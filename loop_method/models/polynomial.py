@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations_with_replacement, product
 
 import numpy as np
@@ -99,13 +98,14 @@ class PolynomialModel:
 
     def step(self, states: Array, actions: Array) -> Array:
         after = np.array(states, dtype=np.float64)
-        add_products(self.features(states, actions), read_only(self.coefficients), after)
+        features = read_only(self.features(states, actions))
+        add_products(features, read_only(self.coefficients), after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         r, n_a = self.V.shape[1], self.n_a
         on_features = np.zeros((len(states), len(self.coefficients)))
-        add_products(read_only(covectors), self._transposed, on_features)
+        add_products(read_only(covectors), read_only(self.coefficients.T), on_features)
         w = self.features(states, actions)[:, 1 : 1 + r + n_a]
         on_w = on_features[:, 1 : 1 + r + n_a].copy()
         add_slopes(read_only(w), read_only(on_features[:, 1 + r + n_a :]), self.products, on_w)
@@ -142,10 +142,6 @@ class PolynomialModel:
             products,
             numbers_of(arrays, "coefficients", rows, len(centre)),
         )
-
-    @cached_property
-    def _transposed(self) -> Array:
-        return read_only(self.coefficients.T)
 
 
 @cached_njit()
