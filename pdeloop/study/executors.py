@@ -81,9 +81,10 @@ class Workers:
         self._waiting[self.pool.submit(task, *arguments)] = name
 
     def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
-        """The trainings that have ended since, after at most `timeout` seconds."""
+        """The trainings that have ended since, after at most `timeout` seconds, results first."""
         done, _ = wait(self._waiting, timeout=timeout, return_when=FIRST_COMPLETED)
-        return [(self._waiting.pop(future), future) for future in done]
+        ordered = sorted(done, key=lambda one: one.cancelled() or one.exception() is not None)
+        return [(self._waiting.pop(future), future) for future in ordered]
 
     def deaths(self) -> list[Death]:
         """The trainings whose workers have died since."""

@@ -133,7 +133,6 @@ def test_workers_that_end_are_replaced_and_those_that_always_end_are_reported(
         made.append(successes)
         return Breaking(successes)
 
-    # Of two that were finished at the same moment the broken one may be looked at first.
     with pytest.raises(StudyError, match="the workers ended 3 times"):
         run(study, tmp_path / "never", lambda: breaking(0))
     assert made == [0, 0, 0] and contents(tmp_path / "never") == {}
