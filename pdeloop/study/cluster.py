@@ -285,16 +285,19 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
             )
         known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
         _check_versions(known, own)
-        # A worker would end at a task of a package that it lacks.
-        installed = client.run(metadata.version, "pdeloop", on_error="return")
-        for at, version in installed.items():
+        # A worker would end at a task of a package that it lacks; the scheduler reads tasks as well.
+        found = client.run(metadata.version, "pdeloop", on_error="return")
+        installed = {f"worker at {at}": version for at, version in found.items()}
+        try:
+            installed["scheduler"] = client.run_on_scheduler(metadata.version, "pdeloop")
+        except metadata.PackageNotFoundError as error:
+            installed["scheduler"] = error
+        for whose, version in installed.items():
             if isinstance(version, Exception):
-                raise StudyError(
-                    f"the worker at {at} has no pdeloop; install pdeloop[cluster] there"
-                )
+                raise StudyError(f"the {whose} has no pdeloop; install pdeloop[cluster] there")
             if version != metadata.version("pdeloop"):
                 raise StudyError(
-                    f"the worker at {at} has pdeloop {version}, and this machine has "
+                    f"the {whose} has pdeloop {version}, and this machine has "
                     f"{metadata.version('pdeloop')}; install the same on all"
                 )
         pool = Cluster(client, client.run(training.environment))

@@ -40,7 +40,7 @@ class DaskCluster:
         self.scheduler: Process | None = None
         self.address = ""
 
-    def start_scheduler(self, packages: str = "") -> None:
+    def start_scheduler(self, packages: str = str(ROOT)) -> None:
         """packages: a folder of packages that the process has instead of those here."""
         self._file.unlink(missing_ok=True)
         self.scheduler = self._started("dask_scheduler", "--port", "0", packages=packages)
@@ -54,11 +54,16 @@ class DaskCluster:
         self.workers.append(process)
         return process
 
-    def await_workers(self, count: int, **client: Any) -> None:
+    def await_workers(self, count: int, *, exactly: bool = False) -> None:
+        """Wait for at least so many workers; exactly: and until the scheduler has no other ones."""
         from distributed import Client
 
-        with Client(self.address, set_as_default=False, **client) as known:
+        with Client(self.address, set_as_default=False) as known:
             known.wait_for_workers(count, timeout=LIMIT)
+            deadline = time.monotonic() + LIMIT
+            while exactly and len(known.scheduler_info(n_workers=-1)["workers"]) != count:
+                assert time.monotonic() < deadline, "workers that have died are still known"
+                time.sleep(0.05)
 
     @property
     def _file(self) -> Path:
@@ -96,7 +101,7 @@ def address_in(file: Path) -> str:
 
 @contextmanager
 def dask_cluster(
-    folder: Path, workers: int, *, scheduler: str = "", worker: str = str(ROOT), nanny: bool = False
+    folder: Path, workers: int, *, scheduler: str = str(ROOT), worker: str = str(ROOT), nanny: bool = False
 ) -> Iterator[DaskCluster]:
     """A scheduler with so many workers; scheduler, worker: folders of packages of theirs."""
     with ExitStack() as stack:

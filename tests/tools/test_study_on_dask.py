@@ -94,6 +94,8 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
             said,
         )
         dask.workers[1].kill()
+        dask.workers[1].wait(LIMIT)
+        dask.await_workers(1, exactly=True)
         # Workers are compared with each other, and not with this machine.
         assert main(words) == 0
     numpy = json.loads(contents(Path(out))["small/two-point/0/result.json"])["environment"]["numpy"]
