@@ -179,6 +179,8 @@ class Cluster(Workers):
         """Know these workers, by their addresses."""
         for at, environment in environments.items():
             kind = environment["processor"]
+            if self.environments.get(kind, environment) != environment:  # other versions there
+                kind = f"{kind} at {at}"
             self.environments = {kind: environment, **self.environments}
             self._kinds[at] = kind
 

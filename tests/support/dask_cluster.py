@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from tests.support.interpreter import ROOT
 from tests.support.small_study import LIMIT
@@ -101,7 +100,12 @@ def address_in(file: Path) -> str:
 
 @contextmanager
 def dask_cluster(
-    folder: Path, workers: int, *, scheduler: str = str(ROOT), worker: str = str(ROOT), nanny: bool = False
+    folder: Path,
+    workers: int,
+    *,
+    scheduler: str = str(ROOT),
+    worker: str = str(ROOT),
+    nanny: bool = False,
 ) -> Iterator[DaskCluster]:
     """A scheduler with so many workers; scheduler, worker: folders of packages of theirs."""
     with ExitStack() as stack:
