@@ -8,7 +8,7 @@ export PYTHONSAFEPATH := 1
 # What hundreds of processes import is compiled once, also where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup run test test-extras coverage packages lint types docs check lock audit clean
+.PHONY: setup run test test-extras findings coverage packages lint types docs check lock audit clean
 
 setup: .venv/ready
 
@@ -76,6 +76,12 @@ test: setup packages $(if $(COVERAGE),coverage)
 test-extras: setup packages
 	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
 	$(PYTEST) $(EXTRAS)
+
+# What other software does that a guess would not expect; each script says what, and which have changed is printed.
+findings:
+	@changed=0; for script in findings/*.sh; do \
+		if bash $$script >/dev/null 2>&1; then echo "as before  $$script"; else echo "CHANGED    $$script"; changed=1; fi; \
+	done; exit $$changed
 
 EXTRAS := tests/plant/test_fmu.py tests/tools/test_model_files.py
 
