@@ -77,13 +77,13 @@ test-extras: setup packages
 	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
 	$(PYTEST) $(EXTRAS)
 
+EXTRAS := tests/plant/test_fmu.py tests/tools/test_model_files.py
+
 # What other software does that a guess would not expect; each script says what, and which have changed is printed.
 findings:
 	@changed=0; for script in findings/*.sh; do \
 		if bash $$script >/dev/null 2>&1; then echo "as before  $$script"; else echo "CHANGED    $$script"; changed=1; fi; \
 	done; exit $$changed
-
-EXTRAS := tests/plant/test_fmu.py tests/tools/test_model_files.py
 
 # The tests without topics, with their coverage of the pure modules (pyproject.toml).
 coverage: setup packages
