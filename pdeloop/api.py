@@ -41,6 +41,7 @@ from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
 from pdeloop.problem_values import problem_values
 from pdeloop.training_run import begin, carry_out, continuing
+from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
 
@@ -356,6 +357,12 @@ def train(
     RuntimeError
         A node cannot be started or ends, or the training over topics is stopped.
 
+    Warns
+    -----
+    TrainingWarning
+        The law is no better than no control or than the first one, rollouts were left over, or costs
+        cannot be compared, and why.
+
     Examples
     --------
     >>> import pdeloop
@@ -391,7 +398,14 @@ def train(
             raise RuntimeError(f"stopped by {reason}; continue with: {again}") from None
         finally:
             display.close()
-        return load_run(folder)
+        run = load_run(folder)
+    for text in (*narration.warnings(run.result), *narration.reasons(run.result)):
+        warnings.warn(text.strip(), TrainingWarning, stacklevel=2)
+    return run
+
+
+class TrainingWarning(UserWarning):
+    """What the user of a training should know: a law is no better, or a plant drifts."""
 
 
 def _check_count(name: str, value: object, least: int) -> None:

@@ -170,7 +170,7 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
     lines += [f"  {text}" for text in differences(summary)]
-    lines += _reasons(summary)
+    lines += reasons(summary)
     return [*lines, f"  results in {folder}"] if folder else lines
 
 
@@ -193,7 +193,7 @@ def differences(summary: Row) -> list[str]:
     ]
 
 
-def _reasons(summary: Row) -> list[str]:
+def reasons(summary: Row) -> list[str]:
     """Why seeds kept their first law, have no control or left rollouts over."""
     kept: dict[str, list[int]] = {}
     early: dict[str, list[int]] = {}
@@ -242,12 +242,13 @@ def warnings(summary: Row) -> list[str]:
     costs = summary["costs"]
     found = several_publishers(summary.get("several_publishers", {}))
     found += misjudged_noise(summary)
-    if not _repeatable(summary):
+    if pair := _not_repeated(summary):
+        then, now = pair
         found.append(
-            "the same law had another cost when it ran again from the same initial fields, so the "
-            "plant is not a function of state, action and seed (it is a machine, or draws random "
-            "numbers of its own) and differences in cost are partly chance; `pdeloop check` tests "
-            "its steps"
+            f"the same law from the same initial field cost {then:.4g}, and {now:.4g} when it ran "
+            f"again at the end{_share_of(now - then, then)}: the plant is no function of state, action "
+            "and seed (it drifts, is a machine, or draws random numbers of its own), so a difference "
+            "in cost of that size is no gain; `pdeloop check` tests its steps"
         )
     if lost["lqt"] == rollouts:
         found.append(
@@ -281,16 +282,16 @@ def warnings(summary: Row) -> list[str]:
     return found
 
 
-def _repeatable(summary: Row) -> bool:
-    """False where a law that was not changed cost otherwise than the same one on the same fields."""
-    costs = summary["costs"]
-    rows = zip(
-        summary.get("changed", []), *(costs[n] for n in ("adapted", "lqt", "none")), strict=False
-    )
-    return all(
-        changed or not min(abs(own - lqt), abs(own - none)) > REPEATS * abs(own)
-        for changed, own, lqt, none in rows
-    )
+def _not_repeated(summary: Row) -> tuple[float, float] | None:
+    """The two costs of a rollout that differ most, of those that the same seeds determine."""
+    pairs = [(own["then"], own["now"]) for own in summary.get("repeated", []) if own]
+    changed = [pair for pair in pairs if abs(pair[1] - pair[0]) > REPEATS * abs(pair[0])]
+    return max(changed, key=lambda pair: abs(pair[1] - pair[0]), default=None)
+
+
+def _share_of(change: float, of: float) -> str:
+    """A change in percent, in brackets; empty: of nothing."""
+    return f" ({100 * change / of:+.2g} %)" if of else ""
 
 
 def misjudged_noise(summary: Row) -> list[str]:

@@ -63,6 +63,12 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         isinstance(own, dict) and _outcome(own) for own in outcome
     ):
         raise ValueError("its 'outcome' is not a list of verdicts with reasons")
+    repeated = content.get("repeated", [])
+    if not isinstance(repeated, list) or not all(
+        own is None or (isinstance(own, dict) and _numbers([own.get("then"), own.get("now")]))
+        for own in repeated
+    ):
+        raise ValueError("its 'repeated' is not a list of pairs of costs")
     controller = content.get("controller", {})
     nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
     several = content.get("several_publishers", {})
@@ -126,6 +132,7 @@ def summarise(training: Training) -> dict[str, Any]:
 
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
+    repeated: the cost of the first rollout of each adaptation, and of the same one at the end;
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
     one it began with; noise: the measurement noise that was declared, what each optimiser found in its
     place, 0 where nothing else, and what readings seem to have where it found none; outcome: what came
@@ -150,6 +157,10 @@ def summarise(training: Training) -> dict[str, Any]:
             "mean_of_ratios": float(_below(adapted, lqt).mean()),
             "ratio_of_means": float(_below(adapted.mean(), lqt.mean())),
         },
+        "repeated": [
+            dict(zip(("then", "now"), pair, strict=True)) if pair else None
+            for pair in training.repeated
+        ],
         "improved": bool((adapted <= lqt).all()),
         "evaluation_rollouts": int(costs[:, 0].size),
         "diverged": dict(zip(EVALUATED, diverged.tolist(), strict=True)),

@@ -84,16 +84,18 @@ def evaluations(
 
 
 def noise_seeds(
-    settings: TrainingSettings, phase: str, rows: Array, counts: Sequence[int]
+    settings: TrainingSettings, phase: str, rows: Array, counts: Sequence[int], again: Sequence[int]
 ) -> list[int]:
     """The seed of the noise of every row (R, 4) of a batch of that phase.
 
     counts: for every training a number that is never the same again in the phase, its attempts or how
-    many batches its optimiser has had. In the evaluation all controllers share the noise.
+    many batches its optimiser has had. In the evaluation all controllers share the noise, and the
+    first rollouts of the trainings `again` have theirs once more.
     """
     if phase == "evaluate":
         fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
-        return fields * (settings.seeds * len(EVALUATED))
+        first = [derive(settings.all_seeds[m], NOISE["adapt"], 0) for m in again]
+        return fields * (settings.seeds * len(EVALUATED)) + first
     rows_of: Counter[int] = Counter()
     noise = []
     for m in rows[:, StartColumn.MODEL].astype(int).tolist():

@@ -9,7 +9,8 @@
                                                         better, while they may; else adapt
     adapt     what the optimiser asks for               evaluate, once all optimisers are done
     evaluate  no control, LQT and the adapted policy    done
-              on the same sampled fields
+              on the same sampled fields; and the first
+              rollout of the adaptation once more
 
 The first three share the budget of a seed. A seed whose last warm start is not better than no control
 starts the adaptation from no control. Pure: it uses neither topics nor time, so the training is the
@@ -89,6 +90,11 @@ class Training:
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
     """True where the warm start of a seed was measured to be no better than no control."""
+    first: list[Rollout | None] = field(default_factory=list)
+    """The first rollout of every seed's adaptation, which the evaluation repeats; None: none, or it
+    diverged."""
+    repeated: list[list[float]] = field(default_factory=list)
+    """Its cost then, and at the end."""
     _laws: list[Law] = field(default_factory=list, repr=False)
     _made_from: int = 0
     """Digest of the models of these laws."""
@@ -102,6 +108,7 @@ class Training:
         self.void = [0] * seeds
         self.measured = [[] for _ in range(seeds)]
         self.worse = [False] * seeds
+        self.first, self.repeated = [None] * seeds, [[] for _ in range(seeds)]
         self.budget = Budget(seeds, settings.rollouts, settings.adaptation)
         if settings.model is not None and not settings.trajectories:
             self._take_given_model(settings.model)
@@ -122,16 +129,16 @@ class Training:
             ]
             batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
-            batch = batch_of(
-                rollouts.evaluations(self.settings, self.warm_starts(), self.policies())
-            )
+            wanted = rollouts.evaluations(self.settings, self.warm_starts(), self.policies())
+            batch = batch_of([*wanted, *self._first_again()])
         else:
             return None
         if not self.settings.noise:
             return batch
         adapts = self.phase == "adapt"
         counts = [optimizer.tells for optimizer in self.optimizers] if adapts else self.explored
-        noise = rollouts.noise_seeds(self.settings, self.phase, batch.rows, counts)
+        again = [m for m, _ in self._first_again()]
+        noise = rollouts.noise_seeds(self.settings, self.phase, batch.rows, counts, again)
         return replace(batch, rows=np.column_stack([batch.rows, noise]))
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
@@ -166,6 +173,10 @@ class Training:
         if self.phase == "adapt":
             return self._tell(result)
         return self._evaluated(result)
+
+    def _first_again(self) -> list[tuple[int, Rollout]]:
+        """The rollouts that the evaluation repeats, each with the index of its seed."""
+        return [(m, rollout) for m, rollout in enumerate(self.first) if rollout is not None]
 
     def laws(self) -> list[Law]:
         """The law of each seed's model."""
@@ -390,6 +401,10 @@ class Training:
                 seen = [measured.trajectory for measured in own]
                 check_law(asked, laws[m], seen, self.settings.action_set)
                 self.law_seen = True
+            if not optimizer.tells and not own[0].diverged:
+                shaped = self._shaped(asked[0].policy)
+                self.first[m] = Rollout(shaped, asked[0].field_seed)
+                self.repeated[m] = [own[0].cost]
             report = calls.tell(optimizer, own)
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
@@ -405,8 +420,13 @@ class Training:
 
     def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
         settings = self.settings
-        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(self.evaluation_shape)
-        self.ended = result.costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
-        self.budget.count("evaluate", np.repeat(np.arange(settings.seeds), self.ended[0].size))
+        again = [m for m, _ in self._first_again()]
+        costs = result.costs[: len(result.costs) - len(again)]
+        for m, cost in zip(again, result.costs[len(costs) :, CostColumn.MEAN], strict=True):
+            self.repeated[m].append(float(cost))
+        self.evaluation = costs[:, CostColumn.MEAN].reshape(self.evaluation_shape)
+        self.ended = costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
+        counted = [*np.repeat(np.arange(settings.seeds), self.ended[0].size), *again]
+        self.budget.count("evaluate", np.array(counted))
         self.phase = "done"
         return event_rows.evaluated(settings, self.evaluation, self.ended)

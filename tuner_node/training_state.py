@@ -14,7 +14,7 @@ from loop_interfaces.array_files import checked_array
 from loop_interfaces.documents import parse_json
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.text import shown
-from loop_method.adapt import calls
+from loop_method.adapt import Rollout, calls
 from loop_method.adapt.trajectories import (
     is_kept,
     record_arrays,
@@ -46,6 +46,11 @@ def arrays_of(training: Training) -> Arrays:
         "worse": np.array(training.worse),
         "void": np.array(training.void),
     }
+    for m, first in enumerate(training.first):
+        if first is not None:
+            costs = np.array(training.repeated[m])
+            arrays |= {f"first{m}.policy": first.policy, f"first{m}.costs": costs}
+            arrays[f"first{m}.field_seed"] = np.array(first.field_seed)
     for m, rollouts in enumerate(training.measured):
         for i, rollout in enumerate(rollouts):
             arrays |= record_arrays(f"measured{m}.{i}", rollout)
@@ -108,6 +113,12 @@ def _fill(training: Training, arrays: Arrays) -> None:
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
             shape = (n_a, None) if training.settings.law.axes == 2 else (None,)
             training.measured[m].append(taken_record(arrays, name, n_z, n_a, shape))
+    for m in range(seeds):
+        if (name := f"first{m}.policy") in arrays:
+            seed = int(checked_array(arrays, f"first{m}.field_seed", "i", ()))
+            policy = checked_array(arrays, name, "f", (None,) * np.ndim(arrays[name]))
+            training.first[m] = Rollout(policy, seed)
+            training.repeated[m] = checked_array(arrays, f"first{m}.costs", "f", (None,)).tolist()
     _check(training)
     if training.phase in ("adapt", "evaluate", "done"):
         training.start_optimizers()

@@ -45,7 +45,7 @@ class RecordedRun:
         """The recorded rollouts in words, by their keys (`_keys`)."""
         self._answered: Counter[bytes] = Counter()
         """Number of those with costs."""
-        self._complete: set[bytes] = set()
+        self._complete: Counter[bytes] = Counter()
         """Those of complete episodes."""
         self._numbers: set[int] = set()
         """Numbers of all episodes, whatever was recorded of them."""
@@ -163,7 +163,7 @@ class RecordedRun:
         """Name what is missing where no training shows what was asked for."""
         if between := gaps(self._numbers):
             self._report.missing.append(f"{self._name}: {gaps_text(between)}")
-        if lost := [place for key, place in self._rollouts.items() if key not in self._complete]:
+        if lost := [place for key, place in self._rollouts.items() if not self._complete[key]]:
             count = sum(map(len, lost))
             self._report.missing.append(
                 f"{self._name}: {count} rollouts that are in no complete episode, the first of "
@@ -183,7 +183,7 @@ class RecordedRun:
             self._rollouts.setdefault(key, []).append(place)
             self._answered[key] += episode.cost is not None
             if not episode.missing:
-                self._complete.add(key)
+                self._complete[key] += 1
         if episode.bases is not None:
             self._models[episode.bases.step] = episode.bases
 
@@ -243,9 +243,9 @@ class _Lost:
     """
 
     def __init__(
-        self, recorded: Container[bytes], complete: Container[bytes], *, everything: bool
+        self, recorded: Container[bytes], complete: Counter[bytes], *, everything: bool
     ) -> None:
-        self._recorded, self._complete, self._begun = recorded, complete, everything
+        self._recorded, self._complete, self._begun = recorded, complete.copy(), everything
         self._lost: Counter[str] = Counter()
         self._since: Counter[str] = Counter()
         """Those since the last one that was recorded: they may come after the end of the recording."""
@@ -255,7 +255,9 @@ class _Lost:
         if key in self._recorded:
             self._begun = True
             self.reach_end()
-        if key not in self._complete and self._begun:
+        if self._complete[key]:
+            self._complete[key] -= 1  # the training asks for its first rollout again at its end
+        elif self._begun:
             (self._lost if key in self._recorded else self._since)[phase] += 1
 
     def reach_end(self) -> None:

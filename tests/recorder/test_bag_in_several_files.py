@@ -101,9 +101,7 @@ def test_a_lost_file_that_no_metadata_names_is_seen_in_what_the_training_asked_f
         (split / "metadata.yaml").unlink()
     report = verify(split)
     (missing,) = report.missing
-    assert (
-        "8 rollouts that the training asked for (adaptation 8), in no complete episode" in missing
-    )
+    assert "8 rollouts that the training asked for (adaptation 6, evaluation 2), in no" in missing
     assert "the bag has nothing of episodes 1.3 to 1.4" in missing
 
 

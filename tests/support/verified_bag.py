@@ -10,8 +10,8 @@ from pdeloop.bags.report import Report
 from pdeloop.cli import main
 from tests.support.recorded_here import PART, episode_of
 
-EPISODES = 1 + 1 + 3 + 3
-"""Exploration, check, three steps of four rollouts, and the evaluation's twelve."""
+EPISODES = 1 + 1 + 3 + 4
+"""Exploration, check, three steps of four rollouts, and the evaluation's twelve and two repeated ones."""
 
 
 def by_episodes(messages: list[Message], *ends: int) -> list[list[Message]]:

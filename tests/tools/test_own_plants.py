@@ -320,6 +320,34 @@ def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
     assert (run / "parameters.yaml").exists()
 
 
+class Ageing(pdeloop.Dynamics):
+    """Answers otherwise from rollout to rollout."""
+
+    n_z, n_a, horizon, stateful = 2, 1, 10, True
+
+    def __init__(self, factor: float) -> None:
+        self.pole, self.factor = 0.9, factor
+
+    def initial_state(self, rng: np.random.Generator) -> Any:
+        self.pole *= self.factor
+        return rng.standard_normal(2)
+
+    def step(self, z: Any, a: Any) -> Any:
+        return self.pole * z + a[0]
+
+
+@pytest.mark.parametrize("factor", [0.999, 1.0])
+def test_a_plant_that_drifts_is_found_by_its_first_rollout(
+    factor: float, recwarn: pytest.WarningsRecorder
+) -> None:
+    plant = DynamicsPlant(Ageing(factor))
+    run = pdeloop.train(plant=plant, rollouts=5, evaluation_fields=2, optimizer="two_point")
+    (repeated,) = run.result["repeated"]
+    assert (repeated["now"] == repeated["then"]) == (factor == 1.0)
+    assert repeated["now"] <= repeated["then"]
+    assert any("(it drifts," in str(one.message) for one in recwarn) == (factor < 1.0)
+
+
 def test_a_program_that_trains_when_it_is_loaded_as_a_plant_is_stopped(own: Path) -> None:
     own.write_text(OWN + "\npdeloop.train(plant=Rod(), rollouts=9)\n")
     with pytest.raises(ValueError, match="trains while it is being imported") as told:

@@ -68,7 +68,7 @@ def test_a_training_ended_and_continued_after_each_of_its_batches_is_the_same(tm
     expected = whole.budget.by_purpose()
     assert [[seed[name] for name in PHASES] for seed in expected] == paid.tolist()
     assert all(seed["total"] == sum(seed[name] for name in PHASES[:3]) for seed in expected)
-    assert all(seed["adaptation"] > 0 and seed["evaluation"] == 6 for seed in expected)
+    assert all(seed["adaptation"] > 0 and seed["evaluation"] == 6 + 1 for seed in expected)
     if "rollouts" in options:
         assert max(seed["total"] for seed in expected) <= options["rollouts"]
         last = {row["seed"]: row["rollouts"] for row in whole.history}
@@ -174,7 +174,7 @@ def test_the_results_say_what_the_rollouts_were_for(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "17 rollouts per seed (exploration 1, check 2, adaptation 14)" in shown
     result = json.loads((out / "result.json").read_text())
-    spent = {"exploration": 1, "check": 2, "adaptation": 14, "evaluation": 30, "total": 17}
+    spent = {"exploration": 1, "check": 2, "adaptation": 14, "evaluation": 31, "total": 17}
     assert result["rollouts"] == [spent, spent]
     assert "iterations" not in result and result["changed"] == [True, True]
     rows = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]

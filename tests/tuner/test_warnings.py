@@ -39,15 +39,16 @@ def test_fields_that_cost_nothing_without_control_are_nothing_to_control():
     assert "there is nothing to control" in told and "likely causes" not in told
 
 
-def test_one_law_that_costs_otherwise_on_the_same_fields_is_a_plant_that_does_not_repeat():
-    costs = {"none": [4.0], "lqt": [2.0], "adapted": [2.1]}
-    kept = summary(seeds=1, changed=[False], costs=costs)
-    assert "the same law had another cost when it ran again" in warnings(kept)[0]
-    assert warnings(summary(seeds=1, changed=[True], costs=costs)) == []
-    for same in (2.0, 4.0):  # the first law, or no control, from which it started
-        costs["adapted"] = [same]
-        told = warnings(summary(seeds=1, changed=[False], costs=costs))
-        assert not any("the same law had another cost" in text for text in told)
+def test_a_rollout_that_costs_otherwise_at_the_end_is_a_plant_that_does_not_repeat():
+    pairs = [{"then": 2.0, "now": 2.0}, None, {"then": 2.0, "now": 2.1}, {"then": 2.0, "now": 2.01}]
+    (told,) = warnings(summary(repeated=pairs))
+    assert "initial field cost 2, and 2.1 when it ran again at the end (+5 %)" in told
+    assert "it drifts" in told and "a difference in cost of that size is no gain" in told
+    assert warnings(summary(repeated=[{"then": 0.0, "now": 0.0}, {"then": 2.0, "now": 2.0}])) == []
+    assert (
+        "cost 0, and 1 when it ran again at the end: the"
+        in warnings(summary(repeated=[{"then": 0.0, "now": 1.0}]))[0]
+    )
 
 
 def test_a_law_that_costs_more_than_no_control_has_an_exit_code_of_its_own():
