@@ -11,7 +11,7 @@ from pdeloop.cli import main
 from tests.support.recorded_here import PART, episode_of
 
 EPISODES = 1 + 1 + 3 + 4
-"""Exploration, check, three steps of four rollouts, and the evaluation's twelve and two repeated ones."""
+"""Exploration, check, three steps of four rollouts, twelve of the evaluation and two repeated ones."""
 
 
 def by_episodes(messages: list[Message], *ends: int) -> list[list[Message]]:
