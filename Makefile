@@ -46,7 +46,7 @@ install = { $(UV) pip install --python $(BIN)/python --require-hashes -r require
 # The digests of all archives of the pinned versions; a version is changed in constraints.txt. With its extras,
 # since pip holds name[extra], which a package asks for, to the pin of name[extra] alone.
 lock: .venv/uv
-	@for part in uv: run:ros,report test:ros,dev; do \
+	@for part in uv: run:ros,report,record,monitor test:ros,dev; do \
 		extras=$${part#*:}; { if [ $$extras ]; then echo setuptools; else echo uv; fi; } \
 			| $(UV) pip compile --quiet --universal --generate-hashes --no-strip-extras \
 			--no-annotate --no-header --constraint constraints.txt $$(echo $$extras | tr , '\n' | sed 's/./--extra &/') \
