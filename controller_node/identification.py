@@ -20,6 +20,7 @@ from loop_interfaces.parameters import model_order
 from loop_interfaces.signature import CONSTANTS
 from loop_interfaces.spec import IDENTIFICATION_SETTINGS
 from loop_method.design import lqg, lqt
+from loop_method.design.dead_time import with_dead_time
 from loop_method.design.field_law import FieldLaw, field_law
 from loop_method.design.lqt import DesignError
 from loop_method.laws.registry import law_kind
@@ -28,6 +29,7 @@ from loop_method.models import FieldModelSettings
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
+from loop_method.reduce.input_delay import shifted
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
@@ -62,6 +64,9 @@ class DesignSettings:
         Name of the law that answers.
     horizon : int
         Steps of an episode, for a law that has parameters for each of them.
+    input_delay : sequence of int
+        Steps after which each input acts (`loop_method.reduce.input_delay`); empty: none. A dead time
+        needs a law with a filter, in whose state the last inputs are.
     constants : dict
         Parameters of `loop_interfaces.signature.CONSTANTS` as given; others have their
         defaults.
@@ -79,12 +84,14 @@ class DesignSettings:
     dmdc_order: int = 0
     law: str = "affine"
     horizon: int = 1
+    input_delay: Sequence[int] = ()
     constants: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DesignSettings:
         """Those among the parameters."""
-        names = {item.name for item in fields(DesignSettings)} - {"constants", "action_set"}
+        own = {"constants", "action_set", "input_delay"}
+        names = {item.name for item in fields(DesignSettings)} - own
         return DesignSettings(
             **{name: values[name] for name in names},
             action_set=ActionSet.of(values),
@@ -163,12 +170,12 @@ def examined(
     channels: Channels = NUMBERED,
 ) -> Identifiability:
     """Examine how well trajectories determine a model of `identify` or `design`; p as given there."""
-    # Of a model in innovation form: the directions of the measurements that it sees.
-    U = linalg.orth(model.U) if method == "subspace" else model.U
+    # Of a model with a filter: the directions of the measurements that it sees.
+    U = model.U if getattr(model, "L", None) is None else linalg.orth(model.U)
     found = examine(trajectories, U, channels)
     if method != "dmdc":
         return found
-    more = dmdc.truncation_remarks(trajectories, p or sum(np.shape(model.B)), channels)
+    more = dmdc.truncation_remarks(trajectories, p or U.shape[1] + np.shape(model.B)[1], channels)
     return replace(found, remarks=(*found.remarks, *more))
 
 
@@ -244,6 +251,25 @@ def designed(
         "cost": Cost.parse(settings.cost),
     }
     filtered = law_kind(settings.law, settings.constants).filtered
+    if delays := tuple(settings.input_delay):
+        inner = designed(
+            shifted(trajectories, delays),
+            target,
+            replace(settings, input_delay=()),
+            channels,
+            shifted(further, delays) if further else (),
+            or_no_control=or_no_control,
+            constant=constant,
+        )
+        if max(delays) <= 0:
+            return inner
+        if not filtered:
+            raise ValueError(
+                "a plant with dead time needs a law that remembers its actions, as 'observer' "
+                f"does, but the law is '{settings.law}'"
+            )
+        rows = with_dead_time(inner.rows, delays, target, **weights, or_no_control=or_no_control)
+        return replace(inner, rows=rows)
     if settings.identification == "subspace":
         if not filtered:
             raise ValueError(

@@ -7,7 +7,7 @@ Only states, actions and the target are used, so the plant may be any, this one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -25,6 +25,7 @@ from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.reduce.channels import NUMBERED, SHOWN, Channels
 from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError
+from loop_method.reduce.input_delay import Delays, shifted, study_delays
 from loop_method.reduce.order import OrderStudy, study_orders
 from loop_method.reduce.reduced_model import ReducedModel, steps_of
 from pdeloop.data_file import Measurements
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""
+DEAD = 1e-12
+"""Size of a pole, relative to the largest, that is one of a dead time."""
 Trajectories = Sequence[tuple[Array, Array]]
 Source = Mapping[str, int | str]
 """The name of the trajectory."""
@@ -48,7 +51,8 @@ class Identified:
     sources: which trajectories, by episode and environment or by file and number; study: the orders on
     held-out data, None where these are too few; determined: how well the data determine the model;
     trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data;
-    field: the report on the model of the whole field, for the identification "field".
+    field: the report on the model of the whole field, for the identification "field"; input_delay: of
+    each input, in steps.
     """
 
     model: ModelRows | ReducedModel
@@ -62,6 +66,7 @@ class Identified:
     channels: Channels = NUMBERED
     remarks: tuple[str, ...] = ()
     field: FieldLaw | None = None
+    input_delay: Delays = ()
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
@@ -103,6 +108,7 @@ class Identified:
             "sample_time": self.sample_time,
             "trajectories": list(self.sources),
             "poles": [[pole.real, pole.imag] for pole in poles],
+            "input_delay": list(self.input_delay),
             "constant": [] if self.model.d is None else self.model.d.tolist(),
             "spectral_radius": float(np.abs(poles).max()),
             "rank": determined.rank,
@@ -132,12 +138,18 @@ class Identified:
             f"spectral radius {known['spectral_radius']:.4f}",
         ]
         if self.sample_time is not None:
-            rates = np.log(np.abs(np.linalg.eigvals(self.model.A))) / self.sample_time
+            size = np.abs(np.linalg.eigvals(self.model.A))
+            rates = np.log(size[size > DEAD * size.max()]) / self.sample_time
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
         if self.model.d is not None and self.model.d.any():
             lines.append(
                 "  constant term d: the data are not deviations from rest, and the law knows of it"
             )
+        if any(self.input_delay):
+            told = " and ".join(map(str, dict.fromkeys(self.input_delay)))
+            memory = sum(max(n, 0) for n in self.input_delay)
+            state = f", whose last {memory} numbers belong to the state" if memory else ""
+            lines.append(f"  input delay of {told} steps: a_k-n acts from z_k on{state}")
         own = self.determined.independence
         lines.append(
             f"  rank {known['rank']} of {known['unknowns']}, smallest singular value "
@@ -190,9 +202,26 @@ def _source_text(source: Source) -> str:
     return ", ".join(f"{what} {name}" for what, name in names.items())
 
 
-def identify_data(found: Measurements, given: Mapping[str, Any]) -> Identified:
-    """The model from measurements; see `pdeloop.data_file`, and `given` as below."""
+def identify_data(
+    found: Measurements, given: Mapping[str, Any], input_delay: Delays | None = ()
+) -> Identified:
+    """The model from measurements; see `pdeloop.data_file`, and `given` as below.
+
+    input_delay: steps after which the inputs act, one number or one for each (`study_delays`); empty:
+    0; None: those that fit the data best. Better ones than those in use are remarked upon.
+    """
     known = {"sample_time": found.sample_time}
+    n_a = found.trajectories[0][1].shape[1]
+    if input_delay is not None and len(input_delay) not in (0, 1, n_a):
+        raise ParameterError(
+            f"expected one --input-delay, or one for each of the {n_a} inputs, got {len(input_delay)}"
+        )
+    used = (input_delay or (0,)) * (1 if len(input_delay or ()) > 1 else n_a)
+    delays = study_delays(found.trajectories, used)
+    if input_delay is None:
+        used = delays.best
+    elif better := delays.text(found.channels, found.sample_time):
+        found = replace(found, remarks=(*found.remarks, better))
     return _identified(
         found.trajectories,
         found.target,
@@ -201,6 +230,7 @@ def identify_data(found: Measurements, given: Mapping[str, Any]) -> Identified:
         given,
         channels=found.channels,
         remarks=found.remarks,
+        delays=used,
     )
 
 
@@ -257,12 +287,15 @@ def _identified(
     *,
     channels: Channels = NUMBERED,
     remarks: tuple[str, ...] = (),
+    delays: Delays = (),
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
     known = {**recorded, **given}
     of_past = known.get("identification") == "subspace"
-    if of_past and "law" not in known:
-        known["law"] = "observer"  # it has a filter
+    dead = max(delays, default=0) > 0
+    if (of_past or dead) and "law" not in known:
+        known["law"] = "observer"  # it has a filter, and remembers its actions
+    logged, trajectories = trajectories, shifted(trajectories, delays) if delays else trajectories
     if given.get("reduced_order", 0) > n_z and not of_past:
         raise ParameterError(
             f"expected an order of at most {n_z}, the numbers of a state, got {given['reduced_order']}"
@@ -295,6 +328,7 @@ def _identified(
         "dmdc_order": order or 0,
     }
     settings = DesignSettings.of({**defaults, **values, **own})
+    settings = replace(settings, input_delay=delays if any(delays) else ())
     method, p = settings.identification, settings.dmdc_rank
     if given.get("dmdc_rank") and method != "dmdc":
         raise ParameterError(
@@ -307,10 +341,10 @@ def _identified(
         )
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
-    if target is not None or of_past:
+    if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
         found = designed(
-            trajectories,
+            logged,
             rest if target is None else target,
             settings,
             channels,
@@ -339,6 +373,7 @@ def _identified(
         channels,
         remarks,
         field,
+        delays,
     )
 
 

@@ -22,9 +22,11 @@ from pdeloop.output import print_json
 
 OF_DATA = (
     *("time", "states", "inputs", "sample_time"),
-    *("time_unit", "missing", "cut", "resample"),
+    *("time_unit", "missing", "cut", "resample", "input_delay"),
 )
 """The options that only --data has."""
+MOST_DELAYED = 100
+"""Rows by which inputs may be shifted."""
 
 
 def add(commands: Commands) -> None:
@@ -87,6 +89,13 @@ def add(commands: Commands) -> None:
         const=0.0,
         metavar="S",
         help="interpolate to equal steps of S seconds [without S, the log's own]",
+    )
+    add(
+        "--input-delay",
+        type=_delays,
+        metavar="N,...",
+        help="rows by which the inputs act later than their own, all or each: a dead time above 0, a "
+        "log whose inputs are late below; auto: what fits held-out data best [0]",
     )
     add = identify.add_argument
     add(
@@ -154,7 +163,8 @@ def _identify(options: argparse.Namespace) -> int:
             cut=bool(options.cut),
             resample=options.resample,
         )
-        found = identify_data(measured, given)
+        delay = options.input_delay
+        found = identify_data(measured, given, None if delay == "auto" else delay or ())
     else:
         for name in OF_DATA:
             if getattr(options, name) is not None:
@@ -200,6 +210,21 @@ def _numbers(text: str, finite: bool = True) -> list[float]:
             f"expected {'finite ' * finite}numbers with commas between, got '{text}'"
         )
     return numbers
+
+
+def _delays(text: str) -> tuple[int, ...] | str:
+    """auto, or whole numbers with commas between, for argparse."""
+    if text == "auto":
+        return text
+    try:
+        found = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if not found or max(map(abs, found)) > MOST_DELAYED:
+        raise argparse.ArgumentTypeError(
+            f"expected auto, or whole numbers up to {MOST_DELAYED} with commas between, got '{text}'"
+        )
+    return found
 
 
 def _episode(name: str | None) -> int | None:

@@ -1,0 +1,131 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Delays of inputs are found in held-out steps, and the law of a plant with dead time is optimal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from loop_interfaces.model_rows import ModelRows
+from loop_method.design.dead_time import with_dead_time
+from loop_method.design.lqt import track
+from loop_method.laws.observer import Observer
+from loop_method.reduce.input_delay import shifted, study_delays
+from loop_method.reduce.reduced_model import ReducedModel
+
+A = np.array([[0.9, 0.05, 0, 0], [0.05, 0.85, 0.05, 0], [0, 0.05, 0.85, 0.05], [0, 0, 0.05, 0.9]])
+B = np.array([[0.1, 0.0], [0.02, 0.0], [0.0, 0.03], [0.0, 0.12]])
+K = -np.array([[2.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]])
+
+
+def logged(
+    delays: tuple[int, int],
+    *,
+    noise: float = 0.02,
+    process: float = 0.0,
+    feedback: float = 0.0,
+    held: int = 1,
+    seed: int = 0,
+    steps: int = 200,
+) -> tuple[np.ndarray, np.ndarray]:
+    rng, z, a = np.random.default_rng(seed), np.zeros((steps + 1, 4)), np.zeros((steps, 2))
+    for k in range(steps):
+        drawn = 10.0 * rng.normal(size=2)
+        a[k] = drawn if k % held == 0 else a[k - 1]
+        a[k] += feedback * K @ z[k]
+        acting = [a[k - n, j] if k >= n else 0.0 for j, n in enumerate(delays)]
+        z[k + 1] = A @ z[k] + B @ acting + process * rng.normal(size=4)
+    return z + noise * rng.normal(size=z.shape), a
+
+
+@pytest.mark.parametrize("delays", [(0, 0), (1, 1), (3, 3), (10, 10), (0, 3), (4, 1)])
+@pytest.mark.parametrize("case", [{}, {"noise": 0.5}, {"held": 10}, {"noise": 0.0}])
+def test_the_delay_of_each_input_is_found(delays: tuple[int, int], case: dict[str, Any]) -> None:
+    z, a = logged(delays, **case)
+    assert study_delays([(z, a)]).best == delays
+    # The same with each input logged a row late.
+    assert study_delays([(z[1:-1], a[:-2])]).best == tuple(n - 1 for n in delays)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_feedback_and_idle_inputs_are_no_delay(seed: int) -> None:
+    for known in (
+        logged((0, 0), process=10.0, feedback=1.0, seed=seed, steps=1000),
+        logged((0, 0), process=1.0, feedback=1.0, seed=seed),
+        logged((0, 0), feedback=1.0, seed=seed),
+    ):
+        assert study_delays([known]).best == (0, 0)
+    z, a = logged((0, 0), process=1.0, seed=seed)
+    assert study_delays([(z, np.random.default_rng(9).normal(size=a.shape))]).best == (0, 0)
+
+
+def test_the_gain_is_the_ratio_of_errors() -> None:
+    # At the wrong delay the error of each state is the effect of its input, 10 |B|, at the right one
+    # the noise of a measurement and of its prediction.
+    z, a = logged((2, 2), steps=4000)
+    wrong = 100.0 * np.diag(B @ B.T)
+    found = study_delays([(z, a)])
+    right = 0.02**2 * (1.0 + np.diag(A @ A.T))
+    assert found.gain == pytest.approx(np.sqrt(np.mean(wrong / right)), rel=0.03)
+    text = found.text(sample_time=0.5)
+    assert "2 rows later" in text and "dead time of 1 s" in text and "--input-delay=2" in text
+    assert study_delays([(z, a)], (2, 2)).text() == ""
+    assert "one row earlier" in study_delays([(z, a)], (3, 3)).text()
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_law_of_a_dead_time_is_that_of_the_predicted_state(n: int) -> None:
+    P = linalg.solve_discrete_are(A, B, np.eye(4), 0.01 * np.eye(2))
+    gain = -np.linalg.solve(0.01 * np.eye(2) + B.T @ P @ B, B.T @ P @ A)
+    none, target = np.zeros((2, 4)), np.array([2.0, 1.5, 1.5, 2.0])
+    weights: dict[str, Any] = {"state_weight": 1.0, "action_weight": 0.01}
+    rows = ModelRows(A, B, np.eye(4), none, none, np.zeros(4))
+    found = with_dead_time(rows, (n, n), np.zeros(4), **weights)
+    powers = [np.linalg.matrix_power(A, i) for i in range(n + 1)]
+    expected = np.zeros((2, 4 + 2 * n))
+    expected[:, :4] = gain @ powers[n]
+    for i in range(n):  # a_{k-1-i}
+        for j in range(2):
+            expected[:, 4 + n * j + i] = gain @ powers[i] @ B[:, j]
+    np.testing.assert_allclose(found.K_a, expected, atol=1e-9)
+    # On the plant: nothing can be done about the first n steps, and the rest costs what it does
+    # without a delay.
+    start = np.array([1.0, -1.0, 2.0, 0.5])
+    cost, _ = cost_with_delay(found, n, start)
+    free = [power @ start for power in powers]
+    least = sum(float(z @ z) for z in free[:n]) + float(free[n] @ P @ free[n])
+    assert cost == pytest.approx(least, rel=1e-9)
+    # To a target it comes to rest where the law without a delay does.
+    at_target = with_dead_time(replace(rows, s_r=target), (n, n), target, **weights)
+    _, last = cost_with_delay(at_target, n, start)
+    direct = track(ReducedModel(A, B), **weights)
+    rest = np.linalg.solve(np.eye(4) - A - B @ direct.K_a, B @ direct.K_b @ target)
+    np.testing.assert_allclose(last, rest, atol=1e-9)
+
+
+def cost_with_delay(model: ModelRows, n: int, z: np.ndarray) -> tuple[float, np.ndarray]:
+    """The law `observer` on the plant whose actions act n steps late: cost, last state."""
+    law = Observer(model, 600)
+    theta, memory, late, cost = (
+        law.parts(law.theta_start),
+        law.memory_start(),
+        [np.zeros(2)] * n,
+        0.0,
+    )
+    for k in range(600):
+        a = law.action(theta, z, memory, k)
+        memory = law.memory_update(theta, z, memory, a, k)
+        cost += float(z @ z + 0.01 * a @ a)
+        late.append(a)
+        z = A @ z + B @ late.pop(0)
+    return cost, z
+
+
+def test_shifts_need_rows() -> None:
+    z, a = logged((0, 0), steps=5)
+    with pytest.raises(ValueError, match="no trajectory has more steps"):
+        shifted([(z, a)], (5, 0))
