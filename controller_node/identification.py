@@ -33,7 +33,7 @@ from loop_method.reduce.input_delay import shifted
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
-from loop_method.reduce.subspace import subspace_model
+from loop_method.reduce.subspace import InnovationModel, subspace_model
 from loop_method.settings import settings_from
 
 
@@ -192,10 +192,11 @@ def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A law and, for the identification "field", the report on the model of the whole field."""
+    """A law; for "field" the report on the model of the whole field, for "subspace" its model."""
 
     rows: ModelRows
     field: FieldLaw | None = None
+    innovations: InnovationModel | None = None
 
 
 def design(
@@ -285,7 +286,8 @@ def designed(
             constant=constant and regression.needs_constant(every, target.size),
         )
         return Designed(
-            lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control)
+            lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
+            innovations=found_model,
         )
     truncated = settings.identification == "dmdc"
     known: Sequence[tuple[ArrayLike, ArrayLike]] = trajectories

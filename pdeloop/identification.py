@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,16 +21,20 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
 from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.one_thread import one_thread
 from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
+from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, SHOWN, Channels
 from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError
 from loop_method.reduce.input_delay import Delays, shifted, study_delays
 from loop_method.reduce.order import OrderStudy, study_orders
-from loop_method.reduce.reduced_model import ReducedModel, steps_of
+from loop_method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
+from loop_method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
+from pdeloop.model_checks import Residuals, fit_percent, largest_pole, residuals, stability
 
 if TYPE_CHECKING:
     from loop_method.design.field_law import FieldLaw
@@ -52,7 +57,8 @@ class Identified:
     held-out data, None where these are too few; determined: how well the data determine the model;
     trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data;
     field: the report on the model of the whole field, for the identification "field"; input_delay: of
-    each input, in steps.
+    each input, in steps; pole: |lambda| of the largest one, and its interval; innovations: of the
+    identification "subspace"; fits: FIT of each number of the state, by what was simulated.
     """
 
     model: ModelRows | ReducedModel
@@ -67,6 +73,10 @@ class Identified:
     remarks: tuple[str, ...] = ()
     field: FieldLaw | None = None
     input_delay: Delays = ()
+    pole: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    residuals: Residuals | None = None
+    innovations: InnovationModel | None = None
+    fits: tuple[tuple[str, Array], ...] = ()
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
@@ -111,6 +121,10 @@ class Identified:
             "input_delay": list(self.input_delay),
             "constant": [] if self.model.d is None else self.model.d.tolist(),
             "spectral_radius": float(np.abs(poles).max()),
+            "stable": stability(*self.pole[1:]),
+            "spectral_radius_interval": [_finite(end) for end in self.pole[1:]],
+            "residuals": self.residuals and self.residuals.summary(),
+            "fit": {name: [_finite(own) for own in fit.tolist()] for name, fit in self.fits},
             "rank": determined.rank,
             "unknowns": determined.unknowns,
             "smallest_singular_value": determined.smallest_singular_value,
@@ -118,7 +132,7 @@ class Identified:
             "warnings": self.warnings,
             "suggested_order": study and study.suggested,
             "singular_values": [] if study is None else study.singular_values.tolist(),
-            "orders": [] if study is None else study.rows(),
+            "orders": self.orders,
             "closed_loop": loop and loop.summary(),
             "field_model": self.field and self.field.summary(),
         }
@@ -148,7 +162,7 @@ class Identified:
         if any(self.input_delay):
             told = " and ".join(map(str, dict.fromkeys(self.input_delay)))
             memory = sum(max(n, 0) for n in self.input_delay)
-            state = f", whose last {memory} numbers belong to the state" if memory else ""
+            state = f"; the last {memory} inputs belong to the state" if memory else ""
             lines.append(f"  input delay of {told} steps: a_k-n acts from z_k on{state}")
         own = self.determined.independence
         lines.append(
@@ -156,13 +170,43 @@ class Identified:
             f"{known['smallest_singular_value']:.2g}; independent share of the inputs "
             f"{100 * min(own.min(), 1.0):.0f} % or more"
         )
-        if self.study is None:
+        lines += [f"  {text}" for text in self._verdict()]
+        if self.innovations is not None:
+            lines += ["", *_table(self.orders, len(self.innovations.A))]
+        elif self.study is None:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
             lines += ["", self.study.text()]
         if self.field is not None:
             lines += ["", *self.field.text()]
         return "\n".join([*lines, "", *self._law_lines()])
+
+    @property
+    def orders(self) -> list[dict[str, float]]:
+        """The orders that were tried, of the method that was used."""
+        if self.innovations is not None:
+            names = "past", "order", "one_step_error"
+            tried = [dict(zip(names, row, strict=True)) for row in self.innovations.tried]
+            best = {row["order"]: row for row in sorted(tried, key=lambda row: -row[names[2]])}
+            return [best[order] for order in sorted(best)]
+        return [] if self.study is None else self.study.rows()
+
+    def _verdict(self) -> list[str]:
+        """Stability, residuals and fit."""
+        size, low, high = self.pole
+        interval = (
+            f"95 % interval {low:.4f} to {high:.4f}"
+            if low == low
+            else "too few steps for an interval"
+        )
+        lines = [f"stable: {stability(low, high)}; largest pole {size:.4f}, {interval}"]
+        if self.residuals and self.residuals.count:
+            lines.append(self.residuals.text(self.channels))
+        for name, fit in self.fits:
+            shown = [f"{self.channels.state(i)} {fit[i]:.3g}" for i in range(min(len(fit), SHOWN))]
+            more = f", least {np.nanmin(fit):.3g}" if len(fit) > SHOWN else ""
+            lines.append(f"FIT of the simulation of {name}, in %: {', '.join(shown)}{more}")
+        return lines
 
     def _law_lines(self) -> list[str]:
         """A description of the law and its use, or the reason for its absence."""
@@ -188,6 +232,19 @@ class Identified:
         ]
 
 
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _table(rows: Sequence[Mapping[str, float]], order: int) -> list[str]:
+    """Orders of models in innovation form, with their best past."""
+    lines = ["  order  past  one-step error"]
+    for row in rows:
+        mark = "  used" if row["order"] == order else ""
+        lines.append(f"  {row['order']:>5}  {row['past']:>4}  {row['one_step_error']:>14.3g}{mark}")
+    return [*lines, "  errors on held-out steps, relative to a model in which nothing changes"]
+
+
 def _row(names: Sequence[str]) -> str:
     """(a1, a2), with the middle left out where there are many."""
     shown = list(names) if len(names) <= 2 * SHOWN else [*names[:2], "...", names[-1]]
@@ -203,12 +260,16 @@ def _source_text(source: Source) -> str:
 
 
 def identify_data(
-    found: Measurements, given: Mapping[str, Any], input_delay: Delays | None = ()
+    found: Measurements,
+    given: Mapping[str, Any],
+    input_delay: Delays | None = (),
+    validation: Mapping[str, Measurements] = MappingProxyType({}),
 ) -> Identified:
     """The model from measurements; see `pdeloop.data_file`, and `given` as below.
 
     input_delay: steps after which the inputs act, one number or one for each (`study_delays`); empty:
-    0; None: those that fit the data best. Better ones than those in use are remarked upon.
+    0; None: those that fit the data best. Better ones than those in use are remarked upon. validation:
+    other measurements of the plant, by name, that the model simulates.
     """
     known = {"sample_time": found.sample_time}
     n_a = found.trajectories[0][1].shape[1]
@@ -231,6 +292,7 @@ def identify_data(
         channels=found.channels,
         remarks=found.remarks,
         delays=used,
+        validation=validation,
     )
 
 
@@ -288,6 +350,7 @@ def _identified(
     channels: Channels = NUMBERED,
     remarks: tuple[str, ...] = (),
     delays: Delays = (),
+    validation: Mapping[str, Measurements] = MappingProxyType({}),
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
     known = {**recorded, **given}
@@ -312,7 +375,10 @@ def _identified(
     values = known
     study, none = None, ""
     try:
-        study = study_orders(trajectories, channels=channels)
+        fitted_by = None
+        if known.get("identification") == "dmdc":
+            fitted_by = partial(_truncated, int(known.get("dmdc_rank", 0)))
+        study = study_orders(trajectories, channels=channels, fitted_by=fitted_by)
     except NotIdentifiableError:  # whatever the order
         raise
     except ValueError as error:  # too few steps; the model itself may still be had
@@ -341,6 +407,7 @@ def _identified(
         )
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
+    innovations: InnovationModel | None = None
     if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
         found = designed(
@@ -351,7 +418,7 @@ def _identified(
             or_no_control=target is None,
             constant=True,
         )
-        model, field = found.rows, found.field
+        model, field, innovations = found.rows, found.field, found.innovations
     else:
         truncated = method == "dmdc"
         model = identify(
@@ -361,20 +428,60 @@ def _identified(
             p=p if truncated else 0,
             channels=channels,
         )
+    late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
+    aligned = shifted(logged, early) if delays else trajectories
     return Identified(
         model,
         sources,
         len(steps_of(trajectories).inputs),
         study,
         examined(trajectories, model, method=method, p=p, channels=channels),
-        max(trajectories, key=lambda trajectory: len(trajectory[1])),
+        max(aligned, key=lambda trajectory: len(trajectory[1])),
         target,
         values.get("sample_time"),
         channels,
         remarks,
         field,
         delays,
+        largest_pole(
+            model.A, trajectories, partial(_refitted, model, method, p, sum(late), innovations)
+        ),
+        residuals(model, aligned),
+        innovations,
+        tuple(
+            (name, fit_percent(model, shifted(own.trajectories, early)))
+            for name, own in validation.items()
+        ),
     )
+
+
+def _truncated(p: int, data: Steps, U: Array) -> ReducedModel:
+    """The model of truncated DMDc on given modes, of rank p or, if it is 0, n_s + n_a."""
+    n_s = U.shape[1]
+    if 0 < p < n_s:
+        raise ValueError("more modes than directions")
+    return dmdc.fit(data, U, p or n_s + data.inputs.shape[1])
+
+
+def _refitted(
+    model: ReducedModel | ModelRows,
+    method: str,
+    p: int,
+    memory: int,
+    innovations: InnovationModel | None,
+    trajectories: list[Trajectory],
+) -> Array:
+    """A of other data, by the same method and of the same sizes; memory: of the inputs' dead time."""
+    constant = model.d is not None and bool(model.d.any())
+    if innovations is not None:
+        order, past = len(innovations.A), innovations.past
+        return subspace_model(trajectories, order=order, past=past, constant=constant).A
+    U = model.U[:, : model.U.shape[1] - memory]
+    with one_thread():
+        data = steps_of(trajectories)
+        if method == "dmdc":
+            return _truncated(p, data, U).A
+        return regression.fit(data, U, constant).A
 
 
 def save(found: Identified, path: Path) -> None:

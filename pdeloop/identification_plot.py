@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_method.reduce.order import OrderStudy
-from loop_method.reduce.reduced_model import ReducedModel
 from pdeloop.identification import Identified
+from pdeloop.model_checks import simulated
 from pdeloop.report.style import STYLE
 
 CHANNELS = 5
@@ -37,14 +35,14 @@ def plot(found: Identified) -> Figure:
     rows = 1 if found.closed_loop is None else 2
     figure = Figure(figsize=(8.0, 3.0 * rows), layout="constrained")
     axes = figure.subplots(rows, 2, squeeze=False)
-    _orders(axes[0, 0], found.study, len(found.model.A))
+    _orders(axes[0, 0], found.orders, len(found.model.A))
     step = found.sample_time or 1.0
     unit = "t (s)" if found.sample_time else "step"
     states, actions = found.trajectory
     shown = _spread(states.shape[1])
     _lines(axes[0, 1], states, shown, None, step, linewidth=3.0, alpha=0.35)
-    _lines(axes[0, 1], predicted(found.model, states, actions), shown, found.channels.state, step)
-    axes[0, 1].set(title="recorded (thick), predicted from $z_0$ (thin)", xlabel=unit)
+    _lines(axes[0, 1], simulated(found.model, states, actions), shown, found.channels.state, step)
+    axes[0, 1].set(title="recorded (thick), simulated (thin)", xlabel=unit)
     axes[0, 1].legend(frameon=False, fontsize="small")
     loop = found.closed_loop
     if loop is not None:
@@ -68,26 +66,16 @@ def plot(found: Identified) -> Figure:
     return figure
 
 
-def predicted(model: ReducedModel | ModelRows, states: Array, actions: Array) -> Array:
-    """The measurements of the model under the recorded actions, from s_0 = U^T z_0, (N + 1, n_z)."""
-    s = model.U.T @ states[0]
-    reduced = [s]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for a in actions:
-            s = model.A @ s + model.B @ a + (0.0 if model.d is None else model.d)
-            reduced.append(s)
-    seen = model.measurement if isinstance(model, ModelRows) else model.U
-    return np.asarray(np.array(reduced) @ seen.T)
-
-
-def _orders(ax: Axes, study: OrderStudy | None, order: int) -> None:
+def _orders(ax: Axes, rows: Sequence[Mapping[str, float]], order: int) -> None:
     ax.set(title="errors on held-out steps", xlabel="order $n_s$")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if study is None:
+    if not rows:
         ax.text(0.5, 0.5, "too few steps to hold some out", ha="center", transform=ax.transAxes)
         return
-    ax.semilogy(study.orders, study.one_step, "o-", markersize=3, label="one step")
-    ax.semilogy(study.orders, study.rollout, "s-", markersize=3, label="rollout")
+    for name, label in (("one_step_error", "one step"), ("rollout_error", "rollout")):
+        if name in rows[0]:
+            tried = [row["order"] for row in rows], [row[name] for row in rows]
+            ax.semilogy(*tried, "o-", markersize=3, label=label)
     ax.axvline(order, color="0.5", linestyle=":", label=f"this model, {order}")
     ax.legend(frameon=False, fontsize="small")
 

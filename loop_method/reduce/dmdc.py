@@ -26,7 +26,13 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels, cut_off
 from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
-from loop_method.reduce.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
+from loop_method.reduce.reduced_model import (
+    ReducedModel,
+    Steps,
+    leading_modes,
+    numerical_rank,
+    steps_of,
+)
 
 LOST, SHRUNK = 0.01, 0.1
 """Shares of a move of an input alone that p directions keep: with less it is refused, or remarked
@@ -69,22 +75,26 @@ def truncated_dmdc(
     with one_thread():
         basis, _ = leading_modes(data.after, n_s, channels)
         examine_steps(data, basis, channels).require()
-        stacked = np.vstack([data.before.T, data.inputs.T])
-        psi, xi, lam_t = linalg.svd(stacked, full_matrices=False)
-        rank = numerical_rank(xi, n_z + n_a, steps)
-        if p > rank:
-            raise ValueError(
-                f"p must be at most the numerical rank of the data, {rank}, but p is {p}; lower p "
-                "or excite more."
-            )
-        kept = _kept(psi, data.inputs.shape[1], p)
-        if (lost := np.flatnonzero(kept < LOST)).size:
-            names = [channels.input(j) for j in lost.tolist()]
-            raise NotIdentifiableError(cut_off(names, kept[lost].tolist(), p))
-        regression = (basis.T @ data.after.T) @ (lam_t[:p].T / xi[:p])
-        return ReducedModel(
-            A=regression @ (psi[:n_z, :p].T @ basis), B=regression @ psi[n_z:, :p].T, U=basis
+        return fit(data, basis, p, channels)
+
+
+def fit(data: Steps, U: Array, p: int, channels: Channels = NUMBERED) -> ReducedModel:
+    """`truncated_dmdc` on given modes U (n_z, n_s). Call it with one LAPACK thread."""
+    n_z, (steps, n_a) = len(U), data.inputs.shape
+    stacked = np.vstack([data.before.T, data.inputs.T])
+    psi, xi, lam_t = linalg.svd(stacked, full_matrices=False)
+    rank = numerical_rank(xi, n_z + n_a, steps)
+    if p > rank:
+        raise ValueError(
+            f"p must be at most the numerical rank of the data, {rank}, but p is {p}; lower p "
+            "or excite more."
         )
+    kept = _kept(psi, data.inputs.shape[1], p)
+    if (lost := np.flatnonzero(kept < LOST)).size:
+        names = [channels.input(j) for j in lost.tolist()]
+        raise NotIdentifiableError(cut_off(names, kept[lost].tolist(), p))
+    regression = (U.T @ data.after.T) @ (lam_t[:p].T / xi[:p])
+    return ReducedModel(A=regression @ (psi[:n_z, :p].T @ U), B=regression @ psi[n_z:, :p].T, U=U)
 
 
 def truncation_remarks(

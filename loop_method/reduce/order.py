@@ -17,7 +17,7 @@ References
 Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-validation).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
@@ -117,6 +117,7 @@ def study_orders(
     *,
     channels: Channels = NUMBERED,
     settings: IdentificationSettings = DEFAULTS,
+    fitted_by: Callable[[Steps, Array], ReducedModel] | None = None,
 ) -> OrderStudy:
     """Try orders of a reduced model on held-out parts of trajectories of one plant.
 
@@ -132,6 +133,8 @@ def study_orders(
         Names of states and inputs in error messages.
     settings : IdentificationSettings
         `order_pieces`, `order_folds` and `order_share`.
+    fitted_by : callable, optional
+        The model of steps on modes U (n_z, n), in place of the regression.
 
     Returns
     -------
@@ -173,6 +176,7 @@ def study_orders(
         if len(everything.inputs) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
         constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
+        by = fitted_by or (lambda data, U: fit(data, U, constant))
         for fitted, held in _folds(known, settings):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
@@ -180,8 +184,7 @@ def study_orders(
             if most < 1:  # an input that moved in the held-out steps only, for one
                 continue
             tried = [n for n in tried if n <= most]
-            models = [fit(data, modes[:, :n], constant) for n in tried]
-            errors.append([_summed(_errors(model, *piece) for piece in held) for model in models])
+            errors.append([_held_out(by, data, modes[:, :n], held) for n in tried])
             scales += _summed(_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held)
     if not (tried and errors):
         raise ValueError(
@@ -191,10 +194,21 @@ def study_orders(
     total = _summed(np.array(fold[: len(tried)]) for fold in errors)
     with np.errstate(divide="ignore", invalid="ignore"):
         one_step, rollout = np.sqrt(np.nan_to_num(total / scales, nan=np.inf)).T
-    digits = -np.log10(np.maximum(one_step, ROUNDING))
+    digits = -np.log10(np.clip(one_step, ROUNDING, 1.0 / ROUNDING))
     enough = digits[0] + settings.order_share * (digits.max() - digits[0])
     suggested = tried[int(np.argmax(digits >= enough))]
     return OrderStudy(singular_values, np.array(tried), one_step, rollout, suggested)
+
+
+def _held_out(
+    by: Callable[[Steps, Array], ReducedModel], data: Steps, U: Array, held: Sequence[Trajectory]
+) -> Array:
+    """Sums of squared errors of a model on held-out pieces; infinite where there is none."""
+    try:
+        model = by(data, U)
+    except ValueError:
+        return np.full(2, np.inf)
+    return _summed(_errors(model, *piece) for piece in held)
 
 
 def _determined(data: Steps, modes: Array) -> int:

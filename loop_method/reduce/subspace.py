@@ -81,6 +81,8 @@ class InnovationModel:
         where past and order were given.
     d : (n,) array or None
         The constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data.
+    tried : tuple of (p, n, error)
+        Those among which it was chosen.
     """
 
     A: Array
@@ -92,6 +94,7 @@ class InnovationModel:
     past: int
     error: float = np.nan
     d: Array | None = None
+    tried: tuple[tuple[int, int, float], ...] = ()
 
 
 def subspace_model(
@@ -153,11 +156,13 @@ def subspace_model(
                 "quarter is held out; take a longer horizon, or add a log"
             )
         if len(tried) == 1:
-            p, n = tried[0]
-            error = np.nan
+            (p, n), errors = tried[0], [np.nan]
         else:
-            p, n, error = _choose(tried, known, settings.subspace_tolerance)
+            p, n, errors = _choose(tried, known, settings.subspace_tolerance)
+        error = errors[tried.index((p, n))]
         found = _fitted(known, p, n, channels, error, constant=constant)
+        table = tuple((*sizes, own) for sizes, own in zip(tried, errors, strict=True))
+        found = replace(found, tried=table)
         if found.d is None:
             return found
         # The state of the mean measurement is the least one.
@@ -179,8 +184,8 @@ def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
 
 def _choose(
     tried: Sequence[tuple[int, int]], known: Sequence[Trajectory], tolerance: float
-) -> tuple[int, int, float]:
-    """p and n with the least error on parts that were held out, and that error."""
+) -> tuple[int, int, list[float]]:
+    """p and n with the least error on parts that were held out, and the errors of all."""
     parts = _parts(known)
     totals, changes = np.zeros(len(tried)), np.zeros(len(tried))
     for fold in range(FOLDS):
@@ -205,11 +210,11 @@ def _choose(
     ratios = np.divide(totals, changes, out=np.full(len(tried), np.inf), where=changes > 0.0)
     errors = np.sqrt(ratios)
     if not np.isfinite(errors).any():
-        return (*tried[0], np.nan)
+        return (*tried[0], [np.nan] * len(tried))
     good = [i for i in range(len(tried)) if errors[i] <= tolerance * errors.min()]
     least = min(tried[i][1] for i in good)
     best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
-    return (*tried[best], float(errors[best]))
+    return (*tried[best], errors.tolist())
 
 
 def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:

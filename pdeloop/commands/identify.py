@@ -22,7 +22,7 @@ from pdeloop.output import print_json
 
 OF_DATA = (
     *("time", "states", "inputs", "sample_time"),
-    *("time_unit", "missing", "cut", "resample", "input_delay"),
+    *("time_unit", "missing", "cut", "resample", "input_delay", "validate"),
 )
 """The options that only --data has."""
 MOST_DELAYED = 100
@@ -97,6 +97,13 @@ def add(commands: Commands) -> None:
         help="rows by which the inputs act later than their own, all or each: a dead time above 0, a "
         "log whose inputs are late below; auto: what fits held-out data best [0]",
     )
+    add(
+        "--validate",
+        type=a_path,
+        metavar="FILE",
+        nargs="+",
+        help="other logs of the plant, in the same form: the FIT of the model's simulation of each",
+    )
     add = identify.add_argument
     add(
         "--target",
@@ -153,8 +160,8 @@ def _identify(options: argparse.Namespace) -> int:
         if options.episode is not None or options.environment is not None:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")
         table = {name: getattr(options, name) or "" for name in ("time", "states", "inputs")}
-        measured = read_measurements(
-            *options.data,
+        read = partial(
+            read_measurements,
             **table,
             sample_time=options.sample_time,
             target=options.target,
@@ -163,8 +170,13 @@ def _identify(options: argparse.Namespace) -> int:
             cut=bool(options.cut),
             resample=options.resample,
         )
-        delay = options.input_delay
-        found = identify_data(measured, given, None if delay == "auto" else delay or ())
+        delay, others = options.input_delay, {}
+        for path in options.validate or ():
+            read(options.data[0], path)  # of one plant
+            others[str(path)] = read(path)
+        found = identify_data(
+            read(*options.data), given, None if delay == "auto" else delay or (), others
+        )
     else:
         for name in OF_DATA:
             if getattr(options, name) is not None:

@@ -1,0 +1,253 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What data say about a model: stable or not, residuals, and the fit of simulations.
+
+The magnitude |lambda| of the largest pole has the standard error of a jackknife: with |lambda|_i from
+the data without their i-th of g parts in time,
+
+    se^2 = (g - 1) / g sum_i (|lambda|_i - mean)^2,
+
+and an interval of Student's t with g - 1 degrees of freedom. The residuals e_k = z_k - z_{k|k-1} of a
+good model are white and not explained by inputs that are already known. Of N residuals of a channel
+with correlations rho_1 .. rho_m in time, N sum rho^2 is then chi-square with m degrees of freedom (Box
+and Pierce), and so is N R^2 of the regression on the inputs of m steps, with m n_a.
+
+    FIT_i = 100 (1 - |z_i - z_i simulated| / |z_i - mean z_i|)
+
+References
+----------
+Ljung, "System Identification: Theory for the User", 2nd ed., sections 16.5 and 16.6 (residuals).
+Quenouille, Biometrika 43, 1956, and Kuensch, Annals of Statistics 17(3), 1989 (jackknife).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg, stats
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.one_thread import one_thread
+from loop_method.reduce.channels import Channels, listed
+from loop_method.reduce.reduced_model import ReducedModel, Trajectory
+
+PARTS = 10
+"""Parts of the data of which each is left out once."""
+CONFIDENCE = 0.95
+LAGS = 10
+"""Steps in which residuals are correlated with others and with inputs."""
+LEVEL = 0.01
+"""Rate at which the residuals of a right model are called correlated."""
+ROUNDED = 1e-6
+"""Residuals of this size relative to the variation of the data are rounding."""
+LEAST = 4
+"""Residuals for each correlation, at least."""
+FIRST = 8
+"""Measurements from which a filter finds the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of single steps: which are correlated, beyond chance.
+
+    count: N; in_time: channels with the largest |rho|; with_inputs: channels with the R^2 of earlier
+    inputs; rounding: whether there is nothing else in them; modes: whether channels are
+    modes; size: standard deviation relative to that
+    of the measurements.
+    """
+
+    count: int
+    in_time: tuple[tuple[int, float], ...] = ()
+    with_inputs: tuple[tuple[int, float], ...] = ()
+    rounding: bool = False
+    modes: bool = False
+    size: float = 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """As data."""
+        white = not (self.in_time or self.with_inputs)
+        return {"count": self.count, "white": white, "relative_size": self.size}
+
+    def text(self, channels: Channels) -> str:
+        """One line."""
+        if self.rounding:
+            return "residuals: rounding"
+        share = f"residuals: {100 * self.size:.2g} % of the variation"
+        found = []
+        for what, own in (("in time", self.in_time), ("with earlier inputs", self.with_inputs)):
+            if own:
+                names = listed(
+                    [f"mode {i + 1}" if self.modes else channels.state(i) for i, _ in own]
+                )
+                found.append(f"{what} ({names}, up to {max(value for _, value in own):.2f})")
+        if not found:
+            return f"{share}, white, and not correlated with earlier inputs"
+        return (
+            f"{share}, correlated {' and '.join(found)}, as with noise on the measurements, missing "
+            "states or nonlinearity"
+        )
+
+
+def largest_pole(
+    A: Array, trajectories: Sequence[Trajectory], refit: Callable[[list[Trajectory]], Array]
+) -> tuple[float, float, float]:
+    """|lambda| of the largest pole of A, and the ends of its interval; NaN where there is none.
+
+    refit: A from trajectories.
+    """
+    size = _radius(A)
+    found = []
+    for i in range(PARTS):
+        edges = [(len(a) * i // PARTS, len(a) * (i + 1) // PARTS) for _, a in trajectories]
+        others = []
+        for (z, a), (begin, end) in zip(trajectories, edges, strict=True):
+            others += [(z[: begin + 1], a[:begin])] * (begin > 0) + [(z[end:], a[end:])]
+        others = [part for part in others if len(part[1])]
+        try:
+            found.append(_radius(refit(others)))
+        except (ValueError, linalg.LinAlgError):
+            return size, np.nan, np.nan
+    error = np.sqrt((PARTS - 1) * np.var(found))
+    reach = float(stats.t.ppf(0.5 + CONFIDENCE / 2, PARTS - 1) * error)
+    return size, size - reach, size + reach
+
+
+def stability(low: float, high: float) -> str:
+    """Yes, no, or undecided.
+
+    >>> stability(0.9, 0.99), stability(1.01, 1.1), stability(0.9, 1.1)
+    ('yes', 'no', 'undecided')
+    """
+    return "yes" if high < 1.0 else "no" if low > 1.0 else "undecided"
+
+
+def _radius(A: Array) -> float:
+    return float(np.abs(np.linalg.eigvals(A)).max())
+
+
+def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory]) -> Residuals:
+    """Test the residuals of the model's predictions of the next measurement.
+
+    Channels are the numbers of z, or the directions that the model predicts if these are fewer.
+    Those from which a filter finds the state do not count.
+    """
+    skipped = _beginning(model)
+    states = np.concatenate([z for z, _ in trajectories])
+    basis = np.eye(states.shape[1])
+    if len(model.U) > model.U.shape[1]:
+        with one_thread():
+            basis = linalg.orth(model.U)
+    parts, inputs = [], []
+    for z, a in trajectories:
+        e = ((z[1:] - predicted_next(model, z, a)[:-1]) @ basis)[skipped:]
+        if len(e) <= 2 * LAGS:
+            continue
+        u = a - a.mean(axis=0)
+        k = np.arange(max(skipped, LAGS), len(a))
+        parts.append((e, k - skipped))
+        inputs.append(np.hstack([u[k - lag] for lag in range(LAGS + 1)]))
+    if not parts:
+        return Residuals(0)
+    every = np.concatenate([e for e, _ in parts])
+    variation = float(np.sum((states - states.mean(axis=0)) ** 2)) / len(states)
+    size = float(np.sqrt(np.sum(every**2) / len(every) / max(variation, 1e-300)))
+    if size < ROUNDED:
+        return Residuals(len(every), rounding=True, size=size)
+    level, n = LEVEL / basis.shape[1], len(every)
+    centred = [e - every.mean(axis=0) for e, _ in parts]
+    total = np.maximum(sum(np.sum(e**2, axis=0) for e in centred), 1e-300)
+    rho = np.stack(
+        [
+            sum(np.sum(e[lag:] * e[:-lag], axis=0) for e in centred) / total
+            for lag in range(1, LAGS + 1)
+        ]
+    )
+    in_time = np.flatnonzero(n * np.sum(rho**2, axis=0) > stats.chi2.isf(level, LAGS))
+    X, y = (
+        np.concatenate(inputs),
+        np.concatenate([e[k] for e, (_, k) in zip(centred, parts, strict=True)]),
+    )
+    share = np.zeros(basis.shape[1])
+    columns = X.shape[1]
+    if len(X) > LEAST * columns:
+        left = y - X @ linalg.lstsq(X, y)[0]
+        share = 1.0 - np.sum(left**2, axis=0) / np.maximum(np.sum(y**2, axis=0), 1e-300)
+    moved = np.flatnonzero(len(X) * share > stats.chi2.isf(level, columns))
+    return Residuals(
+        n,
+        tuple((int(i), float(np.abs(rho[:, i]).max())) for i in in_time),
+        tuple((int(i), float(share[i])) for i in moved),
+        modes=basis.shape[1] < len(model.U),
+        size=size,
+    )
+
+
+def predicted_next(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array:
+    """z_{k+1|k} for z_k (N + 1, n_z) and a_k (N, n_a); the last one is not used, (N + 1, n_z)."""
+    estimated = _estimates(model, z, a, len(a))
+    d = 0.0 if model.d is None else model.d
+    ahead = estimated @ model.A.T + a @ model.B.T + d
+    found = ahead @ _seen(model).T
+    return np.vstack([found, found[-1:]])
+
+
+def simulated(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array:
+    """The measurements that the model simulates under recorded actions, (N + 1, n_z).
+
+    A filter finds the state from the first measurements; without one, s_0 = U^T z_0.
+    """
+    taken = min(_beginning(model), len(a) // 4)
+    s = _estimates(model, z, a, taken + 1)
+    found, x = [*s], s[-1]
+    d = 0.0 if model.d is None else model.d
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(taken, len(a)):
+            x = model.A @ x + model.B @ a[k] + d
+            found.append(x)
+        return np.asarray(np.array(found) @ _seen(model).T)
+
+
+def _estimates(model: ReducedModel | ModelRows, z: Array, a: Array, count: int) -> Array:
+    """The estimates x_k of the model's state after the measurement z_k, k < count, (count, n_s)."""
+    s, d = z[:count] @ model.U, 0.0 if model.d is None else model.d
+    L = getattr(model, "L", None)
+    if L is None:
+        return np.asarray(s)
+    x = np.empty_like(s)
+    p = s[0]
+    for k in range(count):
+        x[k] = p + L @ (s[k] - p)
+        p = model.A @ x[k] + (model.B @ a[k] if k < len(a) else 0.0) + d
+    return x
+
+
+def _beginning(model: ReducedModel | ModelRows) -> int:
+    """Measurements from which a filter finds the state, with the last inputs of a dead time."""
+    if getattr(model, "L", None) is None:
+        return 0
+    return max(FIRST, int(np.count_nonzero(~model.U.any(axis=0))))
+
+
+def _seen(model: ReducedModel | ModelRows) -> Array:
+    return model.measurement if isinstance(model, ModelRows) else model.U
+
+
+def fit_percent(
+    model: ReducedModel | ModelRows,
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    first: int = 0,
+) -> Array:
+    """FIT of each number of z, in per cent, over trajectories, (n_z,).
+
+    100: exact; 0: as good as the mean.
+    """
+    known: list[Any] = [(np.asarray(z), np.asarray(a)) for z, a in trajectories]
+    mean = np.concatenate([z for z, _ in known]).mean(axis=0)
+    wrong = np.sum([np.sum((z - simulated(model, z, a)) ** 2, 0) for z, a in known], 0)
+    moved = np.sum([np.sum((z - mean) ** 2, axis=0) for z, _ in known], axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(100.0 * (1.0 - np.sqrt(wrong / np.where(moved > 0.0, moved, np.nan))))
