@@ -8,7 +8,7 @@ export PYTHONSAFEPATH := 1
 # What hundreds of processes import is compiled once, also where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup run test test-extras findings coverage packages lint types docs check lock audit clean
+.PHONY: setup run test test-extras test-neighbours findings coverage packages lint types docs check lock audit clean
 
 setup: .venv/ready
 
@@ -78,6 +78,11 @@ test-extras: setup packages
 	$(PYTEST) $(EXTRAS)
 
 EXTRAS := tests/plant/test_fmu.py tests/tools/test_model_files.py
+
+# The libraries of docs/neighbours.md, pinned, against ours.
+test-neighbours: setup
+	@$(PIP) install --quiet -c constraints.txt -e '.[neighbours]'
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/neighbours
 
 # What other software does that a guess would not expect; each script says what, and which have changed is printed.
 findings:

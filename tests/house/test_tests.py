@@ -19,6 +19,7 @@ from tests.support.interpreter import ROOT
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|assert_")
 SKIPS = {
+    "tests/neighbours/test_models.py": ["{package} is not installed: extra neighbours"],
     "tests/plant/test_fmu.py": [
         "FMPy is not installed: extra fmi",
         "needs a C compiler, the command cc (make packages)",

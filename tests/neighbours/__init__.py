@@ -1,0 +1,1 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
