@@ -29,7 +29,7 @@ from loop_method.models import FieldModelSettings
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
-from loop_method.reduce.input_delay import shifted
+from loop_method.reduce.input_delay import shifted, study_delays
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
@@ -358,11 +358,20 @@ def design_each(
     """A design for each environment of an exploratory episode, as rows (M, rows, n_s); see `design`.
 
     Environments of one model have one design in common. A model without stabilising gains has gains of
-    0: a training can explore again, or begin from no control.
+    0: a training can explore again, or begin from no control. Where the actions act late
+    (`study_delays`), a law with a filter has the last ones in its state; the identification "subspace"
+    knows them anyway.
 
     states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
     to.
     """
+    if (
+        settings.identification != "subspace"
+        and law_kind(settings.law, settings.constants).filtered
+    ):
+        every = [(states[:, m], actions[:, m]) for m in range(states.shape[1])]
+        late = tuple(max(n, 0) for n in study_delays(every).best)
+        settings = replace(settings, input_delay=late if any(late) else ())
     found: dict[int, NDArray[np.float64]] = {}
     for number in numbers:
         if number not in found:

@@ -6,6 +6,7 @@ from typing import Any
 from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_method.adapt import Trajectory
 from loop_method.reduce.identifiability import examine_excitation
+from loop_method.reduce.input_delay import study_delays
 from tuner_node.batch import BatchResult
 from tuner_node.errors import ContradictionError
 
@@ -25,16 +26,27 @@ def same_steps(result: BatchResult, known: int) -> int:
 
 
 def check_excitation(
-    explored: Trajectory, seed: int, action_set: ActionSet = ANY_ACTION
+    explored: Trajectory,
+    seed: int,
+    action_set: ActionSet = ANY_ACTION,
+    remembers: bool = False,
 ) -> list[dict[str, Any]]:
     """History rows about what an exploration hardly determines, whatever drew its actions.
 
     NotIdentifiableError if the effects of its inputs cannot be told apart; of actions with a mean of
-    zero, those of their differences.
+    zero, those of their differences. remembers: whether the law has a memory of its actions.
     """
     actions = explored.actions[: len(explored.states) - 1]
     if action_set.zero_mean:
         actions = actions @ action_set.free(actions.shape[1])
     found = examine_excitation((explored.states, actions))
     found.require()
-    return [{"event": "excitation", "seed": seed, "remark": remark} for remark in found.remarks]
+    remarks = [*found.remarks]
+    delays = study_delays([(explored.states, actions)])
+    if not remembers and max(delays.best) > 0:
+        steps = " and ".join(map(str, dict.fromkeys(delays.best)))
+        remarks.append(
+            f"the actions act {steps} steps late ({delays.gain:.3g} times smaller errors), which the "
+            "law does not know: train with --law observer, whose state has the last actions"
+        )
+    return [{"event": "excitation", "seed": seed, "remark": remark} for remark in remarks]

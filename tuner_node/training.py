@@ -160,7 +160,9 @@ class Training:
                 for m in self.pending:
                     first, *further = islice(seen, together)
                     seed = self.settings.all_seeds[m]
-                    remarks += check_excitation(first, seed, self.settings.action_set)
+                    settings = self.settings
+                    remembers = settings.law.filtered or bool(settings.sensors)
+                    remarks += check_excitation(first, seed, settings.action_set, remembers)
                     self.explorations[m], self.further[m] = first, further
                 self.target = result.target
             # A controller that knows no common exploration gives a model of each: the first is taken.

@@ -1,0 +1,83 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A training on a plant whose actions act late: its first law is the optimum of the delayed plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdeloop
+from tests.method.test_input_delay import A, B
+
+DELAY, HORIZON, R = 3, 60, 0.01
+TARGET = np.array([2.0, 1.5, 1.5, 2.0])
+
+
+class Late(pdeloop.Dynamics):
+    n_z, n_a, horizon, sample_time = 4, 2, HORIZON, 0.1
+    action_weight, target, stateful = R, TARGET, True
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        self.waiting = [np.zeros(2)] * DELAY
+        return rng.normal(size=4)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        self.waiting = [*self.waiting, a.copy()]
+        return A @ z + B @ self.waiting.pop(0)
+
+
+def optimum() -> Callable[[int, np.ndarray], np.ndarray]:
+    """The optimal controller of the delayed plant over the horizon, by dynamic programming."""
+    n = 4 + 2 * DELAY + 1  # z, the waiting actions, 1
+    F, G, E = np.zeros((n, n)), np.zeros((n, 2)), np.zeros((4, n))
+    F[:4, :4], F[:4, 4:6], F[-1, -1] = A, B, 1.0
+    for i in range(DELAY - 1):
+        F[4 + 2 * i : 6 + 2 * i, 6 + 2 * i : 8 + 2 * i] = np.eye(2)
+    G[n - 3 : n - 1] = np.eye(2)
+    E[:, :4], E[:, -1] = np.eye(4), -TARGET
+    P, gains = np.zeros((n, n)), []
+    for _ in range(HORIZON):
+        K = -np.linalg.solve(R * np.eye(2) + G.T @ P @ G, G.T @ P @ F)
+        P = E.T @ E + F.T @ P @ (F + G @ K)
+        gains.insert(0, K)
+    waiting: list[np.ndarray] = []
+
+    def law(k: int, z: np.ndarray) -> np.ndarray:
+        if k == 0:
+            waiting[:] = [np.zeros((len(z), 2))] * DELAY
+        x = np.hstack([z, *waiting[-DELAY:], np.ones((len(z), 1))])
+        waiting.append(x @ gains[min(k, HORIZON - 1)].T)
+        return waiting[-1]
+
+    return law
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_observer_knows_of_the_dead_time(seed: int, tmp_path: Path) -> None:
+    with pytest.warns(pdeloop.TrainingWarning, match="no other law is better"):
+        run = pdeloop.train(
+            plant=Late(),
+            law="observer",
+            reduced_order=4,
+            rollouts=6,
+            evaluation_fields=4,
+            seed=seed,
+            out=tmp_path / "run",
+        )
+    best = pdeloop.rollout(Late(), optimum(), *run.evaluation)
+    least = float(np.mean(best.costs.mean))
+    # The law of the infinite horizon knows no end, where actions no longer pay.
+    assert least * (1 - 1e-9) < float(np.mean(run.costs["lqt"])) < 1.02 * least
+    assert float(np.mean(run.costs["adapted"])) < 1.02 * least
+
+
+def test_the_affine_law_is_told_of_the_dead_time() -> None:
+    told = StringIO()
+    with pytest.warns(pdeloop.TrainingWarning):
+        pdeloop.train(plant=Late(), reduced_order=4, rollouts=6, evaluation_fields=2, progress=told)
+    assert "the actions act 3 steps late" in told.getvalue()
+    assert "train with --law observer" in told.getvalue()
