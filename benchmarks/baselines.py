@@ -48,8 +48,7 @@ TEST, VALIDATION = 0, 2024
 TUNING_SEEDS = (100, 101, 102, 103)
 BUDGETS = (20, 40, 80)
 LOOKS = {
-    "model-based": (CONTROLLERS["gauss_newton"].colour, "-s"),
-    "gauss-newton": (CONTROLLERS["gauss_newton"].colour, "-o"),
+    "model-based": (CONTROLLERS["model_based"].colour, "-s"),
     "two-point": (CONTROLLERS["lqt_po"].colour, "-o"),
     "lqt": (CONTROLLERS["lqt"].colour, "--o"),
     "lqt-again": (CONTROLLERS["lqt"].colour, "-s"),

@@ -227,8 +227,9 @@ def _whole(
     problem: str, seed: int, fields: int, seeds: Sequence[int]
 ) -> tuple[Plant, list[Law], dict[str, Any]]:
     """The plant, laws of the whole field, and their costs on held-out fields."""
-    values = values_of(problem, {"seed": seed, "optimizer": "gauss_newton"})
-    true, loop, first = loop_of(values, "gauss_newton")
+    own = {"seed": seed, "optimizer": "two_point", "identification": "regression"}
+    values = values_of(problem, own)
+    true, loop, first = loop_of(values, "two_point")
     initial = initial_fields(true, evaluation_seeds(TRAINING_SEED, fields))
     theta = best_law(loop, first, initial)
     whole = float(law_costs(true, loop, theta, seeds).mean())

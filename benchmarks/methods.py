@@ -328,11 +328,11 @@ def lqg(values: Values, *, whole: bool) -> tuple[LocalPair, Law, int]:
 
 
 def true_model(values: Values, *, candidates: int) -> tuple[LocalPair, Law, int]:
-    """`LikeliestField` with the law that Gauss-Newton finds where the whole field is measured.
+    """`LikeliestField` with the law that `model_based` finds where the whole field is measured.
 
     The limit for any estimator, as it has the true plant and the distribution of initial fields.
     """
-    whole = {**values, "sensors": 0, "optimizer": "gauss_newton", "seeds": 1}
+    whole = {**values, "sensors": 0, "optimizer": "model_based", "seeds": 1}
     pair, training = LocalPair(whole), build_training(whole)
     train(training, pair, lambda row: None)
     assert training.models is not None

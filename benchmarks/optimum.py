@@ -80,7 +80,7 @@ def law_of(
     Its mean cost on the fields, the law, and the costs by field of the laws lqt and optimum.
     """
     with one_thread(), np.errstate(all="ignore"):
-        plant, loop, first = loop_of({**values, "seed": seed}, "gauss_newton")
+        plant, loop, first = loop_of({**values, "seed": seed}, "two_point")
         own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, fields))
         best = best_law(loop, first, own, tolerance)
         costs = {

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from pdeloop.in_process import LocalPair
@@ -12,7 +13,7 @@ from tuner_node.training import Training
 
 
 def warm_start(
-    values: Mapping[str, Any], pair: LocalPair, optimizer: str = "gauss_newton"
+    values: Mapping[str, Any], pair: LocalPair, optimizer: str = "two_point"
 ) -> Training:
     """A training of one seed that is about to adapt, with the trajectories that it has measured.
 
@@ -32,6 +33,7 @@ def warm_start(
         `measured[0]` are trajectories, and `budget.paid[0]` is what they cost.
     """
     training = build_training({**values, "optimizer": optimizer, "seeds": 1})
+    training.settings = replace(training.settings, trajectories=True)
     while training.phase in ("identify", "check"):
         batch = training.next_batch()
         assert batch is not None

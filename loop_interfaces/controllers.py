@@ -24,10 +24,10 @@ CONTROLLERS = {
     # The three adapted controllers of `pdeloop reproduce`, told apart by how they were adapted.
     "lqt_po": Controller("LQT-PO", "#e69f00", "#f7dc6f"),
     "pure_po": Controller("pure PO", "#009e73", "#2fd6a4"),
-    "gauss_newton": Controller("Gauss-Newton", "#d55e00", "#ff8c42"),
+    "model_based": Controller("model-based", "#d55e00", "#ff8c42"),
 }
 """By the key under which result.json, table.json and the history of a run have their costs.
 
-The first three are those of every run; `adapted` is the policy at its end. `gauss_newton` is the
+The first three are those of every run; `adapted` is the policy at its end. `model_based` is the
 `adapted` of a run with the default optimiser and has its colour.
 """

@@ -85,8 +85,7 @@ IDENTIFICATION = Spec(
     "field: a linearised model of the whole field, where its law is better; regression: least "
     "squares in reduced coordinates; subspace: a model in innovation form with its filter, from "
     "measurements alone, for the laws extended_kalman and observer (their default with few "
-    "sensors); dmdc: the paper's truncated DMDc. Some optimisers have another default: regression "
-    "for gauss_newton, dmdc for two_point"
+    "sensors); dmdc: the paper's truncated DMDc, the default of two_point"
 )
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(

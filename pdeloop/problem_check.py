@@ -30,7 +30,8 @@ from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
-from tuner_node.build import build_training, compares_first_law, few_sensors, remarks_on
+from tuner_node.build import build_training, few_sensors, remarks_on
+from tuner_node.optimizer_parameters import kind_of
 
 __all__ = ["Finding", "check", "field_plant"]
 
@@ -314,7 +315,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         )
     yield Finding("order", True, told)
     share: float | None = None
-    costs, compared = {"no control": _drawn_fields_cost(plant)}, compares_first_law(values)
+    costs, compared = {"no control": _drawn_fields_cost(plant)}, kind_of(values).judges_first_law
     for order in dict.fromkeys(orders):
         try:
             own = replace(settings, reduced_order=order)

@@ -16,7 +16,7 @@ from pdeloop.study.results import STUDY_FILE, read_study, reading
 LEARNED = {
     "lqt_po": {"start": "lqt", "optimizer": "two_point"},
     "pure_po": {"start": "zero", "optimizer": "two_point"},
-    "gauss_newton": {"start": "lqt", "optimizer": "gauss_newton"},
+    "model_based": {"start": "lqt", "optimizer": "model_based"},
 }
 """The adapted controllers, and how each is trained."""
 PAPER = {"burgers": 28.0, "allen-cahn": 15.8, "kdv": 36.4}
@@ -28,14 +28,14 @@ DEFAULTS = {"seeds": 6, "iterations": 40, "seed": 0}
 def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:
     """The experiment on these problems, the paper's if there are none.
 
-    The paper counts iterations of two rollouts each, after exploration and check; Gauss-Newton has
-    that many rollouts with exploration and check.
+    The paper counts iterations of two rollouts each, after exploration and check; `model_based`
+    has that many rollouts with its explorations.
     """
     rest = {**DEFAULTS, **options}
     first, seeds, iterations = (rest.pop(name) for name in ("seed", "seeds", "iterations"))
     budgets = {
         "two_point": {"iterations": iterations},
-        "gauss_newton": {"rollouts": 2 * iterations},
+        "model_based": {"rollouts": 2 * iterations},
     }
     return Study.of(
         {

@@ -105,8 +105,8 @@ class _Training:
         self, problem: str, iterations: int, seed: int, out: Path, report: SoakReport
     ) -> None:
         # The optimiser that needs costs only and the one that needs trajectories take turns.
-        # A Gauss-Newton step takes a second to compute, and is computed again after a kill.
-        optimizer, share = (("two_point", 1), ("gauss_newton", 10))[seed % 2]
+        # An update of model_based takes a second to compute, and is computed again after a kill.
+        optimizer, share = (("two_point", 1), ("model_based", 10))[seed % 2]
         iterations = max(1, iterations // share)
         budget = {"iterations": iterations} if optimizer == "two_point" else {}
         budget = budget or {"rollouts": max(20, 2 * iterations)}

@@ -204,20 +204,6 @@ def few_sensors(values: Mapping[str, Any]) -> int:
     return int(values["sensors"]) if newest < values["n_z"] else 0
 
 
-def kind_used(values: Mapping[str, Any]) -> type[Optimizer]:
-    """The class of the optimiser, or of the one that it hands over to with few sensors."""
-    kind = kind_of(values)
-    if few_sensors(values) and kind.with_sensors and values["law"] not in kind.also_improves:
-        return kind_of({"optimizer": kind.with_sensors})
-    return kind
-
-
-def compares_first_law(values: Mapping[str, Any]) -> bool:
-    """True if the optimiser compares the first law with no control itself."""
-    kind = kind_used(values)
-    return kind.judges_first_law or bool(few_sensors(values) and kind.compares_first_law)
-
-
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     order = model_order(values)
@@ -227,11 +213,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
             "as all models of a batch share one order; give --reduced-order N (a training of one "
             "seed shows a suitable one), or train each seed on its own with pdeloop study"
         )
-    named, kind, sensors = kind_of(values), kind_used(values), few_sensors(values)
-    chosen = settings_of(named, values)
-    if kind is not named:
-        chosen = kind.Settings()
-
+    kind, sensors = kind_of(values), few_sensors(values)
+    chosen = settings_of(kind, values)
     law = law_of(values, kind)
 
     def make_optimizer(
@@ -251,11 +234,10 @@ def build_training(values: Mapping[str, Any]) -> Training:
             return InCoordinates(made, context)
         return made(context)
 
-    explorations = 1 if sensors and law is Affine else kind.explorations
-    if compares_first_law(values):
+    if kind.judges_first_law:
         values = {**values, "identification_attempts": 1}
     step = kind.first_step(chosen)
-    check_budget(values, kind, step, explorations)
+    check_budget(values, kind, step, kind.explorations)
     given = {
         item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values
     }
@@ -270,6 +252,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
     # The published readings are scaled (docs/robustness.md).
     scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
+    delayed = (
+        bool(sensors) and values["sensor_delays"] > 1
+    )  # readings of several steps are no field
     points = () if grid is None else tuple(axis.size for axis in grid.axes)
     centres, widths = declared_actuators(values)
     given |= {
@@ -281,8 +266,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "sensors": sensors,
         "actuator_positions": centres,
         "actuator_widths": widths,
-        "periodic": grid is None or grid.is_circle,
-        "line": grid is None or len(grid.axes) < 2,
+        "periodic": not delayed and (grid is None or grid.is_circle),
+        "line": not delayed and (grid is None or len(grid.axes) < 2),
         "shape": points if len(points) > 1 and not sensors else (),
         "measurement_noise": values["measurement_noise"] * scale,
         "model": given_model(values, law),
@@ -292,7 +277,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         **given,
         adaptation=kind.iteration_rollouts * values["iterations"],
         step=step,
-        explorations=explorations,
+        explorations=kind.explorations,
         trajectories=kind.needs_trajectories,
         noise=noisy(values),
     )

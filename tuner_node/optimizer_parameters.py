@@ -76,7 +76,7 @@ def _preferred(
     The law too may be one of few sensors, or of a target that moves.
 
     A model of the whole field that a problem's file asks for, and the options do not, gives way to one
-    of few readings. The optimiser's name may be written as the command line writes words: gauss-newton.
+    of few readings. The optimiser's name may be written as the command line writes words: two-point.
     """
     name = str(given.get("optimizer", OPTIMIZER.default))
     name = name if ":" in name else name.replace("-", "_")

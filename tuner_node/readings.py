@@ -12,7 +12,7 @@ from loop_method.models.noise_level import contradicting_noise, rows_of, share_o
 from loop_method.models.undeclared_noise import PREDICTED
 from tuner_node.training import Training
 
-PREDICTS_NO_FIELD = ("local", "sensed", "innovations")
+PREDICTS_NO_FIELD = ("sensed", "innovations")
 """Kinds of models whose `mismatch` is not the error of predicted whole states."""
 
 

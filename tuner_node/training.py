@@ -381,10 +381,7 @@ class Training:
         if exploration is None or self.target is None or self.models is None:
             return None
         known = exploration, self.further[m], self.measured[m]
-        context = context_of(self.settings, self.laws()[m], self.target, *known)
-        if self.worse[m] and self.settings.start != "zero":
-            context = replace(context, refused=self.warm_starts()[m])
-        return context
+        return context_of(self.settings, self.laws()[m], self.target, *known)
 
     def _asked(self) -> list[list[Rollout]]:
         """The rollouts that each optimiser asks for; its policies may be vectors."""

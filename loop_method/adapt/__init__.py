@@ -8,7 +8,6 @@ from loop_method.adapt.base import Rollout as Rollout
 from loop_method.adapt.base import RolloutResult as RolloutResult
 from loop_method.adapt.base import State as State
 from loop_method.adapt.base import Trajectory as Trajectory
-from loop_method.adapt.gauss_newton import GaussNewton as GaussNewton
 from loop_method.adapt.model_based import ModelBased as ModelBased
 from loop_method.adapt.step_optimizer import StepOptimizer as StepOptimizer
 from loop_method.adapt.two_point import TwoPoint as TwoPoint

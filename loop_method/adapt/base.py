@@ -167,9 +167,6 @@ class Context:
         The law whose parameters theta is, with its derivatives if it has any.
     field_models : FieldModelSettings
         How models of the whole field are fitted and one is chosen.
-    refused : array or None
-        The first law, where it was no better than no control on the field of its check, so that the
-        optimisation begins without control.
     """
 
     U: Array
@@ -191,7 +188,6 @@ class Context:
     cost: Cost | None = None
     law: Law | None = None
     field_models: FieldModelSettings = DEFAULTS
-    refused: Array | None = None
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:
@@ -236,9 +232,6 @@ class Optimizer(Protocol):
     """True if it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
     also_improves: ClassVar[tuple[str, ...]] = ()
     """Names of other laws that it improves, whose theta it is given as a vector."""
-    compares_first_law: ClassVar[bool] = False
-    """True if it compares the first law with no control itself where the state is that of few sensors,
-    so that the plant is explored once and no law is checked before."""
     any_cost: ClassVar[bool] = False
     """True if it can use any quadratic cost (`loop_interfaces.cost.Cost`), if it needs trajectories;
     otherwise scalar weights and a constant target. Optimisers that need only costs can."""
@@ -249,8 +242,6 @@ class Optimizer(Protocol):
     states of more than 2,048 numbers (`loop_method.adapt.in_coordinates`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
-    with_sensors: ClassVar[str] = ""
-    """The optimiser used instead when the state is that of few sensors; empty: none."""
     law_of_moving_targets: ClassVar[str] = ""
     """The law preferred where the target changes from step to step; empty: as without."""
     law_of_sensors: ClassVar[str] = ""

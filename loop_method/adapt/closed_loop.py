@@ -95,11 +95,6 @@ class ClosedLoopProblem:
         n_s = self.U.shape[1]
         return self._changed(near, theta[:, :n_s], theta[:, n_s] - near[:, n_s:] @ self.s_r)
 
-    def moved(self, policy: Array, step: Array) -> Array:
-        """The policy after a step of theta; K_b moves least among those with the wanted b."""
-        n_s = self.U.shape[1]
-        return self._changed(policy, policy[:, :n_s] + step[:, :n_s], step[:, n_s])
-
     def _changed(self, policy: Array, K_a: Array, change: Array) -> Array:
         """The policy with other gains K_a, and with b changed by (n_a,)."""
         n_s, changed = self.U.shape[1], policy.copy()
@@ -118,10 +113,6 @@ class ClosedLoopProblem:
     def cost_of(self, record: Record) -> float:
         """Mean stage cost of the recorded part of a rollout."""
         return self.mean_cost(record.acted_from, record.actions)
-
-    def mean_cost_of(self, records: Sequence[Record]) -> float:
-        """The mean of their costs."""
-        return float(np.mean([self.cost_of(record) for record in records]))
 
 
 @dataclass(frozen=True, eq=False)

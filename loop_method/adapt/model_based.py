@@ -74,8 +74,6 @@ __all__ = ["ModelBased"]
 
 _REACH = 3.0
 """Magnitude of the states that a model must describe, in terms of the largest one measured before."""
-_REMEMBERED = 10**6
-"""Rollouts, more than there ever are: the law is not renewed any more once it knows enough fields."""
 _NONE_ROLLOUTS = 2
 """Rollouts without control on fields of the first law, where no model tells what they cost."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
@@ -107,7 +105,6 @@ class ModelBased(Optimizer):
     in_coordinates = True
     judges_first_law = True
     explorations = 2
-    with_sensors = "gauss_newton"
     law_of_moving_targets = "feedforward"
     law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
 
@@ -136,7 +133,7 @@ class ModelBased(Optimizer):
         self._before = [*explored, *context.measured]
         self._schedule = Schedule(len(self._before), rollouts, self._settings)
         self._reach = _REACH * max(float(np.abs(known.states).max()) for known in self._before)
-        self._records = Records(_REMEMBERED, self._reach)
+        self._records = Records(self._reach)
         self._progress = Progress(self._first.copy())
 
     @classmethod

@@ -15,12 +15,16 @@ GROUP = "pdeloop.optimizers"
 """The group of entry points by which an installed package offers optimisers."""
 
 
+_REMOVED = {"gauss_newton": "was removed: use model_based, which costs as little, or two_point"}
+"""Optimisers of earlier versions, and what to use in their place."""
+
+
 def _ours() -> dict[str, type[Optimizer]]:
     try:
         entries = distribution("pdeloop").entry_points.select(group=GROUP)
     except PackageNotFoundError:
         return {}
-    return {entry.name: entry.load() for entry in entries}
+    return {entry.name: entry.load() for entry in entries if entry.name not in _REMOVED}
 
 
 OWN_OPTIMIZERS = OwnCode("optimizer", "PDELOOP_OPTIMIZERS", _ours())
@@ -28,7 +32,7 @@ OWN_OPTIMIZERS = OwnCode("optimizer", "PDELOOP_OPTIMIZERS", _ours())
 
 def offered() -> list[str]:
     """The names of the installed optimisers, including ours."""
-    return sorted({entry.name for entry in entry_points(group=GROUP)})
+    return sorted({entry.name for entry in entry_points(group=GROUP)} - set(_REMOVED))
 
 
 def optimizer_kind(name: str) -> type[Optimizer]:
@@ -39,6 +43,8 @@ def optimizer_kind(name: str) -> type[Optimizer]:
     ValueError
         Nothing of that name can be loaded, it is code that is not allowed, or no complete `Optimizer`.
     """
+    if name in _REMOVED:
+        raise ValueError(f"optimizer {name!r} {_REMOVED[name]}")
     if not OWN_OPTIMIZERS.shipped:
         raise ValueError(
             f"optimizer {name!r}: the entry points of pdeloop are out of date, as not even its own "

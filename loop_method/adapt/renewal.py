@@ -190,28 +190,6 @@ def renew_from_states(
     return found
 
 
-def confirmed_fraction(
-    loop: ClosedLoop,
-    first: Array,
-    fields: Array,
-    rng: np.random.Generator,
-    settings: ImprovementSettings,
-    *,
-    components: int = 1,
-    periodic: bool = True,
-) -> tuple[float, Estimate]:
-    """Fraction and change of a `Renewal`, for a law that was found in another way.
-
-    The descents on some of the fields are made here only to see what they are worth on the others.
-    """
-    if len(fields) < 2:
-        return 1.0, ZERO
-    descend = _descent(loop, rng, settings, components, periodic, settings.first_gain)
-    starts = [first] * settings.folds
-    made, _ = _of_parts(descend, first, starts, fields, settings.mixtures // 2)
-    return held_out_fraction(loop, first, made, fields, settings)
-
-
 def _of_parts(
     descend: _Descent,
     first: Array,

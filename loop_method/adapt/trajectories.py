@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -95,35 +95,25 @@ def taken_record(
 
 
 class Records:
-    """The last rollouts, and older ones that are still referred to.
+    """The rollouts of an optimiser.
 
     Parameters
     ----------
-    memory : int
-        How many rollouts to remember.
     limit : float
         A diverged rollout counts until a state exceeds this magnitude.
     """
 
-    def __init__(self, memory: int, limit: float) -> None:
-        self._memory = memory
+    def __init__(self, limit: float) -> None:
         self._limit = limit
         self._records: dict[int, Record] = {}
         self.count = 0
 
-    def __getitem__(self, stamp: int) -> Record:
-        return self._records[stamp]
-
     def all(self) -> list[Record]:
-        """The remembered rollouts, oldest first."""
+        """The rollouts, oldest first."""
         return [self._records[stamp] for stamp in sorted(self._records)]
 
-    def raise_limit(self, states: Array) -> None:
-        """Accept magnitudes up to three times those of a trajectory from the start."""
-        self._limit = max(self._limit, 3.0 * float(np.abs(states).max()))
-
-    def add(self, rollout: Rollout, result: RolloutResult, keep: Collection[int] = ()) -> Record:
-        """Remember a rollout; `keep` are the stamps that must not be forgotten."""
+    def add(self, rollout: Rollout, result: RolloutResult) -> Record:
+        """Remember a rollout."""
         states, actions = self.validated_samples(result)
         cost = float(result.cost) if result.usable else float("inf")
         record = Record(
@@ -131,9 +121,6 @@ class Records:
         )
         self._records[record.stamp] = record
         self.count += 1
-        for stamp in list(self._records):
-            if stamp < self.count - self._memory and stamp not in keep:
-                del self._records[stamp]
         return record
 
     def state(self) -> State:

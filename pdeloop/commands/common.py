@@ -178,7 +178,7 @@ def given_flags(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _word(text: str) -> str:
-    """gauss-newton as well as gauss_newton."""
+    """two-point as well as two_point."""
     return text.replace("-", "_")
 
 

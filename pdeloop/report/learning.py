@@ -1,24 +1,18 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The figures about learning: cost against rollouts, the steps that were tried, the final costs."""
+"""The figures about learning: cost against rollouts, the final costs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.report.data import Curve, ProblemData
 from pdeloop.report.style import COLOURS, LINES, NAMES, panels, plain_log
-
-Rows = Sequence[Mapping[str, Any]]
-EDGE = 1.5
-"""Candidates that cost more, relative to the incumbent, or diverged stand at this height."""
 
 TENFOLD = 10.0
 """Ratio of costs beyond which their axis is logarithmic."""
@@ -73,73 +67,6 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
     return float(below.min()), float((mean + std).max())
 
 
-def has_steps(history: Rows) -> bool:
-    """True for the rows of an optimiser that judges its steps as `steps` shows them."""
-    decided = [row for row in history if "accepted" in row]
-    return (
-        bool(decided)
-        and all("relative_cost" in row and row.get("damping", 0.0) > 0 for row in decided)
-        and any("mismatch" in row and "predicted_fall" in row for row in history)
-    )
-
-
-def steps(history: Rows, colour: str) -> Figure:
-    """Steps accepted and rejected, the damping, and the error of the model behind them.
-
-    history: the rows of one seed whose optimiser judges its steps.
-    """
-    decided = [row for row in history if "accepted" in row]
-    proposed = [row for row in history if "mismatch" in row]
-    figure = Figure(figsize=(6.4, 5.2))
-    top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
-    _candidates(top, decided, proposed, colour)
-    used = _column(decided, "rollouts")
-    damping = _column(decided, "damping")
-    middle.step(used, damping, "o-", where="post", color="0.25", ms=3, lw=1)
-    plain_log(middle, float(np.max(damping) / np.min(damping)))
-    middle.set_ylabel("damping $\\lambda$")
-    mismatch = np.maximum(_column(proposed, "mismatch"), 1e-16)  # exact up to rounding, or to noise
-    bottom.plot(_column(proposed, "rollouts"), mismatch, "o-", color="0.25", ms=3, lw=1)
-    bottom.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
-    bottom.set_title("dotted: no prediction at all", loc="right", fontsize=8, color="0.4", pad=2)
-    low = min(0.4, 0.5 * float(np.nanmin(mismatch)))
-    plain_log(bottom, 2.6 / low)
-    bottom.set_ylim(low, 2.6)
-    bottom.set_ylabel("model error E")
-    bottom.set_xlabel("rollouts of the adaptation")
-    bottom.set_xlim(0, 1.02 * float(used[-1]))
-    bottom.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10], integer=True))
-    figure.align_ylabels()
-    return figure
-
-
-def _candidates(ax: Axes, decided: Rows, proposed: Rows, colour: str) -> None:
-    """Cost of each candidate over the incumbent's, as it was predicted and as it came out."""
-    used, relative = _column(decided, "rollouts"), _column(decided, "relative_cost")
-    heights = np.where(relative < EDGE, relative, EDGE)
-    accepted = np.array([bool(row["accepted"]) for row in decided])
-    # The step that was decided is the last one proposed before; a first law is none.
-    last = np.searchsorted(_column(proposed, "rollouts"), used)
-    falls = _column(proposed, "predicted_fall") / _column(proposed, "cost")
-    predicted = 1 - np.concatenate([[np.nan], falls])[last]
-    ax.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
-    ax.plot(used, predicted, "D", ms=4, color="0.5", mfc="none", label="predicted")
-    for which, marker, tint, label in (
-        (accepted, "o", colour, "accepted"),
-        (~accepted, "x", "black", "rejected"),
-    ):
-        if which.any():  # an empty line that is not clipped has no extent to lay out
-            ax.plot(used[which], heights[which], marker, color=tint, label=label, clip_on=False)
-    known = np.concatenate([heights, predicted, [1.0]])
-    ax.set_ylim(min(0.9, float(np.nanmin(known)) - 0.05), min(EDGE, np.nanmax(known) + 0.05))
-    ax.set_ylabel("candidate's cost over\nthe incumbent's")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.2)
-
-
-def _column(rows: Rows, name: str) -> Array:
-    return np.array([row.get(name, np.nan) for row in rows], dtype=np.float64)
-
-
 def bars(problems: Sequence[ProblemData]) -> Figure:
     """Mean stage cost of each controller over seeds and fields, with the standard deviation."""
     widest = max(len(problem.costs) for problem in problems)
@@ -172,7 +99,7 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
             ax.set_ylim(0.5 * low, 1.5 * high)
         else:
             ax.set_ylim(0, 1.12 * high or 1.0)
-        labels = [NAMES[n].replace(" ", "\n", 1).replace("-N", "-\nN") for n in problem.costs]
+        labels = [NAMES[n].replace(" ", "\n", 1).replace("-b", "-\nb") for n in problem.costs]
         ax.set_xticks(range(len(labels)), labels, fontsize=7.5)
         ax.set_xlim(-0.6, len(labels) - 0.4)
         ax.tick_params(axis="x", length=0)

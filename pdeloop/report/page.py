@@ -27,7 +27,7 @@ from pdeloop.finished_run import field_means
 from pdeloop.report import figures, learning
 from pdeloop.report.dark import darken
 from pdeloop.report.data import ProblemData, ReportData
-from pdeloop.report.style import COLOURS, NAMES, STYLE
+from pdeloop.report.style import NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
 from pdeloop.study.results import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
@@ -157,20 +157,6 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
 def _of_problem(problem: ProblemData) -> Drawn:
     """The figures of one problem."""
     name, seed = problem.name, problem.first.seeds[problem.shown]
-    for controller in problem.runs:
-        history = problem.history(controller)
-        judged = [row["accepted"] for row in history if "accepted" in row]
-        if learning.has_steps(history):
-            yield (
-                f"{name}-steps",
-                f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
-                f"Seed {seed}, steps accepted: {sum(judged)} of {len(judged)}. A candidate that "
-                f"diverged, or cost more than {learning.EDGE:g} times what the incumbent costs, is "
-                f"drawn at {learning.EDGE:g}. Below: the damping, which a rejection raises, and the "
-                "relative error of the best fitted model in predicting how measured trajectories "
-                "differ.",
-                learning.steps(history, COLOURS[controller]),
-            )
     if not problem.behaviours:
         return
     yield (

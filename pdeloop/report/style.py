@@ -21,7 +21,7 @@ from loop_interfaces.controllers import CONTROLLERS
 
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
-LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "gauss_newton": (0, (5, 1))}
+LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "model_based": (0, (5, 1))}
 """Line styles; the others are solid."""
 _LOOKS = (
     "axes.", "contour.", "errorbar.", "figure.", "font.", "grid.", "hatch.", "image.", "legend.",

@@ -63,7 +63,7 @@ AGENTS = ("ppo", "sac")
 
 def values_of(method: str) -> dict[str, Any]:
     sensors = {"sensors": 8} if method in ("lqg", "true-model") else {}
-    return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **sensors}
+    return {**parameters(rollouts=ROLLOUTS, optimizer="model_based"), **sensors}
 
 
 def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:
@@ -72,7 +72,7 @@ def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:
 
 
 @pytest.mark.parametrize(
-    "method", sorted({*METHODS, "gauss-newton"} - {"no-control", "dfo-ls", *AGENTS})
+    "method", sorted({*METHODS, "model-based"} - {"no-control", "dfo-ls", *AGENTS})
 )
 def test_a_method_improves_on_no_control_pays_for_each_rollout_and_sees_no_field_of_a_table(
     method: str, monkeypatch: pytest.MonkeyPatch
@@ -287,7 +287,7 @@ def test_what_a_method_needs_is_said_before_anything_runs(
     with pytest.raises(
         ValueError, match=r"ppo\+plain needs stable_baselines3: pip install .*\[rl\]"
     ):
-        run(["kdv"], methods=["gauss-newton", "ppo+plain"], **how)
+        run(["kdv"], methods=["model-based", "ppo+plain"], **how)
     with pytest.raises(ValueError, match=r"mpc needs osqp: pip install 'pdeloop\[bench\]'"):
         run(["kdv"], methods=["mpc"], **how)
     assert not list(tmp_path.iterdir())
@@ -338,14 +338,14 @@ def test_the_command_line_hands_the_program_its_options_alone(
 ) -> None:
     assert cli.run(parser, ["baselines", "kdv", "--methods", "mcp"]) == 1
     assert capsys.readouterr().err.startswith(
-        "pdeloop: no method mcp; expected some of gauss-newton"
+        "pdeloop: no method mcp; expected some of model-based"
     )
 
 
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ({"studies": ["kdv"], "methods": ["mcp"]}, "no method mcp; expected some of gauss-newton"),
+        ({"studies": ["kdv"], "methods": ["mcp"]}, "no method mcp; expected some of model-based"),
         ({"studies": ["kvd"]}, "no study .*kvd.yaml; expected one of allen-cahn, burgers, "),
         (
             {"studies": ["kdv"], "settings": ["sensors"]},

@@ -127,7 +127,7 @@ def test_the_limits_are_optima(limits):
 
 def test_the_limits_from_zero_are_the_same(limits):
     _, result = limits
-    plant, loop, first = loop_of(values_of(), "gauss_newton")
+    plant, loop, first = loop_of(values_of(), "model_based")
     zero = np.zeros_like(first)
     theta = best_law(loop, zero, initial_fields(plant, evaluation_seeds(TRAINING_SEED, 4)), 1e-6)
     held_out = evaluation_seeds(0, FIELDS)

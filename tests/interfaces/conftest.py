@@ -10,7 +10,7 @@ import pytest
 
 from pdeloop.cli import main
 from tests.support.made_once import made_once
-from tests.support.small import FEW_FITS, SMALL
+from tests.support.small import FEW_STEPS, SMALL
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,10 @@ def finished(request, tmp_path_factory) -> Path:
     def make(folder: Path) -> Path:
         out = folder / "run"
         options = ["--in-process", "--optimizer", optimizer, "--rollouts", "15", "--out", str(out)]
-        if optimizer == "gauss_newton":
-            options += [word for n, value in FEW_FITS.items() for word in ("--set", f"{n}={value}")]
+        if optimizer == "model_based":
+            options += [
+                word for n, value in FEW_STEPS.items() for word in ("--set", f"{n}={value}")
+            ]
         assert main(["train", str(SMALL), *options]) == 0
         return out
 

@@ -30,7 +30,7 @@ VISION = {
     ),
 }
 TOGETHER = [name for name in CONTROLLERS if name != "adapted"]
-"""Those of one figure of a reproduction; `adapted` is there as `gauss_newton`."""
+"""Those of one figure of a reproduction; `adapted` is there as `model_based`."""
 
 
 def linear(colour: str) -> np.ndarray:

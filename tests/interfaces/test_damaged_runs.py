@@ -19,7 +19,7 @@ from pdeloop.report.data import gather
 from tuner_node import checkpoint, training_state
 from tuner_node.run_folder import RunFolder, RunFolderError
 
-by_both = pytest.mark.parametrize("finished", ["two_point", "gauss_newton"], indirect=True)
+by_both = pytest.mark.parametrize("finished", ["two_point", "model_based"], indirect=True)
 
 
 def contents(good: bytes) -> Iterator[bytes]:

@@ -242,7 +242,7 @@ def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> No
         ({"optimizer": "model_based"}, True),
         ({"optimizer": "two_point", "identification": "field"}, True),
         ({"optimizer": "two_point"}, False),
-        ({"optimizer": "gauss_newton", "sensors": 8}, False),
+        ({"optimizer": "model_based", "sensors": 8}, False),
     ],
 )
 def test_what_the_fits_of_a_training_call_is_compiled_before_it(

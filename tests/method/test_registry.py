@@ -11,9 +11,9 @@ import pytest
 
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
-from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
+from loop_method.adapt import ModelBased, Optimizer, TwoPoint
 from loop_method.adapt.registry import offered, optimizer_kind
-from loop_method.adapt.settings import GaussNewtonSettings
+from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.settings import Settings, setting
 from pdeloop.problem_values import problem_values
 from tests.support.small import parameters, same_bits, train_here
@@ -59,14 +59,14 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_ours_are_offered_as_those_of_others_are() -> None:
-    assert optimizer_kind("gauss_newton") is GaussNewton
+    assert optimizer_kind("model_based") is ModelBased
     assert optimizer_kind("two_point") is TwoPoint
 
 
 def test_an_installed_package_offers_its_optimisers_by_name(installed: Path) -> None:
     assert optimizer_kind("halved").name == "halved"
     assert optimizer_kind("two_point") is TwoPoint, "no package takes a name of ours"
-    assert {"halved", "two_point", "gauss_newton"} <= set(offered())
+    assert {"halved", "two_point", "model_based"} <= set(offered())
     offer(installed, "second", "halved = foreign:Whole")
     with pytest.raises(ValueError, match="'halved' is offered by several installed packages"):
         optimizer_kind("halved")
@@ -77,8 +77,9 @@ def test_an_installed_package_offers_its_optimisers_by_name(installed: Path) -> 
     [
         (
             "adam",
-            "unknown optimizer 'adam': give one of gauss_newton, model_based, two_point, halved, .*",
+            "unknown optimizer 'adam': give one of model_based, two_point, halved, .*",
         ),
+        ("gauss_newton", "'gauss_newton' was removed: use model_based, .*or two_point"),
         ("lost", "'lost': foreign:Lost cannot be loaded: .*Lost"),
         ("number", "'number': 3 must be a class"),
         ("partial", "'partial': Partial does not define ask, tell, .*needs_trajectories"),
@@ -104,8 +105,6 @@ def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
     given = {"optimizer": "two_point", "identification": "regression"}
     assert training_parameters("burgers", given)["identification"] == "regression"
     assert training_parameters("burgers", {})["identification"] == "field"
-    none = {"optimizer": "gauss_newton"}
-    assert training_parameters("burgers", none)["identification"] == "regression"
 
 
 def test_few_sensors_get_an_estimate_of_the_field_unless_a_law_is_given() -> None:
@@ -117,7 +116,7 @@ def test_few_sensors_get_an_estimate_of_the_field_unless_a_law_is_given() -> Non
         {"sensor_delays": 4},  # a memory of another kind
         {"sensors": 128},  # every point
         {"law": "affine"},
-        {"optimizer": "gauss_newton"},  # which cannot improve it
+        {"optimizer": "two_point"},  # which cannot improve it
     ]
     for other in others:
         assert training_parameters("burgers", {**few, **other})["law"] == "affine", other
@@ -161,30 +160,30 @@ def test_a_file_that_identifies_from_readings_names_their_order(tmp_path: Path) 
 
 
 def test_settings_are_parameters_of_the_training() -> None:
-    chosen = {"optimizer": "gauss_newton"}
-    values = training_parameters("burgers", {**chosen, "optimizer_settings": {"fields": 5}})
-    assert values["optimizer_settings.fields"] == 5
-    assert settings_of(GaussNewton, values) == GaussNewtonSettings(fields=5)
-    assert build_training({**values, "rollouts": 13}).settings.step == 10
-    with pytest.raises(ParameterError, match=r"at least 13: .*10 for a step"):
-        build_training({**values, "rollouts": 12})
-    assert training_parameters("burgers", chosen)["optimizer_settings.fields"] == 3
+    chosen = {"optimizer": "model_based"}
+    values = training_parameters("burgers", {**chosen, "optimizer_settings": {"judging": 5}})
+    assert values["optimizer_settings.judging"] == 5
+    assert settings_of(ModelBased, values) == ModelBasedSettings(judging=5)
+    assert build_training({**values, "rollouts": 8}).settings.step == 6
+    with pytest.raises(ParameterError, match=r"at least 8: .*6 for a step"):
+        build_training({**values, "rollouts": 7})
+    assert training_parameters("burgers", chosen)["optimizer_settings.judging"] == 3
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"fields": 0}, "'optimizer_settings.fields' is 0; expected a whole number from 1 to"),
-        ({"fields": "many"}, "'optimizer_settings.fields' is 'many'; expected a whole number"),
+        ({"judging": 0}, "'optimizer_settings.judging' is 0; expected a whole number from 1 to"),
+        ({"judging": "many"}, "'optimizer_settings.judging' is 'many'; expected a whole number"),
         (
-            {"field": 2},
-            "'optimizer_settings.field' of the optimizer 'gauss_newton'; known: .*fields",
+            {"judgin": 2},
+            "'optimizer_settings.judgin' of the optimizer 'model_based'; known: .*judging",
         ),
     ],
 )
 def test_settings_are_checked_before_anything_runs(options, words) -> None:
     with pytest.raises(ParameterError, match=words):
-        training_parameters("burgers", {"optimizer": "gauss_newton", "optimizer_settings": options})
+        training_parameters("burgers", {"optimizer": "model_based", "optimizer_settings": options})
 
 
 def test_an_optimiser_without_settings_says_so() -> None:

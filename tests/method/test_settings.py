@@ -17,7 +17,7 @@ from loop_interfaces.spec import (
     OPTIMIZER_SETTINGS,
     ParameterError,
 )
-from loop_method.adapt import Context, GaussNewton, ModelBased, TwoPoint
+from loop_method.adapt import Context, ModelBased, TwoPoint
 from loop_method.adapt.base import Record
 from loop_method.adapt.belief import believe
 from loop_method.adapt.registry import OWN_OPTIMIZERS
@@ -32,7 +32,7 @@ from tests.support.small import SMALL
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
 
-OPTIMIZERS = (GaussNewton, ModelBased, TwoPoint)
+OPTIMIZERS = (ModelBased, TwoPoint)
 
 
 @dataclass(frozen=True, kw_only=True)

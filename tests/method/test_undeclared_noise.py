@@ -12,7 +12,7 @@ import scipy
 import pdeloop
 from controller_node.identification import Designed, DesignSettings, designed
 from loop_interfaces.model_rows import pack
-from loop_method.adapt import Context, Record, Trajectory, field_step, undeclared_noise
+from loop_method.adapt import Context, Record, Trajectory, undeclared_noise
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.models import Measured
@@ -24,7 +24,6 @@ from loop_method.models.undeclared_noise import fit_undeclared_noise
 from loop_method.models.whiteness import correlations, is_white
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
-from tests.support.lifted_plant import N_Z, Plant, make, measure
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import warnings
@@ -172,35 +171,6 @@ def test_noise_that_is_found_is_told_and_makes_no_first_law() -> None:
     assert right.field is not None and right.field.noise == 0.0 and right.field.rows is not None
 
 
-def test_gauss_newton_goes_on_with_the_noise_that_a_model_shows(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """From a checkpoint, too; until then a rollout counts as it was measured."""
-    plant, sigma = Plant(), 0.3
-    linear = LinearModel("linear", plant.U @ plant.A @ plant.U.T, plant.U @ plant.B, np.zeros(N_Z))
-    seen: list[float] = []
-
-    def believed(context: Context, *_: Any) -> tuple[Belief, float] | None:
-        seen.append(context.noise)
-        return None if context.noise else (Belief(linear, 0.1, 1), sigma)
-
-    monkeypatch.setattr(field_step, "believe", lambda *_: Belief(linear, 0.4, 1))
-    monkeypatch.setattr(field_step, "believe_in_noise", believed)
-    optimizer = make(plant, 0.6 * plant.best)
-    row = optimizer.tell(measure(plant, optimizer.ask()))
-    assert row["noise"] == optimizer.state()["noise"] == sigma
-    again = make(plant, 0.6 * plant.best)
-    again.restore(optimizer.state())
-    while not optimizer.done:
-        for each in (optimizer, again):
-            row = each.tell(measure(plant, each.ask()))
-            assert row["role"] == "judging" or row["noise"] == sigma
-        assert same_bits(optimizer.policy, again.policy)
-    assert again.done and seen[0] == 0.0 and set(seen[1:]) == {sigma}
-    with pytest.raises(ValueError, match="noise"):
-        again.restore({**optimizer.state(), "noise": np.array(-sigma)})
-
-
 QUICK = {
     **{"n_z": 96, "n_a": 6, "horizon": 20, "reduced_order": 8},
     **{"rollouts": 6, "evaluation_fields": 1},
@@ -259,7 +229,7 @@ def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> No
 def test_a_training_that_was_too_short_for_a_find_warns_of_readings_that_seem_noisy() -> None:
     sigma, given = (
         0.05,
-        {"optimizer": "gauss_newton", "optimizer_settings.fields": 1, "rollouts": 8},
+        {"optimizer": "model_based", "optimizer_settings.fields": 1, "rollouts": 8},
     )
     values, pair = with_noise(sigma, **given)
     training = build_training(values)

@@ -28,7 +28,7 @@ from pde_sim_node.plant import Instruments, Plant
 from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.real_time import Timing
 from pdeloop.in_process import LocalPair, train
-from tests.support.small import FEW_FITS, parameters, same_bits, train_here
+from tests.support.small import FEW_STEPS, parameters, same_bits, train_here
 from tuner_node.build import build_training
 
 GRID = {
@@ -233,7 +233,7 @@ def test_sensors_at_every_point_without_delay_are_the_full_state() -> None:
     a = run(sensed, [1, 2], [0, 0], 0.3)
     b = run(full, [1, 2], [0, 0], 0.3)
     assert same_bits(a, b)
-    for optimizer in ("two_point", "gauss_newton"):
+    for optimizer in ("two_point", "model_based"):
         options = {"optimizer": optimizer, "rollouts": 13}
         first = train_here(parameters(**options))
         second = train_here(parameters(**options, sensors=32, sensor_delays=1))
@@ -347,7 +347,7 @@ def test_rollouts_have_a_noise_of_their_own_and_the_evaluation_one_for_all_contr
     assert build_training(parameters()).next_batch().rows.shape == (1, 4)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("optimizer", ["two_point", "gauss_newton"])
+@pytest.mark.parametrize("optimizer", ["two_point", "model_based"])
 def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> None:
     options = {
         "measurement_noise": 0.05,
@@ -358,7 +358,7 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
         "optimizer": optimizer,
         "rollouts": 13,
         "horizon": 10,
-        **(FEW_FITS if optimizer == "gauss_newton" else {}),
+        **(FEW_STEPS if optimizer == "model_based" else {}),
     }
     both = train_here(parameters(seeds=2, **options), max_batch=3)
     alone = train_here(parameters(seed=1, **options))

@@ -12,6 +12,7 @@ import pdeloop
 from loop_interfaces.action_set import ActionSet
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.spec import ParameterError
+from loop_method.adapt import ModelBased
 from loop_method.design.finite_horizon import finite_horizon_of
 from loop_method.design.tracking import track_horizon
 from loop_method.laws.calls import laws_of
@@ -131,8 +132,12 @@ def test_a_moving_target_is_followed_by_default() -> None:
 
 
 def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
-    with pytest.raises(ParameterError, match="'gauss_newton' needs scalar weights"):
-        pdeloop.train(plant=Servo(), optimizer="gauss_newton", rollouts=20)
+    class OfWeights(ModelBased):
+        name = "of_weights"
+        any_cost = False
+
+    with pytest.raises(ParameterError, match="OfWeights' needs scalar weights"):
+        pdeloop.train(plant=Servo(), optimizer=OfWeights, rollouts=20)
 
 
 @pytest.mark.parametrize(

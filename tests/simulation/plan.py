@@ -81,7 +81,7 @@ class Plan:
 
     loss, duplicates, damage: probabilities that a message on a topic that is not reliable is lost,
     comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
-    the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
+    the clocks of the processes; iterations: of the two-point method, 0 for model_based, for which
     the tuner reads states and actions; pairs: of plant and controller; own_plant: instead of the small
     problem's one of a user's own; law: which the controller has, with the two-point method any; signs:
     whether it signs its actions.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
@@ -33,7 +33,7 @@ from loop_interfaces.topics import (
     TARGET,
     Topic,
 )
-from loop_method.adapt.proposer import Proposer
+from loop_method.adapt import ModelBased, RolloutResult
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Plant
@@ -41,7 +41,7 @@ from pde_sim_node.plants.loading import hand_over
 from pde_sim_node.real_time import Timing
 from tests.simulation.disk import Disk
 from tests.support.plants import Rods
-from tests.support.small import FEW_FITS, parameters
+from tests.support.small import FEW_STEPS, parameters
 from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.run_folder import RunIdentity
@@ -58,7 +58,7 @@ EVERY_PAIR = -1
 @cache
 def values(iterations: int, own_plant: bool, law: str = "affine") -> dict[str, Any]:
     """The parameters of the training: as few and as short episodes as have all of its phases."""
-    budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9, **FEW_FITS}
+    budget: dict[str, Any] = {"optimizer": "model_based", "rollouts": 9, **FEW_STEPS}
     if iterations:
         budget = {"optimizer": "two_point", "iterations": iterations}
     limits: dict[str, Any] = {
@@ -85,23 +85,28 @@ def remembering() -> Iterator[None]:
     Nearly all histories compute the same, and it is not what they are about.
     """
     own_design = identification.design
-    own_begin, own_propose = Proposer.__init__, Proposer.propose
-    begun: WeakKeyDictionary[Proposer, Any] = WeakKeyDictionary()
+    own_begin, own_tell = ModelBased.__init__, ModelBased.tell
+    begun: WeakKeyDictionary[ModelBased, Any] = WeakKeyDictionary()
 
     def design(*args: Any, **how: Any) -> Any:
         return _once(lambda: own_design(*args, **how), (args, how))
 
-    def begin(self: Proposer, *args: Any) -> None:
-        own_begin(self, *args)
-        begun[self] = args
+    def begin(self: ModelBased, *args: Any, **how: Any) -> None:
+        own_begin(self, *args, **how)
+        begun[self] = args, how
 
-    def propose(self: Proposer, *args: Any, **how: Any) -> Any:
-        return _once(lambda: own_propose(self, *args, **how), (begun[self], args, how))
+    def tell(self: ModelBased, results: Sequence[RolloutResult]) -> Any:
+        def told() -> Any:
+            return own_tell(self, results), self.state()
+
+        row, state = _once(told, (begun[self], self.state(), results))
+        self.restore(state)
+        return row
 
     with (
         mock.patch.object(identification, "design", design),
-        mock.patch.object(Proposer, "__init__", begin),
-        mock.patch.object(Proposer, "propose", propose),
+        mock.patch.object(ModelBased, "__init__", begin),
+        mock.patch.object(ModelBased, "tell", tell),
     ):
         yield
 

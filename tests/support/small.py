@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from loop_method.adapt import ModelBased
+from loop_method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
@@ -28,6 +30,20 @@ FEW_FITS = {
     "field_model_settings.sensed_last_iterations": 1,
 }
 """For trainings whose model does not matter: fits of all kinds would be most of their time."""
+FEW_STEPS = {"optimizer_settings.iterations": 3, "optimizer_settings.mixtures": 2, **FEW_FITS}
+"""For trainings by `model_based` whose law does not matter either."""
+CHECKED = "tests.support.small:Checked"
+
+
+class Checked(ModelBased):
+    """`model_based` for a first law that the training checks, as it does for most optimisers."""
+
+    name = "checked"
+    judges_first_law = False
+    explorations = 1
+
+
+OWN_OPTIMIZERS.allow(CHECKED)
 
 
 def paced(folder: Path, factor: float) -> Path:

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from pdeloop.study.results import reading
-from tests.support.small import FEW_FITS, SMALL
+from tests.support.small import FEW_STEPS, SMALL
 
 LIMIT = 300.0
 CONTENT: dict[str, Any] = {
     "problems": [str(SMALL)],
     "seeds": 2,
     "settings": {"rollouts": 9},
-    "variants": {"gauss-newton": {"optimizer": "gauss_newton", **FEW_FITS}, "two-point": {}},
+    "variants": {"model-based": {"optimizer": "model_based", **FEW_STEPS}, "two-point": {}},
 }
 
 

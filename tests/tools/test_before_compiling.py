@@ -37,7 +37,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     [
         (("train", "stokes"), "unknown problem 'stokes'"),
         ((*TRAIN, "--rollouts", "3"), "'rollouts' is 3; expected at least 5"),
-        ((*TRAIN, "--optimizer", "gauss-newton", "--iterations", "3"), "does not count iterations"),
+        ((*TRAIN, "--optimizer", "model-based", "--iterations", "3"), "does not count iterations"),
         ((*TRAIN, "--reduced-order", "0", "--seeds", "2"), "give --reduced-order N"),
         ((*TRAIN, "--reduced-order", "33"), "needs at least 36 steps, but there are 30"),
         ((*TRAIN, "--reduced-order", "30", "--identification", "dmdc"), "p must be at most"),

@@ -58,8 +58,8 @@ def test_any_parameter_can_be_set_and_is_recorded(tmp_path) -> None:
             "is code, which is not run merely because a file names it",
         ),
         (
-            ("--optimizer", "gauss-newton", "--set", "optimizer_settings.feilds=2"),
-            "unknown parameter 'optimizer_settings.feilds' of the optimizer 'gauss_newton'",
+            ("--optimizer", "model-based", "--set", "optimizer_settings.juding=2"),
+            "unknown parameter 'optimizer_settings.juding' of the optimizer 'model_based'",
         ),
     ],
 )

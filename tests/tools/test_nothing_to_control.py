@@ -25,7 +25,7 @@ class Resting(pdeloop.Dynamics):
 """
 
 
-@pytest.mark.parametrize("optimizer", ["gauss_newton", "two_point"])
+@pytest.mark.parametrize("optimizer", ["model_based", "two_point"])
 def test_a_training_with_nothing_to_control_says_so_and_can_be_shown(
     optimizer: str, tmp_path: Path, capsys: Any, undrawn: None
 ) -> None:

@@ -25,7 +25,6 @@ from pdeloop.problem_check import check
 from pdeloop.training_run import resolve
 from tests.support.small import SMALL, parameters
 from tuner_node.batch import Batch
-from tuner_node.build import compares_first_law
 
 
 def named(**changes: Any) -> dict[str, tuple[bool, str]]:
@@ -218,9 +217,6 @@ def test_a_first_law_that_need_not_be_begun_with_is_not_bad() -> None:
     assert judged(9.0, 99.0, compared=True)[0] and judged(9.0, 1.0, compared=True) == (True, "")
     assert judged(9.0, 9.1, compared=True)[0] and not judged(9.0, 9.1)[0]
     assert not judged(np.inf, np.inf, compared=True)[0]
-    delayed = {"sensors": 8, "sensor_delays": 32, "optimizer": "gauss_newton"}
-    assert compares_first_law(resolve("allen-cahn", delayed))
-    assert not compares_first_law(resolve("allen-cahn", {"optimizer": "gauss_newton"}))
     values = resolve("kdv", {"sensors": 8})
     good, text = next((f.good, f.text) for f in check(values) if f.name == "first law")
     assert good and "does not help; the adaptation compares it" in text

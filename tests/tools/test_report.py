@@ -17,12 +17,10 @@ from matplotlib.image import imread
 
 from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.report.data import gather
-from pdeloop.report.learning import EDGE, steps
 from tests.support.browser import browser
 from tests.support.loop_harness import processes
 from tests.support.made_once import made_once
-from tests.support.small import FEW_FITS, SMALL
-from tests.support.small_study import contents
+from tests.support.small import FEW_STEPS, SMALL
 
 LIMIT = 300.0
 FIGURES = (
@@ -32,7 +30,6 @@ FIGURES = (
     "small-gains",
     "small-orders",
     "small-spectrum",
-    "small-steps",
 )
 
 
@@ -49,8 +46,8 @@ def reported(base: Path, reproduced: Path | None) -> Path:
     out = reproduced or base / "out"
     with processes(base) as running:
         if not reproduced:
-            few = [word for n, value in FEW_FITS.items() for word in ("--set", f"{n}={value}")]
-            options = ("--in-process", "--rollouts", "21", "--optimizer", "gauss_newton", *few)
+            few = [word for n, value in FEW_STEPS.items() for word in ("--set", f"{n}={value}")]
+            options = ("--in-process", "--rollouts", "21", "--optimizer", "model_based", *few)
             words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
             running.wait(running.pdeloop(*words), LIMIT)
         running.wait(running.pdeloop("report", str(out)), LIMIT)
@@ -62,7 +59,7 @@ def is_run(folder: Path) -> bool:
 
 
 def controllers_of(folder: Path) -> tuple[str, ...]:
-    return ("adapted",) if is_run(folder) else ("lqt_po", "pure_po", "gauss_newton")
+    return ("adapted",) if is_run(folder) else ("lqt_po", "pure_po", "model_based")
 
 
 @pytest.fixture(scope="module")
@@ -97,39 +94,6 @@ def test_a_controller_has_the_same_colour_in_every_figure(folder):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()
         for controller in ("none", "lqt", *controllers_of(folder)):
             assert CONTROLLERS[controller].colour in svg, (name, controller)
-
-
-def test_steps_damping_and_model_error_are_those_of_the_history(folder):
-    """What the figure draws against result.json; the paper's optimiser has no such figure."""
-    problem = gather(folder).problems[0]
-    name = controllers_of(folder)[-1]
-    if is_run(folder):
-        result = (folder / "result.json").read_bytes()
-    else:
-        result = contents(folder)[f"small/{name}/{problem.shown}/result.json"]
-    history = json.loads(result)["history"]
-    before = problem.runs[name].before[problem.shown]
-    own = [row for row in history if row["seed"] == problem.shown]
-    proposed = [row for row in own if "mismatch" in row]
-    top, middle, bottom = steps(problem.history(name), "red").axes
-    drawn = {line.get_label(): line.get_xydata() for line in top.lines}
-    for label, accepted in (("accepted", True), ("rejected", False)):
-        decided = [row for row in own if row.get("accepted") is accepted]
-        assert decided or label not in drawn
-        if not decided:
-            continue
-        assert drawn[label][:, 0].tolist() == [row["rollouts"] - before for row in decided]
-        costs = [min(row.get("relative_cost", EDGE), EDGE) for row in decided]
-        assert drawn[label][:, 1].tolist() == costs
-    assert len(drawn["accepted"]) and (drawn["accepted"][:, 1] < 1).all()
-    assert (drawn["predicted"][:, 1] < 1).all() and (middle.lines[0].get_ydata() > 0).all()
-    assert bottom.lines[0].get_ydata().tolist() == [row["mismatch"] for row in proposed]
-    fine = [
-        {**row, "mismatch": 1e-7 * row["mismatch"]} if "mismatch" in row else row
-        for row in problem.history(name)
-    ]
-    least = 1e-7 * min(row["mismatch"] for row in proposed)
-    assert steps(fine, "red").axes[2].get_ylim()[0] < least  # a good model is shown, too
 
 
 def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):
@@ -169,7 +133,7 @@ def test_the_page_says_what_it_reports(folder, tab):
     )
     if is_run(folder):
         assert facts["Command"] == f"pdeloop train {folder}/parameters.yaml"
-        assert facts["Controller"] == "adapted: gauss-newton, started from the LQT gains"
+        assert facts["Controller"] == "adapted: model-based, started from the LQT gains"
     else:
         assert facts["Command"] == f"pdeloop study {folder}/study.json"
         assert "pure PO: two-point, started from zero gains" in controllers
@@ -313,7 +277,7 @@ def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
     assert "Not shown." in page and "of the run was not the built-in one" in page
     assert "<img src=x" not in page and "&lt;img src=x" in page  # shown, not run
     drawn = {path.stem for path in (own / "report").glob("*.png")}
-    assert drawn == {"training-curves", "costs", "small-steps"}
+    assert drawn == {"training-curves", "costs"}
 
 
 def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path, undrawn):

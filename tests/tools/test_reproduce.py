@@ -44,12 +44,12 @@ def test_what_costs_no_less_than_no_control_is_named():
 
 def test_every_number_is_that_of_the_trainings(reproduction):
     out, text = reproduction
-    for words in ("below LQT", "LQT-PO", "pure PO", "Gauss-Newton", "bootstrap"):
+    for words in ("below LQT", "LQT-PO", "pure PO", "model-based", "bootstrap"):
         assert words in text, words
     study = reproduction_in(out)
     runs, files = runs_of(study, out, "small"), contents(out)
     for name, how in LEARNED.items():
-        budget = {"rollouts": 16} if how["optimizer"] == "gauss_newton" else {"iterations": 8}
+        budget = {"rollouts": 16} if how["optimizer"] == "model_based" else {"iterations": 8}
         training = train_here(parameters(seeds=2, identification="dmdc", **how, **budget))
         for seed in range(2):
             with np.load(BytesIO(files[f"small/{name}/{seed}/curve.npz"])) as curve:
@@ -79,7 +79,7 @@ def test_every_number_is_that_of_the_trainings(reproduction):
 def test_the_curve_is_the_cost_of_each_policy(reproduction):
     out, _ = reproduction
     values, files = parameters(), contents(out)
-    for name in ("lqt_po", "gauss_newton"):
+    for name in ("lqt_po", "model_based"):
         kept = (BytesIO(files[f"small/{name}/1/{file}.npz"]) for file in ("curve", "policy"))
         with np.load(next(kept)) as curve, np.load(next(kept)) as final:
             pair = LocalPair(values)

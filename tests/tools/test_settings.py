@@ -174,8 +174,8 @@ def test_train_refuses_what_would_change_nothing(
         {"bag": "x"},
         {"view_rate": 3.0},
         {"real_time_factor": 1.0},
-        {"optimizer": "gauss_newton", "learning_rate": 0.1, "rollouts": 20},
-        {"optimizer": "gauss_newton", "smoothing_radius": 0.1, "rollouts": 20},
+        {"optimizer": "model_based", "learning_rate": 0.1, "rollouts": 20},
+        {"optimizer": "model_based", "smoothing_radius": 0.1, "rollouts": 20},
     ],
 )
 def test_the_python_interface_refuses_what_would_change_nothing(

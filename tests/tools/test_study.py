@@ -35,7 +35,7 @@ def test_every_training_of_a_study_is_an_ordinary_run_with_the_bits_of_train(ref
     assert len(trainings) == 4 and set(contents(reference)) == {
         f"{name}/{file}" for name in trainings for file in FILES
     }
-    name = "small/gauss-newton/1"
+    name = "small/model-based/1"
     alone = train_here(trainings[name])
     with np.load(BytesIO(contents(reference)[f"{name}/policy.npz"])) as kept:
         assert same_bits(kept["policy"], alone.policies())
@@ -44,7 +44,7 @@ def test_every_training_of_a_study_is_an_ordinary_run_with_the_bits_of_train(ref
 def test_the_table_is_that_of_the_runs(reference: Path):
     table = rows(Study.of(CONTENT), reference)
     assert [(row["variant"], row["seeds"], row["rollouts"]) for row in table] == [
-        ("gauss-newton", 2, 9.0),
+        ("model-based", 2, 9.0),
         ("two-point", 2, 9.0),
     ]
     files = contents(reference)
@@ -187,7 +187,7 @@ def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any
     with pytest.raises(StudyError, match=sentence):
         Study.of({**CONTENT, **change})
     with pytest.raises(
-        StudyError, match=r"small, variant 'gauss-newton': parameter 'rollouts' is -1"
+        StudyError, match=r"small, variant 'model-based': parameter 'rollouts' is -1"
     ):
         Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
 
@@ -339,9 +339,9 @@ def test_exchanged_and_copied_results_are_refused(reference: Path, tmp_path: Pat
     (one / "c").rename(b)
     with pytest.raises(StudyError, match=r"small/two-point/0 .*seed: 1 there, 0 now.*and 1 more"):
         run(study, one, here)
-    shutil.rmtree(two / "small/gauss-newton/1")
-    shutil.copytree(two / "small/gauss-newton/0", two / "small/gauss-newton/1")
-    with pytest.raises(StudyError, match=r"small/gauss-newton/1 .*seed: 0 there, 1 now"):
+    shutil.rmtree(two / "small/model-based/1")
+    shutil.copytree(two / "small/model-based/0", two / "small/model-based/1")
+    with pytest.raises(StudyError, match=r"small/model-based/1 .*seed: 0 there, 1 now"):
         run(study, two, here)
 
 

@@ -153,7 +153,7 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
             ("pdeloop train zzz" + "-ow" * (shell == "fish"), "pdeloop train zzz-own.yaml "),
             ("pdeloop bag ver", "pdeloop bag verify "),
             ("pdeloop bag ver", "pdeloop bag verify "),
-            ("pdeloop train --optimizer gauss", "--optimizer gauss_newton "),
+            ("pdeloop train --optimizer model", "--optimizer model_based "),
             ("pdeloop evaluate ru", "pdeloop evaluate runs/"),
         ):
             shown.type(typed + "\t")

@@ -10,18 +10,18 @@ import pytest
 
 from pdeloop.bags.verify import verify
 from tests.support.loop_harness import Processes
-from tests.support.small import FEW_FITS, SMALL, parameters, train_here
+from tests.support.small import FEW_STEPS, SMALL, parameters, train_here
 from tests.support.small_loop import LIMIT, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
 POSITIONS = [0.05, 0.2, 0.45, 0.9]
-OPTIONS = {"rollouts": 15, "optimizer": "gauss_newton", **FEW_FITS}
+OPTIONS = {"rollouts": 15, "optimizer": "model_based", **FEW_STEPS}
 
 
 def test_a_training_by_the_command_line_is_recorded_and_recomputed(loop: Processes, tmp_path):
     out = tmp_path / "run"
-    words = ["train", str(SMALL), "--rollouts", "15", "--optimizer", "gauss-newton", "--record"]
-    words += [word for name, value in FEW_FITS.items() for word in ("--set", f"{name}={value}")]
+    words = ["train", str(SMALL), "--rollouts", "15", "--optimizer", "model-based", "--record"]
+    words += [word for name, value in FEW_STEPS.items() for word in ("--set", f"{name}={value}")]
     words += ["--actuator-positions", ",".join(map(str, POSITIONS)), "--actuator-shape", "gaussian"]
     loop.wait(loop.pdeloop(*words, "--out", str(out)), LIMIT)
     placed = {"actuator_positions": POSITIONS, "actuator_shape": "gaussian"}

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Gauss-Newton with noise, action limits and sensors over topics: the training of one process."""
+"""`model_based` with noise, action limits and sensors over topics: the training of one process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from pdeloop.bags.verify import verify
 from tests.support.loop_harness import Processes, until
-from tests.support.small import FEW_FITS, SMALL, parameters, train_here
+from tests.support.small import FEW_STEPS, SMALL, parameters, train_here
 from tests.support.small_loop import LIMIT, PARAMETERS, adapted, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
@@ -22,12 +22,12 @@ OWN: dict[str, Any] = {
     "action_bounds": [-0.3, -1.0, 1.0, 0.5, 0.0],
     "sensors": 6,
     "sensor_delays": 1,
-    # A problem so small that a step of Gauss-Newton takes no time.
+    # A problem so small that an update takes no time.
     "n_z": 16,
     "n_a": 2,
     "horizon": HORIZON,
     "reduced_order": 3,
-    **FEW_FITS,
+    **FEW_STEPS,
 }
 WORDS = [word for name, value in OWN.items() for word in ("-p", f"{name}:={value}")]
 
@@ -39,7 +39,7 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
     loop.start("-m", "tests.support.relay.node", "--ros-args", *line, name="relay")
-    options = {"rollouts": 20, "optimizer": "gauss_newton"}
+    options = {"rollouts": 20, "optimizer": "model_based"}
     tuner = start_tuner(loop, out, *WORDS, **options, max_attempts=50)
     for count, victim in ((3, "controller_node"), (6, "pde_sim_node")):
         until(lambda least=count: adapted(out) >= least, LIMIT, f"batch {count}")
@@ -58,11 +58,11 @@ def test_a_recorded_run_is_recomputed_with_its_noise(loop: Processes, tmp_path):
     small = [x for x in SMALL.read_text().splitlines() if x.strip().split(":")[0] not in OWN]
     own.write_text("\n".join([*small, *(f"    {name}: {value}" for name, value in OWN.items())]))
     out = tmp_path / "run"
-    words = ("train", str(own), "--rollouts", "12", "--record", "--optimizer", "gauss_newton")
+    words = ("train", str(own), "--rollouts", "12", "--record", "--optimizer", "model_based")
     loop.wait(loop.pdeloop(*words, "--out", str(out)), LIMIT)
     report = verify(out)
     assert (report.count, report.incomplete, report.notes) == (0, [], [])
     assert report.compared["steps"] == HORIZON * report.compared["costs"]
     assert report.compared["policies"] >= 11  # all but the exploration
-    values = parameters(rollouts=12, optimizer="gauss_newton", **OWN)
+    values = parameters(rollouts=12, optimizer="model_based", **OWN)
     assert_same_training(out, train_here(values))

@@ -49,7 +49,7 @@ def plant_of(folder: Path) -> object:
     ("name", "given", "optimizer"),
     [
         (LINEAR, {"radius": 0.9}, "two_point"),
-        (PLATE, {"nx": 6, "ny": 4}, "gauss_newton"),
+        (PLATE, {"nx": 6, "ny": 4}, "model_based"),
         (PENDULUM, {"horizon": 20}, "model_based"),
         (f"{PLANTS}/plate_skfem.py:Plate", {"refinements": 1}, "two_point"),
         solver("pde", "swift_hohenberg_pypde.py:SwiftHohenberg", {"points": 6}),
@@ -70,7 +70,7 @@ def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorde
     problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given, **few}}}))
     out, here = tmp_path / "run", tmp_path / "here"
     budget = {**BUDGET, "optimizer": optimizer}
-    if optimizer == "gauss_newton":  # its last rollouts compare laws: with 9 no step is confirmed
+    if optimizer == "model_based":  # its last rollouts compare laws: with 9 no step is confirmed
         budget["rollouts"] = 12
     words = [str(problem), "--plant", name, *flags(budget)]
     loop.wait(loop.pdeloop("train", *words, "--record", "--out", str(out)), LIMIT)

@@ -58,7 +58,7 @@ def test_the_policy_allows_each_running_node_what_it_does_and_no_more(loop: Proc
         "pde_sim_node": ["-p", "real_time_factor:=10.0"],  # the graph is the same at any speed
         "recorder_node": ["-p", "bag:=recorded"],
         # With more rollouts than there is time for: a tuner that has finished is no part of the graph.
-        "tuner_node": ["-p", "optimizer:=gauss_newton", "-p", "rollouts:=100000"],
+        "tuner_node": ["-p", "optimizer:=model_based", "-p", "rollouts:=100000"],
     }
     expected = {}
     for profile in POLICY.iter("profile"):

@@ -21,5 +21,5 @@ def test_random_faults_change_no_bit(tmp_path: Path):
     assert report.mismatches == 0, told
     assert report.trainings >= 1, told
     assert report.faults.total() == 4, told
-    # The shortest of the trainings takes at least one step of Gauss-Newton, of 6 rollouts.
+    # The shortest of the trainings takes at least one step of model_based, of 4 rollouts.
     assert report.rollouts >= report.trainings * 6, told

@@ -21,7 +21,7 @@ def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Proces
     plant = start_pair(loop, real_time_factor=20.0)["plant"]  # so that the stranger keeps up
     stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
     until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
-    options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2, **FEW_FITS}
+    options = {"rollouts": ROLLOUTS, "optimizer": "model_based", "seeds": 2, **FEW_FITS}
     loop.wait(start_tuner(loop, out, **options, max_attempts=50), LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
     until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")

@@ -32,7 +32,7 @@ def field(seed: int, rows: int = 1) -> np.ndarray:
 def training_of(states: np.ndarray, declared: float = 0.0, **settings: Any) -> Training:
     """A training that has measured these states."""
     known = {"n_z": states.shape[1], "measurement_noise": declared, "rollouts": 12}
-    training = build_training(parameters(optimizer="gauss_newton", **{**known, **settings}))
+    training = build_training(parameters(optimizer="model_based", **{**known, **settings}))
     training.explorations = [Trajectory(states, np.zeros((L - 1, 2)))]
     training.target = np.zeros(states.shape[1])
     return training
@@ -79,7 +79,7 @@ def test_have_no_noise_where_a_model_predicts_them_better_than_that() -> None:
     for error, seeming in ((2.0 * share, 0.05), (0.1 * share, 0.0)):
         training.history = [{**row, "mismatch": error}]
         assert seeming_noise(training, 0) == pytest.approx(seeming, rel=0.1)
-    training.history = [{**row, "model": "local", "mismatch": 0.1 * share}]
+    training.history = [{**row, "model": "sensed", "mismatch": 0.1 * share}]
     assert seeming_noise(training, 0) == pytest.approx(0.05, rel=0.1)  # of another quantity
     training.history = [{**row, "mismatch": 0.1, "noise": 0.05}]
     assert seeming_noise(training, 0) == 0.0  # it was found, and is told as such

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from pdeloop.in_process import LocalPair
-from tests.support.small import parameters
+from tests.support.small import CHECKED, FEW_STEPS, parameters
 from tuner_node.build import build_training
 from tuner_node.training_state import Arrays, arrays_of, restore
 
 KINDS: dict[str, dict[str, Any]] = {
     "two_point": {"iterations": 2},
-    "gauss_newton": {"rollouts": 9},
+    CHECKED: {"rollouts": 9, **FEW_STEPS},
 }
 
 
@@ -96,9 +96,9 @@ def test_every_state_of_a_training_of_one_seed_that_explores_twice_comes_back() 
         ("two_point", "identify", {"steps": np.array(2**62)}, "number of steps"),
         ("two_point", "check", {"models": np.full((2, 33, 4), 1e200)}, "products are infinite"),
         ("two_point", "adapt", {"optimizer0.tells": np.array(-1)}, "does not fit"),
-        ("gauss_newton", "adapt", {"target": None}, "no target"),
-        ("gauss_newton", "check", {"exploration1": None}, "not all explorations"),
-        ("gauss_newton", "adapt", {"target": np.zeros(15)}, "'target'"),
+        (CHECKED, "adapt", {"target": None}, "no target"),
+        (CHECKED, "check", {"exploration1": None}, "not all explorations"),
+        (CHECKED, "adapt", {"target": np.zeros(15)}, "'target'"),
     ],
 )
 def test_a_state_in_which_no_training_can_be_is_refused_and_nothing_is_changed(
