@@ -33,7 +33,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
 from loop_method.adapt.belief import Belief
 from loop_method.adapt.estimate import mean_of
-from loop_method.adapt.renewal import choose_fraction, left_out_costs
+from loop_method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
 from loop_method.models import affine_law
@@ -222,7 +222,7 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
     none, first = loop.no_control, loop.theta(training.starts()[0])
     base = first if state["safe"] else none
     improved, *parts = np.asarray(state["laws"], dtype=float)
-    count = ModelBasedSettings().fractions
+    count = FRACTIONS
     laws = [none, first, *(base + i / count * (improved - base) for i in range(count + 1))]
     returned = loop.theta(optimizer.policy)
 

@@ -282,7 +282,6 @@ def designed(
             every,
             order=settings.reduced_order,
             channels=channels,
-            settings=settings.method,
             constant=constant and regression.needs_constant(every, target.size),
         )
         return Designed(

@@ -27,6 +27,11 @@ from loop_method.models.prediction import errors, pieces
 from loop_method.models.readings import ReadingsModel, fit_readings
 from loop_method.models.sensed import SensedModel
 
+_PIECES = 8
+"""Pieces of a rollout that a model of a chaotic plant must predict."""
+_CHAOTIC_GROWTH = 20.0
+"""Minimum ratio of the errors on whole rollouts and on pieces."""
+
 _MODEL = "model."
 
 
@@ -163,15 +168,15 @@ def also_in_pieces(
     of_readings = bool(context.sensors) and isinstance(context.law, Observer)
     if whole.error <= most or of_readings:
         return whole
-    most = min(most, whole.error / settings.chaotic_growth)
+    most = min(most, whole.error / _CHAOTIC_GROWTH)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
-    parts = [part for rollout in rollouts for part in pieces(rollout, settings.pieces)]
+    parts = [part for rollout in rollouts for part in pieces(rollout, _PIECES)]
     # What it was fitted to is predicted better than what it was not, and takes no other fit.
     worst = context.field_models.worst
     known = errors(whole.model, parts, context.target, worst, context.noise)
     if not (len(known) and known.mean() <= most):
         return whole
-    found = believe(context, records, whole.model.kind, settings.pieces)
+    found = believe(context, records, whole.model.kind, _PIECES)
     return replace(found, whole=False) if found and found.error <= most else whole
 
 

@@ -28,6 +28,13 @@ from loop_method.models.sensed import WAVES, SensedModel, coefficients_of
 from loop_method.models.sensed_filter import SensedFilter
 from loop_method.models.settings import FieldModelSettings
 
+FILTER_MODES = 24
+"""Modes of the field that the law extended_kalman feeds back."""
+FILTER_INFLATION = 1.0
+"""Factor by which the standard deviations of its estimate grow in every step."""
+_FILTER_SEEN = 0.2
+"""Noise, as a share of the size of a field, for which one of its laws is optimised."""
+
 INDEPENDENT = (0.3, 1.0)
 """Shares of the standard deviation of each wave that initial fields are assumed to have besides the
 covariance of those that were estimated; each makes a filter."""
@@ -50,17 +57,17 @@ def estimated_laws(
     """
     model = loop.model
     assert isinstance(model, SensedModel)
-    whole = whole_field_law(loop, fields, weights, settings, settings.filter_modes)
+    whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
     if whole is None:
         return [], np.empty((0, 0)), 0
     size = root_mean_square(model.spread)
     noise = noise_of_filter(model, settings)
     filters = [
-        SensedFilter(model, *prior(fields, weights, share), noise, settings.filter_inflation)
+        SensedFilter(model, *prior(fields, weights, share), noise, FILTER_INFLATION)
         for share in INDEPENDENT
     ]
     found, theta, steps = [], whole.theta, whole.steps
-    for share in (0.0, settings.filter_seen):
+    for share in (0.0, _FILTER_SEEN):
         seen = replace(whole.loop, noise=share * size)
         if share:
             better = improve(seen, theta, fields, weights, curvature_of(seen), settings)
@@ -99,7 +106,7 @@ def least_trusting(
     most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
         noise = noise_of_filter(model, settings, times)
-        other = law.vector(parts | {"noise": np.array([noise, settings.filter_inflation])})
+        other = law.vector(parts | {"noise": np.array([noise, FILTER_INFLATION])})
         if loop.costs(other, fields)[known].mean() <= most:
             return other
     return best

@@ -27,6 +27,15 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.settings import ImprovementSettings
 from loop_method.design.finite_horizon import action_curvature
 
+_MEMORY = 40
+"""Gradient differences that L-BFGS keeps."""
+_WINDOW = 5
+"""L-BFGS steps that together must reach `least_gain`."""
+_ISOTROPY = 1e-3
+"""Share of the identity in the second moment of [s; 1] that scales the gains."""
+_HALVINGS = 12
+"""Maximum number of halvings of a law until the model's fields are finite."""
+
 FAR = 10.0
 """The cost of a law without a finite one, per cost of the law to begin with."""
 LARGEST = 512
@@ -106,7 +115,7 @@ def improve(
         Weight of the added cost |x - x_0|^2, with x_0 the initial law: for a linear plant the step is
         1/(1 + trust) of the whole one.
     """
-    for _ in range(settings.halvings + 1):
+    for _ in range(_HALVINGS + 1):
         simulation = loop.simulate(theta, fields)
         finite = np.isfinite(simulation.costs) & (weights > 0.0)
         if finite.any():
@@ -122,7 +131,7 @@ def improve(
         return None
     # s and the constants each in its own unit.
     units = np.append(np.full(count, size), np.full(loop.constants, 1.0 / loop.constants))
-    moment[np.diag_indices(len(moment))] += settings.isotropy * units
+    moment[np.diag_indices(len(moment))] += _ISOTROPY * units
     gain = settings.least_gain if least_gain is None else least_gain
     return _descend(
         loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain, trust
@@ -166,8 +175,8 @@ def _descend(
 
     def stop_when_flat(_: Array) -> None:
         values.append(least / before)
-        earlier = values[max(len(values) - 1 - settings.window, 0)]
-        few = len(values) <= settings.window
+        earlier = values[max(len(values) - 1 - _WINDOW, 0)]
+        few = len(values) <= _WINDOW
         if not few and earlier - values[-1] <= least_gain * values[-1]:
             raise StopIteration
 
@@ -179,7 +188,7 @@ def _descend(
         callback=stop_when_flat,
         options={
             "maxiter": settings.iterations,
-            "maxcor": settings.memory,
+            "maxcor": _MEMORY,
             "ftol": 0.0,
             "gtol": 0.0,
         },

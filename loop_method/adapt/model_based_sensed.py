@@ -38,7 +38,7 @@ from loop_method.adapt.observer_design import compensators
 from loop_method.adapt.progress import JUDGING, RENEWING
 from loop_method.adapt.replay import FEWEST
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
-from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.settings import MEASURED_SHARE, ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -53,6 +53,16 @@ from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.models.sensed import SensedModel
 from loop_method.models.sensed_ensemble import SensedEnsemble, ensemble
 from loop_method.models.sensed_unknowns import unknowns
+from loop_method.models.settings import SENSED_REPRODUCED
+
+_ATTEMPTS = 5
+"""Maximum number of times that an equation is looked for in vain."""
+_OBSERVER_GAIN = 3e-4
+"""As `least_gain`, for the last improvement of the law observer."""
+_OBSERVER_DRAWS = 2
+"""Sets of drawn initial fields, each of at most `mixtures`, for a law between few sensors."""
+_FILTER_DRAWS = 4
+"""Sets of drawn initial fields, each of at most mixtures, for such a law."""
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
 OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
@@ -104,7 +114,7 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _attempts_left(self, own: int) -> bool:
         """True if an equation is looked for after so many own rollouts."""
-        return own // self._settings.judging < self._context.field_models.sensed_attempts
+        return own // self._settings.judging < _ATTEMPTS
 
     def _believe(self) -> Belief | None:
         """In an equation where one reproduces the readings, else in a model of the readings.
@@ -124,7 +134,7 @@ class ModelBasedSensed(ModelBasedReadings):
             return super()._fields()
         loop = sensed_loop(self._context, self._sensed)
         found = [loop.smoothed(record) for record in self._data()]
-        most = self._context.field_models.sensed_reproduced
+        most = SENSED_REPRODUCED
         good = [field for field, error in found if error <= most]
         return np.stack(good or [field for field, _ in found])
 
@@ -137,9 +147,9 @@ class ModelBasedSensed(ModelBasedReadings):
         plants = replace(loop, model=self._plants(belief.model))
         progress, settings, law = self._progress, self._settings, self._context.law
         # A law with memory has many parameters, and simulations cost no rollout.
-        sets = settings.observer_draws if final else 1
+        sets = _OBSERVER_DRAWS if final else 1
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
-        every, weights = weighted(fields, drawn, settings.measured_share)
+        every, weights = weighted(fields, drawn, MEASURED_SHARE)
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
@@ -193,8 +203,8 @@ class ModelBasedSensed(ModelBasedReadings):
         assert isinstance(plants.model, SensedEnsemble)
         if len(plants.model.members) < 2:
             return [], 0
-        drawn = self._drawn(fields, settings.filter_draws, 2)
-        many = weighted(fields, drawn, settings.measured_share)
+        drawn = self._drawn(fields, _FILTER_DRAWS, 2)
+        many = weighted(fields, drawn, MEASURED_SHARE)
         best = cheapest(plants, laws, *designed_from)
         best = least_trusting(plants, law, best, designed_from[0], settings)
         best, steps = improve_through_filter(plants, law, best, modes, *many, settings)
@@ -305,7 +315,7 @@ def _observers(
     """The cheapest law with an observer to begin with, the one after a descent, and its steps."""
     longer = settings
     if final:
-        iterations, gain = settings.observer_iterations, settings.observer_gain
+        iterations, gain = settings.observer_iterations, _OBSERVER_GAIN
         longer = replace(settings, iterations=iterations, least_gain=gain)
     laws = [now]
     whole = whole_field_law(loop, fields, weights, settings, len(loop.law.model.A))

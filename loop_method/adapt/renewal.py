@@ -29,7 +29,16 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO, Estimate, mean_change
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import measured_states, mixtures, weighted
-from loop_method.adapt.settings import ImprovementSettings
+from loop_method.adapt.settings import MEASURED_SHARE, ImprovementSettings
+
+FRACTIONS = 4
+"""Equal steps from the first law to the improved one, among which one is chosen."""
+_CHAOTIC_MOST = 96
+"""Measured states of a chaotic plant if the gain from fewer is not clear on the others."""
+_CHAOTIC_CLEAR = 10.0
+"""Multiple of the standard errors of the verdict at which such a gain is clear."""
+_CHAOTIC_CONFIRMED = 0.8
+"""Share of its own gain that a law must reach on other states for few to suffice."""
 
 _Descent: TypeAlias = Callable[[Sequence[Array], Array, int], tuple[Array, int] | None]
 
@@ -178,14 +187,14 @@ def renew_from_states(
     records: all rollouts, denoised.
     """
     settings, found = replace(settings, mixtures=0, most_mixtures=0), None
-    for count in (settings.chaotic_fields, settings.chaotic_most):
+    for count in (settings.chaotic_fields, _CHAOTIC_MOST):
         fields = measured_states(records, count)
         # Others than last time, so that the laws of the parts may know those of their own part.
         found = renew(loop, first, improved, [], fields, rng, settings, final=final)
-        if found is None or found.change.is_negative(settings.confidence, settings.chaotic_clear):
+        if found is None or found.change.is_negative(settings.confidence, _CHAOTIC_CLEAR):
             break
         gain = _own_gain(loop, first, found, fields, settings)
-        if gain > 0.0 and -found.change.value >= settings.chaotic_confirmed * gain:
+        if gain > 0.0 and -found.change.value >= _CHAOTIC_CONFIRMED * gain:
             break
     return found
 
@@ -218,9 +227,9 @@ def held_out_fraction(
 
     parts: for each part of the fields the law that the others made.
     """
-    costs = left_out_costs(loop, first, parts, fields, settings.fractions)
+    costs = left_out_costs(loop, first, parts, fields, FRACTIONS)
     i, change = choose_fraction(costs, settings.confidence)
-    return i / settings.fractions, change
+    return i / FRACTIONS, change
 
 
 def left_out_costs(
@@ -270,7 +279,7 @@ def _descent(
 
     def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
         drawn = mixtures(fields, most, rng, components, periodic=periodic)
-        every, weights = weighted(fields, drawn, settings.measured_share)
+        every, weights = weighted(fields, drawn, MEASURED_SHARE)
         start = cheapest(loop, starts, every, weights)
         found = improve(loop, start, every, weights, curvature, settings, least_gain)
         return None if found is None else (found.theta, found.steps)

@@ -22,7 +22,17 @@ from loop_method.laws.observer import Observer
 from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
 from loop_method.models.sensed_fit import fit_sensed, halved
 from loop_method.models.sensed_smoothing import Smoothing, settled
-from loop_method.models.settings import DEFAULTS, FieldModelSettings
+from loop_method.models.settings import (
+    DEFAULTS,
+    SENSED_ALIKE_CHI,
+    SENSED_REPRODUCED,
+    FieldModelSettings,
+)
+
+_LARGEST_COST = 3.0
+"""Maximum cost of a rollout in a fit, per cost of the exploration."""
+_EXTRAPOLATION = 1.5
+"""Maximum of simulated fields, relative to the estimated initial ones."""
 
 _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
     WeakKeyDictionary()
@@ -139,7 +149,7 @@ def fit_rollouts(
             spread=spread,
             settings=settings,
         )
-        if found[2] <= settings.sensed_reproduced:
+        if found[2] <= SENSED_REPRODUCED:
             return found
     return None
 
@@ -158,7 +168,7 @@ def to_be_fitted(
         context.U, context.target, context.state_weight, context.action_weight, context.horizon
     )
     settings = context.field_models
-    largest_cost = settings.sensed_largest_cost * problem.cost_of(records[0])
+    largest_cost = _LARGEST_COST * problem.cost_of(records[0])
     return problem, whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
 
 
@@ -181,7 +191,7 @@ def sensed_from(
     declared = float(np.hypot(context.noise, settings.sensed_unresolved * np.sqrt(size)))
     found = fit_rollouts(problem, chosen, actuators, declared, start, alike(settings), spread)
     noise = context.noise**2 / size
-    chance = settings.sensed_alike_chi * noise * np.sqrt(2.0 / np.size(readings))
+    chance = SENSED_ALIKE_CHI * noise * np.sqrt(2.0 / np.size(readings))
     if found is None or found[2] > max(settings.sensed_unresolved**2, chance):
         near = start if found is None else found[0]
         free = fit_rollouts(problem, chosen, actuators, declared, near, settings, spread)
@@ -207,7 +217,7 @@ def sensed_from(
     smoothing, likely = learned()
     # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
     for _ in range(settings.sensed_again):
-        if spread is not None and settled(likely, spread, settings):
+        if spread is not None and settled(likely, spread):
             break
         again = fit_sensed(
             readings,
@@ -221,11 +231,11 @@ def sensed_from(
             settings=settings,
             near=fields,
         )
-        if again[2] > settings.sensed_reproduced:
+        if again[2] > SENSED_REPRODUCED:
             break
         (shared, fields, error), spread = again, likely
         smoothing, likely = learned()
-    largest = settings.sensed_extrapolation * float(np.abs(fields).max())
+    largest = _EXTRAPOLATION * float(np.abs(fields).max())
     model = sensed_model(shared, sensors, actuators, largest, settings, noise=smoothing.noise)
     return replace(model, spread=likely), error
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from loop_method.settings import Settings, setting
 
+MEASURED_SHARE = 0.5
+"""Weight of the measured fields relative to the drawn ones."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImprovementSettings(Settings):
@@ -18,7 +21,7 @@ class ImprovementSettings(Settings):
     judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
     believed: float = setting(
         0.05,
-        "largest error E at which a model is used; above it, local steps are taken",
+        "largest error E at which a model is used; above it, laws are steps along measured rollouts",
         0.0,
         1.0,
     )
@@ -55,37 +58,7 @@ class ImprovementSettings(Settings):
         4,
         1000,
     )
-    chaotic_most: int = setting(
-        96,
-        "the same if the gain of a law from fewer states is not clear on the other states",
-        4,
-        1000,
-    )
-    chaotic_clear: float = setting(
-        10.0,
-        "multiple of the standard errors of the verdict at which this gain is clear",
-        0.0,
-        100.0,
-    )
-    chaotic_confirmed: float = setting(
-        0.8,
-        "share of the gain on its own states that a law must reach on those left out for few "
-        "states to suffice",
-        0.0,
-        1.0,
-    )
-    pieces: int = setting(
-        8, "pieces of a rollout that a model of a chaotic plant must predict", 2, 1000
-    )
-    chaotic_growth: float = setting(
-        20.0, "minimum ratio of the errors on whole rollouts and on pieces", 1.0, 1e6
-    )
-    measured_share: float = setting(
-        0.5, "weight of the measured fields relative to the drawn ones", 0.0, 1.0
-    )
     iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
-    memory: int = setting(40, "gradient differences that L-BFGS keeps", 1, 1000)
-    window: int = setting(5, "L-BFGS steps that together must reach least_gain", 1, 100)
     least_gain: float = setting(
         1e-3,
         "relative reduction of the cost that a window must reach for the descent to continue",
@@ -93,25 +66,10 @@ class ImprovementSettings(Settings):
         1.0,
     )
     first_gain: float = setting(2e-2, "the same before the last renewal", 0.0, 1.0)
-    isotropy: float = setting(
-        1e-3,
-        "share of the identity in the second moment of [s; 1] that scales the gains",
-        1e-12,
-        1.0,
-    )
-    halvings: int = setting(
-        12, "maximum number of halvings of a law until the model's fields are finite", 0, 100
-    )
     folds: int = setting(
         2,
         "parts of the fields, each held out once to choose how far the law moves",
         2,
-        100,
-    )
-    fractions: int = setting(
-        4,
-        "number of equal steps from the first law to the improved one, among which one is chosen",
-        1,
         100,
     )
     close: float = setting(
@@ -120,12 +78,6 @@ class ImprovementSettings(Settings):
         "this share",
         0.0,
         10.0,
-    )
-    pairs: int = setting(
-        12,
-        "maximum number of fields on which laws are compared by rollouts alone",
-        2,
-        1000,
     )
     confidence: float = setting(
         1.0,
@@ -156,17 +108,6 @@ class ModelBasedSettings(ImprovementSettings):
         1,
         10_000,
     )
-    observer_gain: float = setting(3e-4, "as least_gain, for that improvement", 0.0, 1.0)
-    observer_draws: int = setting(
-        2,
-        "sets of drawn initial fields, each of at most mixtures, for that improvement and for "
-        "the law extended_kalman",
-        1,
-        100,
-    )
-    filter_modes: int = setting(
-        24, "modes of the field that the law extended_kalman feeds back", 1, 1000
-    )
     filter_unpredicted: float = setting(
         0.04,
         "share of the size of a field that its filter adds to the noise of a reading for what no "
@@ -174,20 +115,8 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         1.0,
     )
-    filter_inflation: float = setting(
-        1.0, "factor by which the standard deviations of its estimate grow in every step", 1.0, 2.0
-    )
-    filter_seen: float = setting(
-        0.2,
-        "noise, as a share of the size of a field, for which one of its laws is optimised",
-        0.0,
-        10.0,
-    )
     filter_iterations: int = setting(
         30, "as iterations, for a law on an estimate that is improved through its filter", 1, 10_000
-    )
-    filter_draws: int = setting(
-        4, "sets of drawn initial fields, each of at most mixtures, for such a law", 1, 100
     )
     filter_equations: int = setting(
         1,

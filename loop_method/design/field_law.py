@@ -66,6 +66,15 @@ from loop_method.reduce.reduced_model import (
 from loop_method.reduce.regression import fit
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
+_FIELD_LARGEST = 512
+"""Largest state for which a model of the whole field is fitted for the first law."""
+_FIELD_PIECES = 8
+"""Pieces of an episode that the model may predict instead of the whole."""
+_FIELD_THINNING = 5
+"""Interval between the simulated states that the basis is computed from."""
+_FIELD_ROOM = 2.0
+"""Modes per actuator from which on the basis includes the rows of the full-state feedback."""
+
 EXACT = 1e-6
 """E of a model that counts as exact."""
 NOISY = 0.3
@@ -197,7 +206,7 @@ def best_model(
     size of the state, so there is a largest one. Last, what the model was chosen by.
     """
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
-    if len(target) > settings.field_largest:
+    if len(target) > _FIELD_LARGEST:
         return None, 0.0, rollouts
     scale = variation(trajectories)
 
@@ -227,7 +236,7 @@ def best_model(
         return *misjudged, rollouts
     data, best = rollouts, whole
     if error > settings.field_error:
-        parts = [Measured(z, a) for z, a in pieces(trajectories, settings.field_pieces) if len(a)]
+        parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
         found = fitted(parts)
         if found is not None and found.error < error:
             data, best, error = parts, found, found.error
@@ -353,9 +362,7 @@ def field_law(
     best = saturated(affine_law(K, b - K @ point), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
-    U = _basis(
-        K, np.concatenate(visited)[:: settings.field_thinning], target, n_s, settings.field_room
-    )
+    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, n_s, _FIELD_ROOM)
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)

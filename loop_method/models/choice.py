@@ -31,6 +31,9 @@ from loop_method.models.prediction import (
 )
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
+_HOPELESS = 20.0
+"""Multiple of the best E, or of `reproduced`, above which a kind is dropped from further folds."""
+
 FEWEST_SAMPLES = 4
 
 
@@ -200,7 +203,7 @@ def _error(
         own = usable(own)
         parts.append((model, own, predicted(model, own)))
         found += errors(model, own, target, settings.worst, noise, None, parts[-1][2]).tolist()
-        if found and np.mean(found) > settings.hopeless * max(least, settings.reproduced):
+        if found and np.mean(found) > _HOPELESS * max(least, settings.reproduced):
             break
     if not found:
         return None

@@ -24,7 +24,7 @@ from loop_method.models.base import Arrays, Samples, linearised, numbers_of, tex
 from loop_method.models.finite_difference import FiniteDifferenceModel
 from loop_method.models.finite_difference_fit import fit_finite_difference
 from loop_method.models.linear import add_products
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES, FieldModelSettings
 
 Points = NDArray[np.int64]
 _INNER = "inner."
@@ -147,11 +147,11 @@ def fit_coarse(
     inner = fit(seen, shape=few)
     if inner is None:
         return None
-    some = samples.thinned(settings.point_samples)
+    some = samples.thinned(POINT_SAMPLES)
     states = np.concatenate([some.before, some.after])
     values = states[:, every]
     gram = values.T @ values
-    gram[np.diag_indices(len(gram))] += settings.coefficient_ridge * np.trace(gram) / len(gram)
+    gram[np.diag_indices(len(gram))] += COEFFICIENT_RIDGE * np.trace(gram) / len(gram)
     interpolation = np.linalg.solve(gram, values.T @ states).T
     if not np.isfinite(interpolation).all():
         return None

@@ -17,7 +17,12 @@ from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
 from loop_method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES, FieldModelSettings
+
+_POINT_PASSES = 4
+"""How often an equation of finite differences is refitted along the paths of the last fit."""
+_POINT_REACH = 2.5
+"""Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
 
 def largest_rate(order: int) -> float:
@@ -40,18 +45,18 @@ def fit_finite_difference(
     ridge: of the points' own parts in normalised columns; None: they have none; shape: points of each
     axis, where there are several.
     """
-    samples = samples.thinned(settings.point_samples)
+    samples = samples.thinned(POINT_SAMPLES)
     features = features_of(components, degree, len(shape) or 1)
     size = largest_of(samples)
     model, fitted = nothing(kind, features, samples, components, shape), None
-    for _ in range(settings.point_passes):
+    for _ in range(_POINT_PASSES):
         data = Regression.along(model, samples)
         if data is None:
             break
-        found = data.solved(coefficients(data.columns(), ridge, settings), model)
+        found = data.solved(coefficients(data.columns(), ridge), model)
         if found is None:
             break
-        substeps = substeps_of(found, size, settings.point_reach, settings)
+        substeps = substeps_of(found, size, _POINT_REACH, settings)
         model = fitted = replace(found, substeps=substeps)
     return fitted
 
@@ -193,13 +198,11 @@ class Regression:
         )
 
 
-def coefficients(columns: Columns, ridge: float | None, settings: FieldModelSettings) -> Array:
+def coefficients(columns: Columns, ridge: float | None) -> Array:
     """Coefficients of every point, (n_x, F, components)."""
     gram, moment, scale = columns.gram, columns.moment, columns.scale
     eye = np.eye(len(scale))
-    shared = np.linalg.solve(
-        gram.sum(axis=0) + settings.coefficient_ridge * eye, moment.sum(axis=0)
-    )
+    shared = np.linalg.solve(gram.sum(axis=0) + COEFFICIENT_RIDGE * eye, moment.sum(axis=0))
     found = np.broadcast_to(shared, moment.shape)
     if ridge is not None:
         own = np.linalg.solve(gram + ridge / len(gram) * eye, moment - gram @ shared)

@@ -18,10 +18,19 @@ from loop_method.models.low_rank import fit_low_rank
 from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.noisy_fit import fit_noisy
 from loop_method.models.polynomial import LARGEST_STATE, fit_polynomial
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import SPARSE_TERMS, FieldModelSettings
 from loop_method.models.sparse_fit import fit_sparse
 from loop_method.models.spectral_fit import fit_spectral
 from loop_method.models.symbols import Form
+
+_FEWEST_POINTS = 8
+"""Minimum number of grid points of a spectral model."""
+NEAR_NEEDED = 0.05
+"""Least E of the other kinds above which models of neighbours are tried."""
+_SPARSE_NUMBERS = 40
+"""Largest state for models of few products of any of its numbers."""
+_CONVOLUTION_RIDGE = 1e-9
+"""Ridge of convolution models."""
 
 FORMS = (
     Form(name="poly3", degree=3),
@@ -87,7 +96,7 @@ def kinds_of(
         kinds = [
             Kind(
                 name,
-                partial(fit_low_rank, kind=name, most=most, settings=settings),
+                partial(fit_low_rank, kind=name, most=most),
                 (float(most), 0),
             )
             for name, most in LOW_RANKS.items()
@@ -96,8 +105,8 @@ def kinds_of(
         several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
         return kinds + _linear(n_z, settings) + several
     if not line:
-        return kinds + _linear(n_z, settings) + _sparse(n_z, settings) + _polynomial(n_z, settings)
-    if components == 1 and n_z >= settings.fewest_points:
+        return kinds + _linear(n_z, settings) + _sparse(n_z, settings) + _polynomial(n_z)
+    if components == 1 and n_z >= _FEWEST_POINTS:
         kinds += [
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
         ]
@@ -110,7 +119,7 @@ def kinds_of(
         kinds += [kind for kind in two if kind.name != "two-convolution"]
         near += _neighbours(n_z, 2, settings, "two-")
     kinds += _linear(n_z, settings) + near + _sparse(n_z, settings)
-    return kinds + _polynomial(n_z, settings)
+    return kinds + _polynomial(n_z)
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
@@ -143,7 +152,7 @@ def _several_fields(
     if components > 1 and n_z <= settings.dense:
         name = f"{prefix}convolution"
         convolution = partial(
-            fit_convolution, kind=name, ridge=settings.convolution_ridge, components=components
+            fit_convolution, kind=name, ridge=_CONVOLUTION_RIDGE, components=components
         )
         kinds.append(Kind(name, convolution, (float(components), 0)))
     return kinds + _finite_difference(components, settings, prefix)
@@ -166,31 +175,31 @@ def _neighbours(
             ridge=ridge,
         )
         own = 0.0 if ridge is None else count
-        kinds.append(Kind(prefix + name, fit, (own, count), needed=settings.near_needed))
+        kinds.append(Kind(prefix + name, fit, (own, count), needed=NEAR_NEEDED))
     return kinds
 
 
 def _sparse(n_z: int, settings: FieldModelSettings) -> list[Kind]:
     """Few products of any numbers of a small state."""
-    if n_z > settings.sparse_numbers:
+    if n_z > _SPARSE_NUMBERS:
         return []
     return [
         Kind(
             name,
             partial(fit_sparse, kind=name, settings=settings, is_map=is_map),
-            (n_z + settings.sparse_terms, 0),
-            needed=settings.near_needed,
+            (n_z + SPARSE_TERMS, 0),
+            needed=NEAR_NEEDED,
         )
         for name, is_map in SPARSE.items()
     ]
 
 
-def _polynomial(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+def _polynomial(n_z: int) -> list[Kind]:
     """Products of the leading modes and of actions, where nothing simpler describes the plant."""
     if n_z > LARGEST_STATE:
         return []
     fit = partial(fit_polynomial, kind="polynomial")
-    return [Kind("polynomial", fit, (n_z + 1.0, 0), needed=settings.near_needed)]
+    return [Kind("polynomial", fit, (n_z + 1.0, 0), needed=NEAR_NEEDED)]
 
 
 def _finite_difference(

@@ -10,7 +10,15 @@ import numpy as np
 from loop_interfaces.arrays import Array, read_only
 from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 from loop_method.models.linear import add_products
-from loop_method.models.settings import FieldModelSettings
+
+_LOW_RANK_RIDGE = 1e-12
+"""Ridge of low-rank models."""
+_SNAPSHOTS = 400
+"""Maximum number of states that POD modes are computed from."""
+_ENERGY = 1e-12
+"""Share of the energy below which a POD mode is left out."""
+_SAMPLES_PER_MODE = 4
+"""Data steps per unknown in a row of a low-rank model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +85,16 @@ def _products(rows: Array, matrix: Array) -> Array:
     return totals
 
 
-def fit_low_rank(
-    samples: Samples, *, kind: str, most: int, settings: FieldModelSettings
-) -> LowRankModel | None:
+def fit_low_rank(samples: Samples, *, kind: str, most: int) -> LowRankModel | None:
     """Least squares in at most `most` POD modes of the data, as many as the data determine."""
     n_a = samples.actions.shape[1]
-    few = samples.thinned(settings.snapshots).before
-    largest = min(most, len(few), len(samples) // settings.samples_per_mode - n_a - 1)
+    few = samples.thinned(_SNAPSHOTS).before
+    largest = min(most, len(few), len(samples) // _SAMPLES_PER_MODE - n_a - 1)
     if largest < 1:
         return None
     energies, mixtures = np.linalg.eigh(few @ few.T)
     energies, mixtures = energies[::-1], mixtures[:, ::-1]
-    kept = int(np.count_nonzero(energies > settings.energy * max(energies[0], 0.0)))
+    kept = int(np.count_nonzero(energies > _ENERGY * max(energies[0], 0.0)))
     if not kept:
         return None
     V = np.linalg.qr(few.T @ mixtures[:, : min(kept, largest)])[0]
@@ -97,7 +103,7 @@ def fit_low_rank(
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
     columns = columns / scale
-    gram = columns.T @ columns / len(x) + settings.low_rank_ridge * np.eye(len(scale))
+    gram = columns.T @ columns / len(x) + _LOW_RANK_RIDGE * np.eye(len(scale))
     found = np.linalg.solve(gram, columns.T @ after / len(x)) / scale[:, None]
     if not np.isfinite(found).all():
         return None

@@ -38,7 +38,22 @@ from loop_method.models.finite_difference_fit import (
     nothing,
     substeps_of,
 )
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import COEFFICIENT_RIDGE, FieldModelSettings
+
+_NEAR_SCREENED = 0.1
+"""Share of the change that may be unexplained along straight paths between samples."""
+_NEAR_HOPELESS = 0.05
+"""Share of the change that may be unexplained along the paths of the first fit."""
+_NEAR_SUBSTEPS = 8
+"""Maximum number of internal steps of the paths of a fit."""
+_NEAR_PASSES = 8
+"""Further passes of a model of neighbours, on what its steps miss."""
+_NEAR_SETTLED = 0.1
+"""Relative change of what its steps miss at which the passes end."""
+_NEAR_DROPPED = 0.5
+"""Share by which its residual may grow when products are left out."""
+_NEAR_NEGLIGIBLE = 1e-12
+"""Squared error that counts as none, as a share of the squared change."""
 
 
 def fit_neighbours(
@@ -74,25 +89,25 @@ def fitted(
 ) -> FiniteDifferenceModel | None:
     """The equation of the terms of an empty one, which has substeps of its own then, or None."""
     size = largest_of(samples)
-    for most in (settings.near_screened, settings.near_hopeless):
+    for most in (_NEAR_SCREENED, _NEAR_HOPELESS):
         data = Regression.along(model, samples)
         if data is None:
             return None
         columns = data.columns()
-        C = coefficients(columns, ridge, settings)
+        C = coefficients(columns, ridge)
         found = data.solved(C, model)
         if found is None or not columns.unexplained(C) <= most**2:
             return None  # the plant is of another kind
         # Means that are roughly right are enough for what follows.
         substeps = substeps_of(found, size, settings.near_reach, settings)
-        model = replace(found, substeps=min(substeps, settings.near_substeps))
+        model = replace(found, substeps=min(substeps, _NEAR_SUBSTEPS))
     every = _passes(model, samples, ridge, settings)
     if every is None:
         return None
     missed = Regression.along(every, samples, missed=True)
     if missed is None:
         return every
-    kept = explaining(missed.columns(), ridge is None, settings)
+    kept = explaining(missed.columns(), ridge is None)
     fewer = replace(
         every,
         features=tuple(every.features[f] for f in kept),
@@ -110,15 +125,15 @@ def _passes(
     """The best equation of passes that regress what steps miss."""
     size = largest_of(samples)
     best, least = None, np.inf
-    for _ in range(settings.near_passes + 1):
+    for _ in range(_NEAR_PASSES + 1):
         data = Regression.along(model, samples, missed=True)
         if data is None or not data.miss < least:
             break
-        settled = data.miss > (1.0 - settings.near_settled) * least
+        settled = data.miss > (1.0 - _NEAR_SETTLED) * least
         best, least = model, data.miss
         if settled:
             break
-        found = data.solved(coefficients(data.columns(), ridge, settings), model)
+        found = data.solved(coefficients(data.columns(), ridge), model)
         if found is None:
             break
         substeps = substeps_of(found, size, settings.near_reach, settings)
@@ -126,16 +141,16 @@ def _passes(
     return best
 
 
-def explaining(columns: Columns, shared: bool, settings: FieldModelSettings) -> list[int]:
+def explaining(columns: Columns, shared: bool) -> list[int]:
     """The features without which the residual is clearly larger, left out one by one."""
     gram, moment = columns.gram, columns.moment
     if shared:
         gram, moment = gram.sum(axis=0)[None], moment.sum(axis=0)[None]
-    size = settings.coefficient_ridge * np.trace(gram, axis1=1, axis2=2)[:, None, None]
+    size = COEFFICIENT_RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None]
     inverse = np.linalg.inv(gram + size * np.eye(gram.shape[1]))
     w = inverse @ moment
     residual = max(columns.square - float(np.sum(moment * w)), 0.0)
-    most = settings.near_dropped * residual + settings.near_negligible * columns.square
+    most = _NEAR_DROPPED * residual + _NEAR_NEGLIGIBLE * columns.square
     kept = list(range(gram.shape[1]))
     lost = 0.0
     while len(kept) > 1:

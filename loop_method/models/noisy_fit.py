@@ -44,11 +44,32 @@ from loop_method.models.columns import least_squares
 from loop_method.models.denoising import signal_power
 from loop_method.models.filtering import Filtered, filtered
 from loop_method.models.prediction import finite
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import (
+    COEFFICIENT_RIDGE,
+    FAR,
+    FIRST_SUBSTEPS,
+    LEAST_CORRECTION,
+    FieldModelSettings,
+)
 from loop_method.models.spectral import SpectralModel, Spectrum
 from loop_method.models.spectral_fit import POWERS, fewer_of, substeps_of
 from loop_method.models.symbols import Form, Regression, polynomial
 from spectral_solver.polynomial_step import phi_functions
+
+_NOISY_STEPS = 2000
+"""Maximum number of data steps in a fit with measurement noise."""
+_NOISY_POWER = 3.0
+"""Mean power of a wavenumber, relative to the noise, from which it is compared."""
+_FEWEST_MODES = 4
+"""Wavenumbers that are always compared, whatever their power."""
+_LARGEST_WINDOW = 16
+"""Maximum number of sampling times in a window."""
+_GROWTH = 1.5
+"""Largest growth of the linear part within a window, as an exponent of e."""
+_RELATIVE_ERROR = 0.02
+"""Model error of a window as a share of the change within it."""
+_SIGNIFICANCE = 3.0
+"""Multiple of its standard error that a coefficient must reach to be kept."""
 
 PASSES = ((1, 8), (2, 8), (4, 4), (8, 4), (8, 4), (16, 4), (16, 4))
 """Of each pass, the sampling times of a window, and n: the lowest 1/n wavenumbers are compared."""
@@ -80,9 +101,7 @@ class WindowRegression(Regression):
         self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
     ) -> Array:
         count = len(self.y) - self.lost - self.common.shape[2]  # complex numbers a wavenumber
-        return significant(
-            columns, values, max(count / len(self.y), 0.1), settings, self.strictness
-        )
+        return significant(columns, values, max(count / len(self.y), 0.1), self.strictness)
 
     def inputs(self, left: Spectrum) -> Spectrum:
         """F of B and c, (n_a + 1, modes), from what the other terms leave (N, modes).
@@ -106,7 +125,6 @@ def significant(
     columns: Spectrum,
     values: Spectrum,
     free: float,
-    settings: FieldModelSettings,
     strictness: float = 1.0,
 ) -> Array:
     """Real coefficients of complex columns, 0 where they are within a few standard errors of it.
@@ -116,7 +134,7 @@ def significant(
     scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
     columns = columns / scale
-    gram = (columns.conj().T @ columns).real + settings.coefficient_ridge * np.eye(len(scale))
+    gram = (columns.conj().T @ columns).real + COEFFICIENT_RIDGE * np.eye(len(scale))
     moment, total = (columns.conj().T @ values).real, float(np.sum(np.abs(values) ** 2))
     kept = list(range(len(scale)))
     while kept:
@@ -124,7 +142,7 @@ def significant(
         own = inverse @ moment[kept]
         rest = max(total - float(own @ moment[kept]), 0.0)
         error = np.sqrt(rest / (2.0 * free * len(values)) * np.diag(inverse))
-        size = np.abs(own) - strictness * settings.significance * error
+        size = np.abs(own) - strictness * _SIGNIFICANCE * error
         if size.min() >= 0.0:
             break
         kept.pop(int(np.argmin(np.abs(own) / np.where(error > 0.0, error, 1.0))))
@@ -144,12 +162,12 @@ def fit_noisy(
     deviation of the noise on every number of their states.
     """
     rollouts = [short for r in rollouts if len((short := finite(r)).actions)]
-    rollouts = _thinned(rollouts, settings.noisy_steps)
+    rollouts = _thinned(rollouts, _NOISY_STEPS)
     n_z, n_a = rollouts[0].states.shape[1], rollouts[0].actions.shape[1]
     first = [rollout.known[0] for rollout in rollouts]
     largest = max(float(np.abs(rollout.states).max()) for rollout in rollouts)
     noise_power = noise**2 / n_z
-    cut, shares = _wavenumbers(rollouts, noise, settings)
+    cut, shares = _wavenumbers(rollouts, noise)
     modes = n_z // 2 + 1
     model = SpectralModel(
         form.name,
@@ -158,17 +176,17 @@ def fit_noisy(
         np.eye(form.degree - 1),
         np.zeros((n_z, n_a)),
         np.zeros(n_z),
-        settings.first_substeps,
+        FIRST_SUBSTEPS,
         settings.clip * largest if form.degree > POWERS else np.inf,
     )
     best, least = None, np.inf
-    known = filtered(model, rollouts, first, shares, settings.far)
+    known = filtered(model, rollouts, first, shares, FAR)
     for window, share in PASSES:
-        steps = min(window, settings.largest_window)
+        steps = min(window, _LARGEST_WINDOW)
         growth = max(float(model.linear.real[:cut].max()), 0.0)
-        if growth * steps > settings.growth:
-            steps = max(int(settings.growth / growth), 1)
-        data = _regression(model, rollouts, known, steps, cut, noise, settings)
+        if growth * steps > _GROWTH:
+            steps = max(int(_GROWTH / growth), 1)
+        data = _regression(model, rollouts, known, steps, cut, noise)
         if data is None:
             break
         compared = replace(form, shares=(max(share, form.shares[-1]),))
@@ -178,7 +196,7 @@ def fit_noisy(
             if found is None:
                 continue
             found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
-            known = filtered(found, rollouts, first, shares, settings.far)
+            known = filtered(found, rollouts, first, shares, FAR)
             if not known.lost:
                 break
         if found is None:
@@ -187,8 +205,8 @@ def fit_noisy(
         miss = float(error[:cut].sum()) if not known.lost else np.inf
         if best is None or miss < least:
             best, least = model, miss
-        shares = np.clip(error / (error + noise_power), settings.least_correction, 1.0)
-        shares[cut:] = np.minimum(shares[cut:], settings.least_correction)
+        shares = np.clip(error / (error + noise_power), LEAST_CORRECTION, 1.0)
+        shares[cut:] = np.minimum(shares[cut:], LEAST_CORRECTION)
     if best is None:
         return None
     return replace(best, fewer=fewer_of(best.symbols, largest, best.substeps, settings))
@@ -202,15 +220,13 @@ def _thinned(rollouts: Sequence[Measured], most: int) -> list[Measured]:
     return [rollouts[i] for i in np.unique(chosen).tolist()]
 
 
-def _wavenumbers(
-    rollouts: Sequence[Measured], noise: float, settings: FieldModelSettings
-) -> tuple[int, Array]:
+def _wavenumbers(rollouts: Sequence[Measured], noise: float) -> tuple[int, Array]:
     """How many of the lowest wavenumbers stand out of the noise, and g of the first pass."""
     n_z = rollouts[0].states.shape[1]
     spectra = [scipy.fft.rfft(rollout.states) for rollout in rollouts]
     signal, noise_power = signal_power(np.concatenate(spectra), noise, n_z)
-    weak = signal + noise_power < settings.noisy_power * noise_power
-    cut = max(int(np.argmax(weak)) if weak.any() else len(weak), settings.fewest_modes)
+    weak = signal + noise_power < _NOISY_POWER * noise_power
+    cut = max(int(np.argmax(weak)) if weak.any() else len(weak), _FEWEST_MODES)
     steps = np.concatenate([np.diff(own, axis=0) for own in spectra])
     change = np.maximum(np.mean(np.abs(steps) ** 2, axis=0) - 2.0 * noise_power, 0.0)
     shares = change / (change + noise_power)
@@ -225,7 +241,6 @@ def _regression(
     steps: int,
     cut: int,
     noise: float,
-    settings: FieldModelSettings,
 ) -> WindowRegression | None:
     """What is known in windows of so many steps; None where the equation overflows in most."""
     even = replace(model, substeps=model.substeps + model.substeps % 2)
@@ -265,7 +280,7 @@ def _regression(
     if 2 * ok.sum() < len(y):
         return None
     change = np.sum(np.abs(y[:, -1] - y[:, 0]) ** 2, axis=1)
-    variance = 2.0 * noise**2 / model.n_z * cut + settings.relative_error**2 * change
+    variance = 2.0 * noise**2 / model.n_z * cut + _RELATIVE_ERROR**2 * change
     root = 1.0 / np.sqrt(variance[ok])
     # Without the part of each window that its unknown initial state explains.
     free = decay ** np.arange(steps + 1)[:, None]

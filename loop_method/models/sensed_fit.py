@@ -41,7 +41,21 @@ from loop_method.models.sensed import Actuators, coefficients_of, field_of, grid
 from loop_method.models.sensed_growth import USED, Found, further_terms, grown, start_with
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.sensed_unknowns import EQUATION, TERMS
-from loop_method.models.settings import DEFAULTS, FieldModelSettings
+from loop_method.models.settings import (
+    DEFAULTS,
+    SENSED_ALIKE_CHI,
+    SENSED_ENOUGH,
+    SENSED_HELD_RIDGE,
+    SENSED_HOPELESS,
+    SENSED_REPRODUCED,
+    FieldModelSettings,
+)
+
+_LIKELIER = 30.0
+"""Margin in log-likelihood by which a fit from nothing must exceed one with an earlier equation's
+spread."""
+_DISPERSION = 20.0
+"""Dispersion at which fits start, of both signs; also half of it and 1.5 times it."""
 
 # Shares of the declared dispersion that fits begin with: no descent leads from waves that run one way
 # to waves that run the other. The last ones are tried only where none of the others is good enough.
@@ -101,10 +115,10 @@ def fit_sensed(
     fields, n = problem.interpolated(), grid_points(y.shape[2])
     if start is not None:
         known = None if near is None else coefficients_of(near)
-        found = _refined(problem, start, fields, known, settings)
+        found = _refined(problem, start, fields, known)
     else:
         first, *others = few_rollouts(y, a, settings.sensed_starts)
-        found, enough = _from_few(problem, first, settings, np.inf), settings.sensed_reproduced
+        found, enough = _from_few(problem, first, settings, np.inf), SENSED_REPRODUCED
         for few in others:
             if found[0] <= enough:
                 break
@@ -147,13 +161,13 @@ def _from_few(
     """
     problem.prior.forget()
     fields = problem.interpolated()
-    error, shared, fields[few] = _first_guess(problem.part(few, hold=True), settings)
+    error, shared, fields[few] = _first_guess(problem.part(few, hold=True))
     if not np.isfinite(error) or error > most:
         return np.inf, shared, fields
-    found = _refined(problem, shared, fields, None, settings, first=True)
+    found = _refined(problem, shared, fields, None, first=True)
     shared = further_terms(problem, found, settings)
     if shared is not found[1]:
-        found = _refined(problem, shared, problem.interpolated(), None, settings, first=True)
+        found = _refined(problem, shared, problem.interpolated(), None, first=True)
     return found
 
 
@@ -162,7 +176,6 @@ def _refined(
     shared: Array,
     fields: Array,
     known: Array | None,
-    settings: FieldModelSettings,
     *,
     first: bool = False,
 ) -> Found:
@@ -175,31 +188,29 @@ def _refined(
         _, _, known = problem.fit(shared, fields, known=True)
     whole, found = [problem.y.shape[1]] * _WHOLE, []
     # Else the equation does not hold for the other rollouts: nothing is near enough for a whole fit.
-    holds = problem.error(shared, known) <= settings.sensed_reproduced
+    holds = problem.error(shared, known) <= SENSED_REPRODUCED
     if holds:
         found.append(problem.fit(shared, known, lengths=whole))
     # With noise two rollouts leave much of an equation open.
     if not holds or (first and problem.noise):
         problem.prior.forget()
-        found.append(part_by_part(problem, shared, fields, settings))
+        found.append(part_by_part(problem, shared, fields))
     if problem.noise and fresh:
         problem.prior.forget()
-        most = settings.sensed_hopeless
-        anew = part_by_part(problem, dispersion_of(shared), fields, settings, most)
+        most = SENSED_HOPELESS
+        anew = part_by_part(problem, dispersion_of(shared), fields, most)
         found += [anew] if np.isfinite(anew[0]) else []
         # Errors that are all below the noise tell no equation from another.
         best = min(found, key=lambda own: problem.implausibility(*own[1:]))
         if problem.prior.spread is not None:
-            best = far_likelier(problem, best, dispersion_of(shared), fields, settings)
+            best = far_likelier(problem, best, dispersion_of(shared), fields)
         error, shared, fields = best
     else:
         error, shared, fields = min(found, key=lambda own: own[0])
     return error - problem.noise, shared, fields
 
 
-def far_likelier(
-    problem: SensedProblem, best: Found, start: Array, fields: Array, settings: FieldModelSettings
-) -> Found:
+def far_likelier(problem: SensedProblem, best: Found, start: Array, fields: Array) -> Found:
     """A fit from these unknowns without a spread of waves, if it is likelier by far, or else the best.
 
     The spread followed from the equation before, and may hold a wrong one: with eight sensors one whose
@@ -207,13 +218,13 @@ def far_likelier(
     """
     spread, problem.prior.spread = problem.prior.spread, None
     problem.prior.forget()
-    anew = part_by_part(problem, start, fields, settings, settings.sensed_hopeless)
+    anew = part_by_part(problem, start, fields, SENSED_HOPELESS)
     if np.isfinite(anew[0]):
         # Each with its likeliest fields: those of the best were held to that spread.
         _, *held = problem.fit(*best[1:], known=True, lengths=[problem.y.shape[1]])
         gain = problem.implausibility(*held) - problem.implausibility(*anew[1:])
         share = problem.weight(problem.y.shape[1])  # that of one reading, with its variance
-        if 0.5 * gain / share > settings.sensed_likelier:
+        if 0.5 * gain / share > _LIKELIER:
             best = anew
     problem.prior.spread = spread
     return best
@@ -233,7 +244,6 @@ def part_by_part(
     problem: SensedProblem,
     shared: Array,
     fields: Array,
-    settings: FieldModelSettings,
     most: float = np.inf,
 ) -> tuple[float, Array, Array]:
     """The fit over longer and longer parts; with noise, declared actuators stay where they are.
@@ -245,7 +255,7 @@ def part_by_part(
     """
     if not problem.holds:
         return problem.fit(shared, fields, most=most)
-    problem.prior.place_ridge = settings.sensed_held_ridge
+    problem.prior.place_ridge = SENSED_HELD_RIDGE
     error, shared, fields = problem.fit(shared, fields, most=most)
     problem.prior.place_ridge = 0.0
     problem.prior.forget()
@@ -268,17 +278,17 @@ def with_coefficients_of_x(
     start = np.zeros(problem.shared)
     start[len(TERMS) : EQUATION] = USED
     some, others = (problem.part(range(own, count, 2)) for own in (0, 1))
-    most = settings.sensed_hopeless
-    error, shared, _ = part_by_part(some, start, some.interpolated(), settings, most)
+    most = SENSED_HOPELESS
+    error, shared, _ = part_by_part(some, start, some.interpolated(), most)
     if not np.isfinite(error):
         return first
     before = foretold(others, first[1], np.inf) if np.isfinite(first[0]) else np.inf
     # These rollouts are among those that the first equation was fitted to.
-    if not foretold(others, shared, most) < min(before, settings.sensed_reproduced):
+    if not foretold(others, shared, most) < min(before, SENSED_REPRODUCED):
         return first
     problem.prior.forget()
-    found = _refined(problem, shared, problem.interpolated(), None, settings)
-    reproduced = found[0] <= settings.sensed_reproduced
+    found = _refined(problem, shared, problem.interpolated(), None)
+    reproduced = found[0] <= SENSED_REPRODUCED
     return found if reproduced and halved(first[0], found[0], settings) else first
 
 
@@ -292,7 +302,7 @@ def foretold(problem: SensedProblem, shared: Array, most: float) -> float:
 
 def unexplained(problem: SensedProblem, settings: FieldModelSettings) -> float:
     """The least error that is due neither to the grid nor to chance in the noise."""
-    chance = settings.sensed_alike_chi * problem.noise * np.sqrt(2.0 / problem.y.size)
+    chance = SENSED_ALIKE_CHI * problem.noise * np.sqrt(2.0 / problem.y.size)
     return max(settings.sensed_varying, float(chance))
 
 
@@ -302,18 +312,18 @@ def halved(before: float, after: float, settings: FieldModelSettings) -> bool:
     return after + unresolved < 0.5 * (before + unresolved)
 
 
-def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:
+def _first_guess(problem: SensedProblem) -> Found:
     """The least error, and the unknowns of a few rollouts that have it."""
     best = np.inf, np.zeros(problem.shared), problem.interpolated()
     reached, longest = 0, best
     for i, share in enumerate(_DISPERSIONS):
-        good = best[0] <= settings.sensed_reproduced
-        if best[0] <= settings.sensed_enough or (good and i >= _FEW):
+        good = best[0] <= SENSED_REPRODUCED
+        if best[0] <= SENSED_ENOUGH or (good and i >= _FEW):
             break
         start = np.zeros(problem.shared)
-        start[TERMS.index((1, 3))] = share * settings.sensed_dispersion
+        start[TERMS.index((1, 3))] = share * _DISPERSION
         problem.prior.forget()
-        most = settings.sensed_hopeless
+        most = SENSED_HOPELESS
         error, *found = problem.fit(start, problem.interpolated(), most=most)
         if error - problem.noise < best[0]:
             best = error - problem.noise, found[0], found[1]
@@ -321,4 +331,4 @@ def _first_guess(problem: SensedProblem, settings: FieldModelSettings) -> Found:
             reached, longest = problem.reached, (np.inf, found[0], found[1])
     if np.isfinite(best[0]) or not reached:
         return best
-    return grown(problem, longest, problem.missing(*longest[1:], reached), reached, settings)
+    return grown(problem, longest, problem.missing(*longest[1:], reached), reached)

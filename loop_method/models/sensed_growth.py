@@ -22,7 +22,16 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.sensed_unknowns import EQUATION, FIRST, well_posed
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import SENSED_ENOUGH, SENSED_HOPELESS, FieldModelSettings
+
+_FURTHER = 4
+"""Maximum number of terms that are added where the first ones do not reproduce readings."""
+_FURTHER_FALL = 0.01
+"""Share by which a further term must promise to reduce the error."""
+_FURTHER_CHI = 12.0
+"""Fall of the error that pays for a term, relative to the variance that noise alone gives."""
+_FURTHER_WORSE = 2.0
+"""Growth of the error at which no further term is added."""
 
 Found = tuple[float, Array, Array]
 """The error without that of the noise, the shared unknowns and the fields."""
@@ -36,22 +45,22 @@ def further_terms(problem: SensedProblem, first: Found, settings: FieldModelSett
     They are fitted to every other rollout, and predict the rest from initial fields of their own.
     """
     count, steps = problem.y.shape[:2]
-    if first[0] <= settings.sensed_enough:
+    if first[0] <= SENSED_ENOUGH:
         return first[1]
     proposed = problem.missing(*first[1:], steps)
-    if proposed[2] <= _least_fall(problem, first[0], steps, settings):
+    if proposed[2] <= _least_fall(problem, first[0], steps):
         return first[1]
     some = problem.part(range(0, count, 2), hold=True)
     others = problem.part(range(1, count, 2)) if count > 2 else some
     begin = some.error(first[1], first[2][::2]), first[1], first[2][::2]
-    found = grown(some, begin, proposed, steps, settings)
+    found = grown(some, begin, proposed, steps)
     if found is begin:
         return first[1]
     before, after = (
         others.fit(shared, others.interpolated(), known=True)[0] - others.noise
         for shared in (first[1], found[1])
     )
-    clear = before - after > settings.sensed_further_chi * others.weight(steps)
+    clear = before - after > _FURTHER_CHI * others.weight(steps)
     return found[1] if clear and after < max(before, 0.0) / settings.better else first[1]
 
 
@@ -60,7 +69,6 @@ def grown(
     first: Found,
     proposed: tuple[int, float, float],
     reached: int,
-    settings: FieldModelSettings,
 ) -> Found:
     """The fit with the least error on adding terms to the first one, which ended after some steps.
 
@@ -68,37 +76,31 @@ def grown(
     if it was abandoned.
     """
     best = now = first
-    for i in range(settings.sensed_further):
+    for i in range(_FURTHER):
         if i:
             proposed = problem.missing(*now[1:], reached)
-            if proposed[2] <= _least_fall(problem, now[0], reached, settings):
+            if proposed[2] <= _least_fall(problem, now[0], reached):
                 break
         start, before = start_with(now[1], proposed[:2]), reached
         problem.prior.forget()
-        most = settings.sensed_hopeless
+        most = SENSED_HOPELESS
         error, *found = problem.fit(start, problem.interpolated(), most=most)
         now, reached = (error - problem.noise, found[0], found[1]), problem.reached
         if now[0] < best[0]:
             best = now
-            if best[0] <= settings.sensed_enough:
+            if best[0] <= SENSED_ENOUGH:
                 break
             continue
-        further = (
-            reached > before
-            if np.isinf(best[0])
-            else now[0] <= settings.sensed_further_worse * best[0]
-        )
+        further = reached > before if np.isinf(best[0]) else now[0] <= _FURTHER_WORSE * best[0]
         if not further:
             break
     return best
 
 
-def _least_fall(
-    problem: SensedProblem, error: float, steps: int, settings: FieldModelSettings
-) -> float:
+def _least_fall(problem: SensedProblem, error: float, steps: int) -> float:
     """The fall of the error that a further term must promise."""
-    share = settings.sensed_further_fall * error if np.isfinite(error) else 0.0
-    return max(share, settings.sensed_further_chi * problem.weight(steps))
+    share = _FURTHER_FALL * error if np.isfinite(error) else 0.0
+    return max(share, _FURTHER_CHI * problem.weight(steps))
 
 
 def start_with(shared: Array, added: tuple[int, float] | None = None) -> Array:

@@ -11,6 +11,17 @@ from loop_method.models.sensed import WAVES
 from loop_method.models.sensed_unknowns import COEFFICIENTS, FIRST, SHARED, TERMS, unknowns
 from loop_method.models.settings import FieldModelSettings
 
+_RIDGE = 1e-5
+"""Ridge of the unknowns of the equation."""
+_DEVIATION = 10.0
+"""Prior standard deviation of the unknowns of the equation, with measurement noise."""
+_FIELD_RIDGE = 1e-3
+"""Ridge of the Fourier coefficients of an initial field."""
+_FIELD_DEVIATION = 0.5
+"""Prior deviation of the Fourier coefficients of a field, relative to the readings, with noise."""
+_FIELD_WAVE = 4.0
+"""Wavenumber beyond which both grow stricter with its square."""
+
 
 class SensedPrior:
     """The ridges that a fit adds to its squared errors, one for each unknown.
@@ -38,8 +49,8 @@ class SensedPrior:
     @property
     def suggested(self) -> Array:
         """Standard deviations of the coefficients of a field, (33,), from its size alone."""
-        falling = 1.0 + (self._waves / self._settings.sensed_field_wave) ** 2
-        found: Array = self._settings.sensed_field_deviation * self._size / falling
+        falling = 1.0 + (self._waves / _FIELD_WAVE) ** 2
+        found: Array = _FIELD_DEVIATION * self._size / falling
         return found
 
     def ridges(self, opened: NDArray[np.intp], variance: float) -> Array:
@@ -53,14 +64,14 @@ class SensedPrior:
     def given(self, opened: NDArray[np.intp], variance: float) -> Array:
         """Those of all unknowns, whatever a fit found significant and wherever it holds actuators."""
         settings = self._settings
-        shared = np.full(len(self.precision), variance / settings.sensed_deviation**2)
+        shared = np.full(len(self.precision), variance / _DEVIATION**2)
         shared[SHARED:] = variance / settings.sensed_unequal**2 + settings.sensed_unequal_ridge**2
-        shared += settings.sensed_ridge**2
+        shared += _RIDGE**2
         shared[_loose(opened)] *= 1e-4
-        rising = (1.0 + (self._waves / settings.sensed_field_wave) ** 2) ** 2 / self._size**2
-        field = settings.sensed_field_ridge**2 / self._rollouts * rising
+        rising = (1.0 + (self._waves / _FIELD_WAVE) ** 2) ** 2 / self._size**2
+        field = _FIELD_RIDGE**2 / self._rollouts * rising
         if self.spread is None:
-            field += variance / settings.sensed_field_deviation**2 * rising
+            field += variance / _FIELD_DEVIATION**2 * rising
         else:
             field += variance / self.spread**2
         return np.concatenate([shared, np.tile(field, self._rollouts)])

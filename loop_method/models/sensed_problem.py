@@ -12,7 +12,28 @@ from loop_method.models.sensed import WAVES, Actuators, coefficients_of, grid_po
 from loop_method.models.sensed_flow import SensedFlow
 from loop_method.models.sensed_prior import SensedPrior
 from loop_method.models.sensed_unknowns import TERMS, open_unknowns, unknowns, well_posed
-from loop_method.models.settings import DEFAULTS, FieldModelSettings
+from loop_method.models.settings import DEFAULTS, SENSED_HELD_RIDGE, FieldModelSettings
+
+_BEGINNING = 0.05
+"""Share of each rollout over which a fit begins."""
+_SHORTEST = 10
+"""Minimum number of its time steps."""
+_CONTINUATION = 1.6
+"""Factor by which the fitted share of the rollouts grows, until they are whole."""
+_LEAST_GAIN = 1e-3
+"""Share by which an iteration must reduce the error for the fit to continue."""
+_DAMPING = 1e-2
+"""Initial damping of the Levenberg-Marquardt method."""
+_DIFFERENCE = 1e-5
+"""Step of the finite differences."""
+_DISTANCE = 0.1
+"""Weight of the relative error of the distance from the target, which is known from a cost."""
+_MARGIN = 1.25
+"""Assumed maximum of the field, relative to the readings, that sets the internal steps."""
+_CLIP = 2.0
+"""Bound on z in powers during a fit, relative to the largest reading."""
+_PLACE_RIDGE = 1e-3
+"""Ridge of the shifts, widths and differences of actuators while no equation is known."""
 
 # The part of rollouts that the fields of a known equation are fitted to before the whole.
 _FIRST = 3
@@ -51,8 +72,8 @@ class SensedProblem:
         """True if noise would move actuators from where they are declared."""
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
-        self._sizes = settings.sensed_margin * windows.max(axis=1)
-        self._clip = settings.sensed_clip * float(near.max())
+        self._sizes = _MARGIN * windows.max(axis=1)
+        self._clip = _CLIP * float(near.max())
         self.reached = 0
         """Steps of the rollouts that the last fit was over when it ended."""
         sensors = y.shape[2]
@@ -80,10 +101,10 @@ class SensedProblem:
     def lengths(self) -> list[int]:
         """Steps of the rollouts that are fitted one after the other."""
         steps, found = self.y.shape[1], []
-        share = max(self._settings.sensed_beginning, self._settings.sensed_shortest / steps)
+        share = max(_BEGINNING, _SHORTEST / steps)
         while share < 1.0:
             found.append(min(max(2, round(share * steps)), steps))
-            share *= self._settings.sensed_continuation
+            share *= _CONTINUATION
         return [*found, steps]
 
     def fit(
@@ -194,9 +215,7 @@ class SensedProblem:
             settings,
         )
         if hold:
-            part.prior.place_ridge = (
-                settings.sensed_held_ridge if self.holds else settings.sensed_place_ridge
-            )
+            part.prior.place_ridge = SENSED_HELD_RIDGE if self.holds else _PLACE_RIDGE
         return part
 
     def implausibility(self, shared: Array, fields: Array) -> float:
@@ -218,7 +237,7 @@ class SensedProblem:
         self, shared: Array, fields: Array, steps: int, known: bool
     ) -> tuple[Array, Array]:
         settings = self._settings
-        damping = settings.sensed_damping
+        damping = _DAMPING
         varied = self._open[:0] if known else self._open
         common = len(varied)
         ridge = self._ridges(steps)[len(self._open) - common :]
@@ -257,7 +276,7 @@ class SensedProblem:
                         damping = max(damping / 5.0, _LEAST_DAMPING)
                         break
                     damping *= 5.0
-                if not now < (1.0 - settings.sensed_least_gain) * before:
+                if not now < (1.0 - _LEAST_GAIN) * before:
                     break
         return parts(x)
 
@@ -291,7 +310,7 @@ class SensedProblem:
             settings,
             self._clip,
             varied,
-            settings.sensed_difference,
+            _DIFFERENCE,
         )
         compared = len(range(0, steps, stride))
         rows, (rollouts, _, sensors) = len(fields), self.y.shape
@@ -313,7 +332,7 @@ class SensedProblem:
             return whole
         off = distance / (steps * self._distances) - 1.0
         off = np.where(np.isnan(self._distances), 0.0, off)
-        off *= self._settings.sensed_distance / np.sqrt(len(self.y))
+        off *= _DISTANCE / np.sqrt(len(self.y))
         return np.concatenate([whole, off[..., None]], axis=2)
 
     def _linearised(
@@ -323,7 +342,7 @@ class SensedProblem:
 
         The unknowns are the shared ones, if they are not known, and the rollout's own field.
         """
-        own, difference = fields.shape[1], self._settings.sensed_difference
+        own, difference = fields.shape[1], _DIFFERENCE
         nearby = np.tile(fields, (1 + own, 1, 1))
         nearby[1:] -= difference * np.eye(own)[:, None]
         varied = [] if known else self._open.tolist()

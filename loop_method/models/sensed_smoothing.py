@@ -23,6 +23,13 @@ from loop_method.models.sensed import WAVES, Actuators, coefficients_of, field_o
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
+_SETTLED = 0.05
+"""Relative change of the spread of waves below which nothing is fitted again."""
+_LEAST_TOLD = 0.05
+"""Minimum share of a coefficient that a rollout is taken to determine."""
+_LEAST_SPREAD = 1e-2
+"""Minimum spread of a wave, relative to the largest."""
+
 
 @dataclass(frozen=True, eq=False)
 class Smoothing:
@@ -89,12 +96,12 @@ class Smoothing:
             for problem, fields in zip(problems, found, strict=True):
                 size += fields[0] ** 2
                 told += 1.0 - problem.variances(self.shared, fields) / spread**2
-            told = np.maximum(told, settings.sensed_least_told * len(problems))
-            spread = _falling(size, told, settings.sensed_least_spread)
+            told = np.maximum(told, _LEAST_TOLD * len(problems))
+            spread = _falling(size, told, _LEAST_SPREAD)
             for i, problem in enumerate(problems):
                 problem.prior.spread = spread
                 found[i] = problem.refined(self.shared, found[i])
-            if settled(spread, before, settings):
+            if settled(spread, before):
                 break
         return replace(self, spread=spread)
 
@@ -115,9 +122,9 @@ class Smoothing:
         return problem
 
 
-def settled(spread: Array, before: Array, settings: FieldModelSettings) -> bool:
+def settled(spread: Array, before: Array) -> bool:
     """True if a spread is as good as the one before."""
-    return bool(np.linalg.norm(spread - before) <= settings.sensed_settled * np.linalg.norm(before))
+    return bool(np.linalg.norm(spread - before) <= _SETTLED * np.linalg.norm(before))
 
 
 def _falling(size: Array, told: Array, least: float) -> Array:

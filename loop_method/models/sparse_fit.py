@@ -31,7 +31,12 @@ from loop_method.models.columns import orthonormal
 from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
 from loop_method.models.finite_difference_fit import nothing
 from loop_method.models.neighbour_fit import fitted
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import SPARSE_TERMS, FieldModelSettings
+
+_SPARSE_PRODUCTS = 2500
+"""Number of products above which products of three different numbers are not tried."""
+_SPARSE_LEFT = 0.5
+"""Share of the remaining squared change that another product may leave."""
 
 Product = tuple[int, ...]
 """The numbers of a state that are multiplied."""
@@ -44,7 +49,7 @@ def fit_sparse(
 ) -> FiniteDifferenceModel | None:
     """The equation or the map, or None where no product is found, or the plant is of another kind."""
     samples = samples.thinned(settings.near_samples)
-    found = chosen(samples, settings)
+    found = chosen(samples)
     if not found:
         return None
     n_z = samples.before.shape[1]
@@ -62,9 +67,9 @@ def products(n_z: int, most: int) -> list[Product]:
     return two + three
 
 
-def chosen(samples: Samples, settings: FieldModelSettings) -> list[Product]:
+def chosen(samples: Samples) -> list[Product]:
     """The products that some number's change is explained by, in the order of `products`."""
-    candidates = products(samples.before.shape[1], settings.sparse_products)
+    candidates = products(samples.before.shape[1], _SPARSE_PRODUCTS)
     size = np.sqrt(np.mean(samples.before**2, axis=0))
     z = samples.before / np.where(size > 0.0, size, 1.0)
     root = samples.weights()[:, None]
@@ -77,19 +82,19 @@ def chosen(samples: Samples, settings: FieldModelSettings) -> list[Product]:
     )
     left = np.linalg.norm(X, axis=0)
     X = X / np.where(left > _ROUNDING * before, left, np.inf)
-    found = {p for change in y.T for p in _pursued(X, change, settings)}
+    found = {p for change in y.T for p in _pursued(X, change)}
     return [candidates[p] for p in sorted(found)]
 
 
-def _pursued(X: Array, y: Array, settings: FieldModelSettings) -> list[int]:
+def _pursued(X: Array, y: Array) -> list[int]:
     """The columns of X, each of length 1 or 0, that explain y."""
     kept: list[int] = []
     rest = y
-    while len(kept) < settings.sparse_terms:
+    while len(kept) < SPARSE_TERMS:
         likely = int(np.argmax(np.abs(rest @ X)))
         together = X[:, [*kept, likely]]
         left = y - together @ np.linalg.lstsq(together, y)[0]
-        if likely in kept or not left @ left < settings.sparse_left * (rest @ rest):
+        if likely in kept or not left @ left < _SPARSE_LEFT * (rest @ rest):
             break
         kept.append(likely)
         rest = left

@@ -32,10 +32,13 @@ from numpy.typing import NDArray
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import FIRST_SUBSTEPS, FieldModelSettings
 from loop_method.models.spectral import SpectralModel, Spectrum
 from loop_method.models.symbols import Form, Regression, all_free, free_linear, polynomial
 from spectral_solver.polynomial_step import phi_functions
+
+_SETTLED = 1e-3
+"""Relative change of the one-step error at which the passes end."""
 
 POWERS = 3
 """Above this degree the multipliers are powers of ik, each with a polynomial; else they are symbols."""
@@ -60,7 +63,7 @@ def fit_spectral(
         np.eye(form.degree - 1),
         np.zeros((n_z, n_a)),
         np.zeros(n_z),
-        settings.first_substeps,
+        FIRST_SUBSTEPS,
         settings.clip * largest if form.degree > POWERS else np.inf,
     )
     # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
@@ -69,7 +72,7 @@ def fit_spectral(
         data = _regression(tried, samples, form)
         if data is None and best is None:
             break
-        settled = data is not None and abs(data.miss - least) <= settings.settled * least
+        settled = data is not None and abs(data.miss - least) <= _SETTLED * least
         if data is not None and data.miss < least and turn:
             best, least = tried, data.miss
         if turn == settings.passes or (settled and turn > len(form.shares)):
@@ -100,9 +103,9 @@ def _pass(
 ) -> SpectralModel | None:
     """The equation of a regression; None where it is not finite."""
     if form.free == "all":
-        linear, multipliers, polynomials = all_free(data, settings)
+        linear, multipliers, polynomials = all_free(data)
     elif form.free == "linear":
-        linear, multipliers, polynomials = free_linear(data, form, settings)
+        linear, multipliers, polynomials = free_linear(data, form)
     else:
         linear, multipliers, polynomials = polynomial(data, form, turn, settings)
     if form.degree <= POWERS:

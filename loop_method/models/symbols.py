@@ -15,8 +15,11 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.models.columns import Values
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import COEFFICIENT_RIDGE, FieldModelSettings
 from loop_method.models.spectral import Spectrum
+
+_SYMBOL_RIDGE = 1e-7
+"""Ridge of a free symbol, relative to the mean square of its column."""
 
 ORDERS = (4, 2, 2, 1, 1, 1, 1)
 """Highest derivative in the symbols of z, z^2, ...; (ik)^3 of z^2 makes the first pass explode."""
@@ -96,7 +99,7 @@ class Regression:
         self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
     ) -> Array:
         """Real coefficients of complex columns (N, terms) that explain values (N,) best."""
-        return _real_least_squares(columns, values, settings)
+        return _real_least_squares(columns, values)
 
     @property
     def k(self) -> Spectrum:
@@ -130,13 +133,13 @@ def polynomial(data: Regression, form: Form, turn: int, settings: FieldModelSett
     return linear, *_grouped(form, powers, found[count:], k)
 
 
-def free_linear(data: Regression, form: Form, settings: FieldModelSettings) -> Symbols:
+def free_linear(data: Regression, form: Form) -> Symbols:
     """L free at every wavenumber, and polynomials of ik for the powers."""
     k, compared = data.k, form.compared(len(data.k))
     rests, y = [data.rest(W) for W in data.W], data.rest(data.y)
     own = rests[0]
     size = np.sum(np.abs(own) ** 2, axis=0)
-    size = size + settings.symbol_ridge * np.mean(np.sum(np.abs(data.W[0]) ** 2, axis=0))
+    size = size + _SYMBOL_RIDGE * np.mean(np.sum(np.abs(data.W[0]) ** 2, axis=0))
     size = np.where(size > 0.0, size, 1.0)
 
     def rest(values: Spectrum) -> Spectrum:
@@ -145,7 +148,7 @@ def free_linear(data: Regression, form: Form, settings: FieldModelSettings) -> S
 
     powers, low = _power_terms(form), slice(compared)
     columns = np.stack([(rest(rests[p]) * k**j)[:, low].ravel() for p, j in powers], axis=1)
-    found = _real_least_squares(columns, rest(y)[:, low].ravel(), settings)
+    found = _real_least_squares(columns, rest(y)[:, low].ravel())
     multipliers, polynomials = _grouped(form, powers, found, k)
     left = y - np.einsum("pk,pnk->nk", polynomials.T @ multipliers, np.stack(rests[1:]))
     linear = data.symbols[0] + np.sum(np.conj(own) * left, axis=0) / size
@@ -154,10 +157,10 @@ def free_linear(data: Regression, form: Form, settings: FieldModelSettings) -> S
     return _unwound(linear, compared), multipliers, polynomials
 
 
-def all_free(data: Regression, settings: FieldModelSettings) -> Symbols:
+def all_free(data: Regression) -> Symbols:
     """All symbols free at every wavenumber, near the current ones where data do not determine them."""
     rests, y = np.stack([data.rest(W) for W in data.W]), data.rest(data.y)
-    ridge = settings.coefficient_ridge * np.sum(np.abs(data.W) ** 2, axis=1).T
+    ridge = COEFFICIENT_RIDGE * np.sum(np.abs(data.W) ** 2, axis=1).T
     ridge = np.where(ridge > 0.0, ridge, 1.0)  # (wavenumbers, P)
     gram = np.einsum("pnk,qnk->kpq", np.conj(rests), rests)
     moment = np.einsum("pnk,nk->kp", np.conj(rests), y)
@@ -203,11 +206,11 @@ def _unwound(linear: Spectrum, known: int) -> Spectrum:
     return found
 
 
-def _real_least_squares(A: Spectrum, y: Spectrum, settings: FieldModelSettings) -> Array:
+def _real_least_squares(A: Spectrum, y: Spectrum) -> Array:
     """Real coefficients of complex columns."""
     scale = np.sqrt(np.sum(np.abs(A) ** 2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
     A = A / scale
-    gram = (A.conj().T @ A).real + settings.coefficient_ridge * np.eye(A.shape[1])
+    gram = (A.conj().T @ A).real + COEFFICIENT_RIDGE * np.eye(A.shape[1])
     found: Array = np.linalg.solve(gram, (A.conj().T @ y).real) / scale
     return found

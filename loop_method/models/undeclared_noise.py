@@ -23,8 +23,15 @@ from loop_interfaces.one_thread import one_thread
 from loop_method.models.base import FieldModel, Measured
 from loop_method.models.choice import FittedModel, fit_field_model, limited, with_clean
 from loop_method.models.noise_level import noise_level, share_of_noise, short_waves
-from loop_method.models.settings import FieldModelSettings
+from loop_method.models.settings import FAR, LEAST_CORRECTION, NOISE_MISJUDGED, FieldModelSettings
 from loop_method.models.whiteness import is_white
+
+_NOISE_EXCESS = 1.3
+"""Largest root mean square of the innovations of an equation, relative to the noise."""
+_WHITE_LEVEL = 0.01
+"""Rate at which the test for white innovations rejects independent noise."""
+_WHITE_TOLERANCE = 0.5
+"""Root sum of squares of the correlations of innovations that counts as white."""
 
 PREDICTED = 0.5
 """E of a model without noise, relative to the share of the noise, below which there is no noise."""
@@ -66,7 +73,7 @@ def fit_undeclared_noise(
     """
     states = [np.asarray(rollout.states) for rollout in rollouts]
     noise = noise_level(states)
-    misjudged = max(noise, declared) > settings.noise_misjudged * min(noise, declared)
+    misjudged = max(noise, declared) > NOISE_MISJUDGED * min(noise, declared)
     if (
         not noise
         or not misjudged
@@ -85,18 +92,18 @@ def fit_undeclared_noise(
         return None
     known = with_clean([limited(rollout, action_set) for rollout in rollouts], noise)
     with one_thread():
-        left = innovations(found.model, known, noise, settings)
+        left = innovations(found.model, known, noise)
     if left is None:
         return None
     short = [short_waves(own) for own in left]
-    if not is_white(short, settings.white_level, settings.white_tolerance):
+    if not is_white(short, _WHITE_LEVEL, _WHITE_TOLERANCE):
         return None
     size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
-    return (found, noise) if size <= settings.noise_excess * noise else None
+    return (found, noise) if size <= _NOISE_EXCESS * noise else None
 
 
 def innovations(
-    model: FieldModel, rollouts: Sequence[Measured], noise: float, settings: FieldModelSettings
+    model: FieldModel, rollouts: Sequence[Measured], noise: float
 ) -> list[Array] | None:
     """Measured minus predicted states (L, n_z) of each rollout, along its filtered states.
 
@@ -107,12 +114,12 @@ def innovations(
     for _ in range(_TURNS):
         left = []
         for rollout in rollouts:
-            if (own := _along(model, rollout, shares, settings.far)) is None:
+            if (own := _along(model, rollout, shares, FAR)) is None:
                 return None
             left.append(own)
         spectra = np.concatenate([scipy.fft.rfft(own) / model.n_z for own in left])
         error = np.maximum(np.mean(np.abs(spectra) ** 2, axis=0) - power, 0.0)
-        shares = np.clip(error / (error + power), settings.least_correction, 1.0)
+        shares = np.clip(error / (error + power), LEAST_CORRECTION, 1.0)
     return left
 
 

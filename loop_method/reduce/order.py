@@ -42,6 +42,9 @@ from loop_method.reduce.reduced_model import (
 from loop_method.reduce.regression import fit, needs_constant
 from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
 
+_ORDER_PIECES = 8
+"""Number of pieces of an exploratory episode from which an order is suggested."""
+
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
 MOST = 8
 """The highest order by which it is decided whether models have a constant term."""
@@ -225,7 +228,7 @@ def _folds(
     trajectories: Sequence[Trajectory], settings: IdentificationSettings
 ) -> Iterator[tuple[list[Trajectory], list[Trajectory]]]:
     """Pieces to fit to and pieces that are held out."""
-    cut, folds = pieces(trajectories, settings.order_pieces), settings.order_folds
+    cut, folds = pieces(trajectories, _ORDER_PIECES), settings.order_folds
     for fold in range(folds):
         held = cut[fold::folds]
         fitted = [piece for i, piece in enumerate(cut) if i % folds != fold]

@@ -43,7 +43,9 @@ from loop_interfaces.one_thread import one_thread
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
 from loop_method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
-from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
+
+_SUBSPACE_TOLERANCE = 1.02
+"""Multiple of the least held-out error up to which a lower order is chosen."""
 
 PASTS = (1, 2, 3, 4, 6, 8)
 """Steps p of the vector ARX that are tried."""
@@ -103,7 +105,6 @@ def subspace_model(
     order: int = 0,
     past: int = 0,
     channels: Channels = NUMBERED,
-    settings: IdentificationSettings = DEFAULTS,
     constant: bool = False,
 ) -> InnovationModel:
     """Identify a model in innovation form.
@@ -118,8 +119,6 @@ def subspace_model(
         p; 0: that of the least error.
     channels : Channels
         Names of states and inputs in error messages.
-    settings : IdentificationSettings
-        `subspace_tolerance`.
     constant : bool
         Identify the model about the means of measurements and inputs, from which its constant term
         follows: degrees and per cent of a machine at rest are then no mode that never decays.
@@ -158,7 +157,7 @@ def subspace_model(
         if len(tried) == 1:
             (p, n), errors = tried[0], [np.nan]
         else:
-            p, n, errors = _choose(tried, known, settings.subspace_tolerance)
+            p, n, errors = _choose(tried, known, _SUBSPACE_TOLERANCE)
         error = errors[tried.index((p, n))]
         found = _fitted(known, p, n, channels, error, constant=constant)
         table = tuple((*sizes, own) for sizes, own in zip(tried, errors, strict=True))

@@ -11,6 +11,8 @@ import pytest
 from loop_interfaces.action_set import ActionSet
 from loop_method.adapt import ModelBased
 from loop_method.adapt.estimated_loop import (
+    FILTER_INFLATION,
+    FILTER_MODES,
     UNPREDICTED,
     estimated_laws,
     least_trusting,
@@ -160,7 +162,7 @@ def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> No
     others, equal = fields(20, seed=1), np.full(20, 1.0 / 20.0)
     none = loop.costs(loop.no_control, others) @ equal
     own = [loop.costs(theta, others) @ equal for theta in laws]
-    whole = whole_field_law(loop, every, weights, settings, settings.filter_modes)
+    whole = whole_field_law(loop, every, weights, settings, FILTER_MODES)
     assert whole is not None
     best = whole.loop.costs(whole.theta, others) @ equal
     assert best < 0.9 * none
@@ -177,7 +179,7 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
 
     def theta_with(times: float) -> Array:
         noise = noise_of_filter(CUBIC, settings, times)
-        return law.vector(parts | {"noise": np.array([noise, settings.filter_inflation])})
+        return law.vector(parts | {"noise": np.array([noise, FILTER_INFLATION])})
 
     assert same_bits(theta_with(1.0), best)
     others = [theta_with(times) for times in UNPREDICTED]

@@ -8,7 +8,7 @@ import pytest
 
 from loop_method.models import FieldModelSettings, fit_field_model
 from loop_method.models.base import Samples
-from loop_method.models.kinds import NEAR_RIDGES, kinds_of
+from loop_method.models.kinds import NEAR_NEEDED, NEAR_RIDGES, kinds_of
 from loop_method.models.neighbour_fit import fit_neighbours
 from loop_method.models.prediction import errors
 from tests.support.ordinary import rolled_out
@@ -133,5 +133,5 @@ def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():
     rollouts = explored(lambda z: 0.2 * (neighbour(z, 1) - 2 * z + neighbour(z, -1)) - z, 3, N_X)
     settings = FieldModelSettings(reproduced=0.0, largest_degree=2, passes=2, folds=2)
     fitted = fit_field_model(rollouts, np.zeros(N_X), settings=settings)
-    assert fitted is not None and fitted.error < settings.near_needed
+    assert fitted is not None and fitted.error < NEAR_NEEDED
     assert not any(kind.startswith(("near", "two-near")) for kind, _ in fitted.candidates)

@@ -25,7 +25,12 @@ from loop_method.models.sensed_fit import fit_sensed, part_by_part
 from loop_method.models.sensed_growth import Found
 from loop_method.models.sensed_problem import SensedProblem
 from loop_method.models.sensed_unknowns import COEFFICIENTS, SHARED, TERMS, unknowns
-from loop_method.models.settings import DEFAULTS
+from loop_method.models.settings import (
+    DEFAULTS,
+    SENSED_HELD_RIDGE,
+    SENSED_HOPELESS,
+    SENSED_REPRODUCED,
+)
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
@@ -174,7 +179,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
             0.03 * scale,
             settings=replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15),
         )
-    assert error < DEFAULTS.sensed_reproduced
+    assert error < SENSED_REPRODUCED
     square = SensedEquation(shared, grid_points(16), actuators).symbols[1]
     # -1/2 (u^2)_x of readings that are scaled, in a sampling time of 0.05.
     assert square[1].imag == pytest.approx(-0.05 * np.pi / scale, rel=0.15)
@@ -261,12 +266,12 @@ def test_noise_at_the_beginning_of_rollouts_moves_no_actuator() -> None:
 
     problem = Recorded(readings, actions, actuators, sigma, np.zeros(SENSORS), np.full(2, np.nan))
     with threadpool_limits(1):
-        last = part_by_part(problem, shared, problem.interpolated(), DEFAULTS)[1]
+        last = part_by_part(problem, shared, problem.interpolated())[1]
     before = found[0][1]
     assert np.abs(before[COEFFICIENTS + 1 :]).max() < 0.1
     np.testing.assert_allclose(last[SHARED:], [0.0, 3.0, -3.0], atol=1.0)
     fits = len(found)
-    given_up = part_by_part(problem, shared, problem.interpolated(), DEFAULTS, -1.0)
+    given_up = part_by_part(problem, shared, problem.interpolated(), -1.0)
     assert np.isinf(given_up[0]) and len(found) == fits + 1 and not problem.prior.place_ridge
 
 
@@ -326,7 +331,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
         worse, wanted = np.inf, 0.0
         again = fit_sensed(readings, actions, actuators, 1.0, shared, **few)[0]
         assert again.any() and len(starts) == 6
-        assert mosts == [(), (DEFAULTS.sensed_hopeless,)] * 2 + [(DEFAULTS.sensed_hopeless,)] * 2
+        assert mosts == [(), (SENSED_HOPELESS,)] * 2 + [(SENSED_HOPELESS,)] * 2
         # A spread that followed from an earlier equation holds neither a third fit nor the choice.
         every_other = replace(few["settings"], sensed_compared=6)
         worse, known = 0.0, {"settings": every_other, "spread": np.full(33, 0.1)}
@@ -343,7 +348,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
                 held = coefficients_of(kept)
                 assert truly(problem, found, likeliest) < truly(problem, found, held)
     # What two of them have to say of each actuator is noise.
-    assert ridges == [DEFAULTS.sensed_held_ridge] * 2
+    assert ridges == [SENSED_HELD_RIDGE] * 2
     # Nobody says where those of a plant of one's own are.
     free = SensedProblem(readings, actions, equally_spaced(3), 1.0, readings[0, 0], np.ones(3))
     assert not free.holds

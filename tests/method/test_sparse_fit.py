@@ -58,7 +58,7 @@ def late(count=3, steps=80):
 def test_the_products_of_a_network_are_found_and_its_equation_recovered():
     rollouts = network()
     samples = Samples.of(rollouts[:2])
-    assert set(PRODUCTS) <= set(chosen(samples, SETTINGS))
+    assert set(PRODUCTS) <= set(chosen(samples))
     model = fit_sparse(samples, kind="sparse", settings=SETTINGS, is_map=False)
     assert model is not None and model.substeps > 0
     found = {f.factors: model.coefficients[n, :, 0] for n, f in enumerate(model.features)}
