@@ -49,8 +49,8 @@ def estimated_laws(
     weights: Array,
     settings: ModelBasedSettings,
     models: FieldModelSettings,
-) -> tuple[list[Array], Array, int]:
-    """Theta of laws on the estimate, their modes and the steps of L-BFGS; none if none is finite.
+) -> tuple[list[Array], int]:
+    """Theta of laws on the estimate, and the steps of L-BFGS; none if none is finite.
 
     That of the whole field, and one that is optimised with noise on what it sees, so that it depends
     less on what an estimate has wrong; each with filters that know the initial fields well, and less.
@@ -59,7 +59,7 @@ def estimated_laws(
     assert isinstance(model, SensedModel)
     whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
     if whole is None:
-        return [], np.empty((0, 0)), 0
+        return [], 0
     size = root_mean_square(model.spread)
     noise = noise_of_filter(model, settings)
     filters = [
@@ -76,7 +76,7 @@ def estimated_laws(
             theta, steps = better.theta, steps + better.steps
         K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
         found += [law.theta_of(K, b, known, models) for known in filters]
-    return found, whole.loop.U, steps
+    return found, steps
 
 
 def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
@@ -135,16 +135,9 @@ def root_mean_square(spread: Array) -> float:
 
 
 def simulate_estimated(
-    loop: ClosedLoop,
-    law: ExtendedKalman,
-    theta: Array,
-    fields: Array,
-    gains: list[Array] | None = None,
+    loop: ClosedLoop, law: ExtendedKalman, theta: Array, fields: Array
 ) -> Simulation:
-    """Roll the law's vector theta out from the fields (F, n); the simulation has no features.
-
-    gains: where the filter's gain in each step, (F, n, n_y), is added.
-    """
+    """Roll the law's vector theta out from the fields (F, n); the simulation has no features."""
     parts, model = law.parts(theta), loop.model
     assert isinstance(model, SensedModel)
     T, count = loop.horizon, len(fields)
@@ -165,8 +158,6 @@ def simulate_estimated(
             s = y @ law.model.U
             p = p if k else s
             x, S = known.measured(x, S, y)
-            if gains is not None:
-                gains.append(known.gain(S))
             a = x @ parts["K_e"].T + p @ parts["K"].T + s @ parts["D"].T + parts["b"]
             loop.action_set.project(a, out=a)
             error = z - loop.target

@@ -6,9 +6,7 @@ designed and improved on it as on a model of the whole field, from the initial f
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
 current law and those of `observer_design`. Laws are compared on other draws. In simulations of the
 filter's own equation what trusts it looks too good: the cheapest law on an estimate gets a filter that
-trusts the equation less where it then costs hardly more. With `filter_equations` above 1 laws are
-compared on plants of the equations believed before as well, and the last one is improved through its
-filter.
+trusts the equation less where it then costs hardly more.
 The last rollouts of the final law begin where those of the first law did, and these pairs decide
 between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
 law that measured better than the final one is returned in its place.
@@ -22,14 +20,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, Rollout, Row
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.estimate import Estimate, mean_of
 from loop_method.adapt.estimated_loop import estimated_laws, least_trusting
-from loop_method.adapt.filtered_loop import improve_through_filter
 from loop_method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from loop_method.adapt.initial_fields import mixtures, weighted
 from loop_method.adapt.model_based import ModelBased
@@ -51,8 +47,6 @@ from loop_method.adapt.verdict import (
 from loop_method.adapt.whole_field_law import whole_field_law
 from loop_method.laws.extended_kalman import ExtendedKalman
 from loop_method.models.sensed import SensedModel
-from loop_method.models.sensed_ensemble import SensedEnsemble, ensemble
-from loop_method.models.sensed_unknowns import unknowns
 from loop_method.models.settings import SENSED_REPRODUCED
 
 _ATTEMPTS = 5
@@ -61,8 +55,6 @@ _OBSERVER_GAIN = 3e-4
 """As `least_gain`, for the last improvement of the law observer."""
 _OBSERVER_DRAWS = 2
 """Sets of drawn initial fields, each of at most `mixtures`, for a law between few sensors."""
-_FILTER_DRAWS = 4
-"""Sets of drawn initial fields, each of at most mixtures, for such a law."""
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
 OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
@@ -71,13 +63,6 @@ OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
 
 class ModelBasedSensed(ModelBasedReadings):
     """`ModelBasedReadings`, on a model of the field as long as one reproduces the readings."""
-
-    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        super().restore(state)
-        expected = unknowns(self._context.exploration.actions.shape[1])
-        for shared in self._progress.equations:
-            if len(shared) != expected:
-                raise ValueError(f"its equations have {len(shared)} unknowns; expected {expected}")
 
     @property
     def _sensed(self) -> SensedModel | None:
@@ -144,7 +129,6 @@ class ModelBasedSensed(ModelBasedReadings):
             super()._improve(belief, row, final)
             return
         loop, fields = sensed_loop(self._context, belief.model), self._fields()
-        plants = replace(loop, model=self._plants(belief.model))
         progress, settings, law = self._progress, self._settings, self._context.law
         # A law with memory has many parameters, and simulations cost no rollout.
         sets = _OBSERVER_DRAWS if final else 1
@@ -153,69 +137,29 @@ class ModelBasedSensed(ModelBasedReadings):
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
-        improved: list[Array] = []
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
-            designed_from = every, weights
-            further, modes, more = estimated_laws(
-                loop, law, *designed_from, settings, self._context.field_models
+            further, more = estimated_laws(
+                loop, law, every, weights, settings, self._context.field_models
             )
             laws, steps = [*laws, *further], steps + more
-            # What the equation has wrong shows more in rollouts of a law that is not adapted to it.
-            if final and further:
-                improved, more = self._improved(plants, law, further, modes, designed_from, fields)
-                laws, steps = [*laws, *improved], steps + more
         if not laws:
             row["reason"] = "no improved law stays finite on the model; the law is kept"
             return
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
-        theta = cheapest(plants, [now, *laws], held_out, equal)
+        theta = cheapest(loop, [now, *laws], held_out, equal)
         if theta is not now:
-            own = any(theta is known for known in improved)  # for its filter
-            if isinstance(law, ExtendedKalman) and theta.ndim == 1 and not own:
-                theta = least_trusting(plants, law, theta, held_out, settings)
+            if isinstance(law, ExtendedKalman) and theta.ndim == 1:
+                theta = least_trusting(loop, law, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
-        first = plants.costs(loop.theta(self._first), held_out)
-        none = plants.costs(loop.no_control, held_out)
-        # From some fields an earlier equation may run away under any law.
+        first = loop.costs(loop.theta(self._first), held_out)
+        none = loop.costs(loop.no_control, held_out)
         progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
-        change = gained(plants.costs(theta, held_out), first if progress.safe else none)
+        change = gained(loop.costs(theta, held_out), first if progress.safe else none)
         progress.fraction, progress.change = 1.0, change
         row["steps"] = steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
-
-    def _improved(
-        self,
-        plants: SensedLoop,
-        law: ExtendedKalman,
-        laws: Sequence[Array],
-        modes: Array,
-        designed_from: tuple[Array, Array],
-        fields: Array,
-    ) -> tuple[list[Array], int]:
-        """The cheapest of the laws on an estimate, improved through its filter, and the steps.
-
-        designed_from: initial fields and their weights. None on the plant of one equation, that of the
-        filter, on which it would look too good.
-        """
-        settings = self._settings
-        assert isinstance(plants.model, SensedEnsemble)
-        if len(plants.model.members) < 2:
-            return [], 0
-        drawn = self._drawn(fields, _FILTER_DRAWS, 2)
-        many = weighted(fields, drawn, MEASURED_SHARE)
-        best = cheapest(plants, laws, *designed_from)
-        best = least_trusting(plants, law, best, designed_from[0], settings)
-        best, steps = improve_through_filter(plants, law, best, modes, *many, settings)
-        return [best], steps
-
-    def _plants(self, model: SensedModel) -> SensedEnsemble:
-        """The model, and the equations that were believed before it, to which it is added."""
-        known, most = self._progress.equations, self._settings.filter_equations - 1
-        earlier = known[max(len(known) - most, 0) :]
-        self._progress.equations = [*earlier, model.shared.copy()]
-        return ensemble(model, earlier[::-1], self._context.field_models)
 
     def _drawn(self, fields: Array, sets: int, which: int) -> Array:
         """Draws from the distribution of the fields, as often as there are sets."""

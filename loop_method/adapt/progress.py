@@ -53,8 +53,6 @@ class Progress:
         True if the first law is better than no control on the model.
     noise : float
         Measurement noise that was found in place of the declared one; 0: none was.
-    equations : list of arrays
-        Unknowns of the last equations of a field between few sensors believed, the newest last.
     """
 
     policy: Array
@@ -70,7 +68,6 @@ class Progress:
     none_is_close: bool = False
     safe: bool = True
     noise: float = 0.0
-    equations: list[Array] = field(default_factory=list)
 
     def state(self) -> State:
         """All of it, as the arrays of a checkpoint."""
@@ -87,8 +84,6 @@ class Progress:
         }
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
-        if self.equations:
-            arrays["equations"] = np.stack(self.equations)
         if self.belief is not None:
             arrays |= self.belief.state()
         return arrays
@@ -102,9 +97,6 @@ class Progress:
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
-        equations: list[Array] = []
-        if "equations" in state:
-            equations = [a.copy() for a in checked_array(state, "equations", "f", (None, None))]
         fraction, change = fraction_and_change(state, finite=False)
         return cls(
             checked_array(state, "policy", "f", shape).copy(),
@@ -120,7 +112,6 @@ class Progress:
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
             noise=noise_of(state),
-            equations=equations,
         )
 
 

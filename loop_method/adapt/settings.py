@@ -115,17 +115,6 @@ class ModelBasedSettings(ImprovementSettings):
         0.0,
         1.0,
     )
-    filter_iterations: int = setting(
-        30, "as iterations, for a law on an estimate that is improved through its filter", 1, 10_000
-    )
-    filter_equations: int = setting(
-        1,
-        "number of equations, the newest and those before it, on which laws between few sensors "
-        "are compared; with more than 1 the last law on an estimate is also improved through its "
-        "filter",
-        1,
-        100,
-    )
     filter_margin: float = setting(
         0.03,
         "largest relative increase in the cost on the model at which a filter that trusts the "

@@ -87,11 +87,6 @@ class SensedFilter:
         S = (vectors / np.sqrt(values)[:, None]) @ (turned @ S)
         return np.where(lost.reshape(-1, 1), np.nan, x), S
 
-    def gain(self, S: Array) -> Array:
-        """L = S S^T H^T / sigma^2, (M, n, n_y), of S after the reading."""
-        found: Array = S.swapaxes(1, 2) @ (S[:, :, self.model.seen] / self.sigma**2)
-        return found
-
     def predicted(self, x: Array, S: Array, a: Array) -> tuple[Array, Array]:
         """After a step under the actions a (M, n_a)."""
         count, columns, n = S.shape

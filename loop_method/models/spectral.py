@@ -107,9 +107,7 @@ class SpectralModel:
         )
         return PolynomialStep(equation)
 
-    def _alike(
-        self, states: Array
-    ) -> Iterator[tuple[PolynomialStep | SpectralModel, NDArray[np.bool_] | slice]]:
+    def _alike(self, states: Array) -> Iterator[tuple[PolynomialStep, NDArray[np.bool_]]]:
         """The rows of states that are stepped alike, and by what."""
         level = np.searchsorted(self.fewer[:, 0], np.abs(states).max(axis=1, initial=0.0))
         level = np.minimum(level, len(self.fewer))  # NaN is beyond infinity

@@ -12,15 +12,13 @@ import pytest
 
 from loop_method.adapt import Context, ModelBased, Record, Rollout, Trajectory, model_based_sensed
 from loop_method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
-from loop_method.adapt.filtered_loop import improve_through_filter
 from loop_method.adapt.model_based_readings import ModelBasedReadings
 from loop_method.adapt.model_based_sensed import ModelBasedSensed, gained
-from loop_method.adapt.progress import JUDGING, RENEWING
-from loop_method.adapt.sensed_loop import sensed_from, sensed_loop
+from loop_method.adapt.progress import JUDGING
+from loop_method.adapt.sensed_loop import sensed_from
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.laws import ExtendedKalman, Observer
 from loop_method.models.sensed import SensedModel
-from loop_method.models.sensed_unknowns import TERMS
 from tests.support.sensed import SENSORS
 from tests.support.sensed_optimiser import N_A, measured, optimiser, small, told
 from tests.support.small import same_bits
@@ -173,69 +171,6 @@ def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_ma
     assert own._sensed is not None and law.estimates(own.policy)
     noise = law.parts(own.policy)["noise"][0]
     assert noise == noise_of_filter(own._sensed, settings, UNPREDICTED[0])
-
-
-def test_laws_are_improved_on_the_plants_of_the_equations_believed_so_far(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _, context = small()
-    assert isinstance(context.law, Observer)
-    law = ExtendedKalman(context.law.model, context.horizon)
-    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=1, filter_equations=2)
-    known, improved = improve_through_filter, []
-
-    def improve(plants: Any, *given: Any) -> tuple[np.ndarray, int]:
-        found = known(plants, *given)
-        improved.append([model.shared for model in plants.model.members])
-        return found
-
-    monkeypatch.setattr(model_based_sensed, "improve_through_filter", improve)
-
-    def begun() -> ModelBasedSensed:
-        near = replace(context, law=law)
-        return ModelBasedSensed(
-            law.theta_start, seed=0, rollouts=4, settings=settings, context=near
-        )
-
-    own, newest, halfway = begun(), [], begun()
-    while own._progress.stage == RENEWING:
-        if len(newest) == 1:
-            halfway.restore(own.state())
-        results = [measured(asked) for asked in own.ask()]
-        row = own.tell(results)
-        assert own._sensed is not None
-        newest.append(own._sensed.shared)
-    assert len(newest) == 2 and not same_bits(*newest)
-    assert len(improved) == 1, "not on the plant of the filter alone"
-    assert same_bits(np.stack(improved[0]), np.stack(newest[::-1]))
-    assert halfway.tell(results) == row and same_bits(halfway.policy, own.policy)
-    assert same_bits(np.stack(improved[1]), np.stack(improved[0]))
-    later = copy.deepcopy(own)
-    assert later._sensed is not None
-    members = later._plants(replace(later._sensed, shared=2.0 * newest[1])).members
-    assert same_bits(np.stack([model.shared for model in members]), [[2.0], [1.0]] * newest[1])
-    later = begun()
-    later.restore(own.state())
-    assert same_bits(np.stack(later._progress.equations), np.stack(own._progress.equations))
-    wrong = own.state() | {"equations": np.zeros((2, 7))}
-    with pytest.raises(ValueError, match="its equations have 7 unknowns; expected"):
-        later.restore(wrong)
-
-
-def test_an_earlier_equation_on_which_every_law_runs_away_decides_nothing() -> None:
-    own, *_ = told(better=True, rollouts=7, judging=3)
-    belief, row = own._progress.belief, dict[str, Any]()
-    assert belief is not None and isinstance(belief.model, SensedModel) and own._progress.safe
-    wild = belief.model.shared.copy()
-    wild[TERMS.index((3, 0))] = 1e3
-    own._progress.equations = [wild]
-    own._settings = replace(own._settings, filter_equations=2)
-    loop, plants = sensed_loop(own._context, belief.model), copy.deepcopy(own)._plants(belief.model)
-    for law in own._none, own._first:
-        lost = np.isinf(replace(loop, model=plants).costs(loop.theta(law), own._fields()))
-        assert lost[1::2].all() and not lost[::2].any() and lost.any()
-    own._improve(belief, row, False)
-    assert own._progress.safe and float(row["predicted_change"]) < 0.0
 
 
 def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_again() -> None:
