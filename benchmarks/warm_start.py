@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from loop_interfaces.spec import OPTIMIZER_SETTINGS
 from pdeloop.in_process import LocalPair
 from tuner_node.build import build_training
 from tuner_node.training import Training
@@ -32,7 +33,10 @@ def warm_start(
         `starts()[0]` is the law it begins with, `models[0]` the reduced model, `explorations[0]` and
         `measured[0]` are trajectories, and `budget.paid[0]` is what they cost.
     """
-    training = build_training({**values, "optimizer": optimizer, "seeds": 1})
+    # The settings of another optimizer are none of this one's.
+    own = {k: v for k, v in values.items() if not k.startswith(OPTIMIZER_SETTINGS)}
+    own = dict(values) if values["optimizer"] == optimizer else own
+    training = build_training({**own, "optimizer": optimizer, "seeds": 1})
     training.settings = replace(training.settings, trajectories=True)
     while training.phase in ("identify", "check"):
         batch = training.next_batch()
