@@ -22,6 +22,7 @@ from loop_method.adapt.trajectories import within
 from loop_method.laws.feedforward import FeedForward
 from loop_method.laws.observer import Observer
 from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
+from loop_method.models.choice import fit_kind, limited
 from loop_method.models.files import model_of
 from loop_method.models.prediction import errors, pieces
 from loop_method.models.readings import ReadingsModel, fit_readings
@@ -33,6 +34,10 @@ _CHAOTIC_GROWTH = 20.0
 """Minimum ratio of the errors on whole rollouts and on pieces."""
 
 _MODEL = "model."
+FEWEST = 2
+"""Rollouts of a law that say how near to the target it keeps the state."""
+LEAST = 1e-6
+"""Least unit of a number of the state, relative to the largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +136,7 @@ def believe(
     parts : int
         Pieces of equal length that are predicted in place of a rollout.
     """
-    if context.sensors and isinstance(context.law, Observer):
+    if _reads(context):
         return _of_readings(context, records)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
     if parts > 1:
@@ -165,8 +170,7 @@ def also_in_pieces(
     those of a plant that is described badly add up.
     """
     most = largest_error(context, settings)
-    of_readings = bool(context.sensors) and isinstance(context.law, Observer)
-    if whole.error <= most or of_readings:
+    if whole.error <= most or _reads(context):
         return whole
     most = min(most, whole.error / _CHAOTIC_GROWTH)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
@@ -192,12 +196,79 @@ def also_near(
     Else `belief` itself. A first law may drive the plant to where no model follows, and no good law
     leads.
     """
-    near = [within(record, limit) for record in records]
-    lost = sum(len(record.states) for record in records) - sum(len(own.states) for own in near)
-    if not lost or (context.sensors and isinstance(context.law, Observer)):
+    if _reads(context):
+        return belief
+    return _of_parts(context, [within(own, limit) for own in records], records, belief, settings)
+
+
+def also_around(
+    context: Context,
+    records: Sequence[Record],
+    belief: Belief | None,
+    settings: ImprovementSettings,
+    law: Array,
+) -> Belief | None:
+    """A model of what stays as near to the target as a law's rollouts, where none predicts the rest.
+
+    Else `belief` itself. Explorations of an unstable plant lead far from the target, and are then most
+    of what a model is judged by. Near to it there may be little excitation left, and a model then knows
+    the plant under its laws alone: rollouts of each law must be predicted by those of the others.
+    """
+    own = [record for record in records if record.usable and np.array_equal(record.policy, law)]
+    if len(own) < FEWEST or _reads(context):
+        return belief
+    away = np.concatenate([record.states for record in own]) - context.target
+    units = np.sqrt(np.mean(away**2, axis=0))
+    units = np.maximum(units, LEAST * max(float(units.max()), 1e-300))
+    limit = float(np.abs(away / units).max())
+    near = [within(record, limit, context.target, units) for record in records]
+    found = _of_parts(context, near, records, None, settings)
+    return found if found and _predicts_others(context, near, found, settings) else belief
+
+
+def _predicts_others(
+    context: Context, records: Sequence[Record], belief: Belief, settings: ImprovementSettings
+) -> bool:
+    """True if a model of this kind predicts rollouts of laws that it was not fitted to."""
+    groups: dict[bytes, list[Measured]] = {}
+    for record in records:
+        if len(record.actions):
+            rollout = limited(_measured(context, record), context.action_set)
+            groups.setdefault(record.policy.tobytes(), []).append(rollout)
+    worst, found = context.field_models.worst, []
+    for group in groups:
+        others = [rollout for name in groups if name != group for rollout in groups[name]]
+        model = others and fit_kind(
+            belief.model.kind,
+            others,
+            settings=context.field_models,
+            noise=context.noise,
+            line=context.line,
+            shape=context.shape,
+        )
+        if not model:
+            return False
+        found.append(errors(model, groups[group], context.target, worst, context.noise).mean())
+    return bool(np.mean(found) <= largest_error(context, settings))
+
+
+def _of_parts(
+    context: Context,
+    near: Sequence[Record],
+    records: Sequence[Record],
+    belief: Belief | None,
+    settings: ImprovementSettings,
+) -> Belief | None:
+    """The model of the beginnings `near` of rollouts, if it predicts them; else `belief`."""
+    if sum(len(record.states) for record in records) == sum(len(own.states) for own in near):
         return belief
     found = believe(context, [own for own in near if len(own.actions)])
     return found if found and found.error <= largest_error(context, settings) else belief
+
+
+def _reads(context: Context) -> bool:
+    """True if the law estimates the state from few readings."""
+    return bool(context.sensors) and isinstance(context.law, Observer)
 
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:

@@ -35,7 +35,14 @@ from loop_method.adapt.base import (
     require_positive,
     require_results,
 )
-from loop_method.adapt.belief import Belief, also_in_pieces, also_near, believe, largest_error
+from loop_method.adapt.belief import (
+    Belief,
+    also_around,
+    also_in_pieces,
+    also_near,
+    believe,
+    largest_error,
+)
 from loop_method.adapt.estimate import Estimate
 from loop_method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
 from loop_method.adapt.progress import ENDED, JUDGING, RENEWING, Progress
@@ -45,6 +52,7 @@ from loop_method.adapt.replay import (
     GROWS,
     LARGEST_TRUST,
     SHRINKS,
+    best_measured,
     best_on_same_fields,
     costs_by_field,
     step,
@@ -304,6 +312,9 @@ class ModelBased(Optimizer):
             belief = also_in_pieces(self._context, known, belief, self._settings)
         if belief is None or not self._is_believed(belief):
             belief = also_near(self._context, known, belief, self._settings, self._reach)
+        if belief is None or not self._is_believed(belief):
+            best = best_measured(self._records.all(), self._first)
+            belief = also_around(self._context, known, belief, self._settings, best)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):

@@ -179,9 +179,11 @@ class Records:
         return states[:length], actions[: max(length - 1, 0)]
 
 
-def within(record: Record, limit: float) -> Record:
-    """The rollout up to the first state that exceeds this magnitude."""
-    far = np.abs(record.states).max(axis=1) > limit
+def within(
+    record: Record, limit: float, centre: Array | float = 0.0, units: Array | float = 1.0
+) -> Record:
+    """The rollout up to the first state of which a number is farther from `centre`, in units."""
+    far = np.abs((record.states - centre) / units).max(axis=1) > limit
     if not far.any():
         return record
     length = int(np.argmax(far))

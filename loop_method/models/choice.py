@@ -167,6 +167,26 @@ def fit_field_model(
     return None
 
 
+def fit_kind(
+    name: str,
+    rollouts: Sequence[Measured],
+    *,
+    settings: FieldModelSettings = DEFAULTS,
+    noise: float = 0.0,
+    action_set: ActionSet = ANY_ACTION,
+    line: bool = True,
+    shape: tuple[int, ...] = (),
+) -> FieldModel | None:
+    """The model of one kind, fitted to all rollouts; None where it cannot be. Arguments: as above."""
+    rollouts = [limited(rollout, action_set) for rollout in rollouts]
+    if noise:
+        rollouts = with_clean(rollouts, noise, line=line)
+    n_z = rollouts[0].states.shape[1]
+    kinds = {kind.name: kind for kind in kinds_of(n_z, 1, settings, line=line, shape=shape)}
+    with one_thread():
+        return _fitted(kinds[name], rollouts, noise)
+
+
 def with_clean(
     rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
 ) -> list[Measured]:

@@ -12,8 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory, model_based
-from loop_method.adapt.belief import believe
+from loop_method.adapt import (
+    Context,
+    ModelBased,
+    Record,
+    RolloutResult,
+    Trajectory,
+    model_based,
+)
+from loop_method.adapt.belief import also_around, believe
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import ADAPTED, FIRST
@@ -232,6 +239,51 @@ def test_a_first_law_that_leads_to_where_no_model_follows_is_no_obstacle() -> No
     assert rows[0]["mismatch"] < 1e-6
     assert rows[-1]["chosen"] == ADAPTED
     assert wild.cost(optimizer.policy) <= 1.05 * wild.cost(wild.best)
+
+
+def test_a_model_of_what_stays_near_predicts_laws_that_it_was_not_fitted_to() -> None:
+    """The plant runs away from its target and is random there; laws keep it where it is linear.
+
+    One law alone says nothing of what another would do: A + B K is known, and not A and B.
+    """
+    plant = Plant(radius=1.15)
+    far = 8.0
+
+    def beyond(s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        random = 3.0 * far * rng.standard_normal(N_S) - plant.A @ s
+        return random if np.abs(plant.U @ s).max() > far else np.zeros(N_S)
+
+    wild = Plant(beyond, radius=1.15)
+    context = wild.context()
+    assert all(np.abs(known.states).max() > far for known in context.every_exploration)
+
+    def rolled(share: float, seeds: range) -> list[Record]:
+        found = []
+        for seed in seeds:
+            result = wild.run(share * wild.best, seed)
+            assert result.trajectory is not None
+            known = result.trajectory.states, result.trajectory.actions
+            found.append(Record(share * wild.best, result.cost, *known))
+        return found
+
+    explored = [
+        Record(0.0 * wild.best, np.inf, known.states, known.actions)
+        for known in context.every_exploration
+    ]
+    settings = ModelBasedSettings()
+    first, others = rolled(0.8, range(10, 14)), rolled(1.1, range(14, 18)) + rolled(0.9, range(4))
+    every = [*explored, *first, *others]
+    whole = believe(context, every)
+    assert whole is None or whole.error > settings.believed
+    found = also_around(context, every, whole, settings, 0.8 * wild.best)
+    assert found is not None and found.error < 1e-6
+    loop = found.loop(context)
+    for record in rolled(0.6, range(30, 34)):
+        predicted = loop.costs(loop.theta(record.policy), record.states[:1])[0]
+        assert predicted == pytest.approx(record.cost, rel=1e-3)
+    # The explorations leave at once, so that rollouts of one law are left.
+    alone = [replace(own, states=own.states[8:], actions=own.actions[8:]) for own in explored]
+    assert also_around(context, [*alone, *first], whole, settings, 0.8 * wild.best) is whole
 
 
 @pytest.mark.parametrize(
