@@ -6,6 +6,9 @@ with no control, with its own first law, with the best affine law and with the l
 (`--bounds`: `benchmarks.bounds`; kept in benchmarks/families/bounds.json). Finished trainings are kept
 in a folder, so that an interrupted run continues where it stood. Constants of the method are chosen on
 `--tuning` seeds; tables are about the others.
+
+The family `process` has plants as users write them (`benchmarks.families.process`), compared with the
+clipped affine law and the linear MPC of their exact linearisation (`benchmarks.families.references`).
 """
 
 from __future__ import annotations
@@ -18,12 +21,15 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 import pdeloop
-from benchmarks.families.cases import CASES, Case
+from benchmarks.bounds import evaluation_seeds
+from benchmarks.families import process
+from benchmarks.families.cases import CASES, PROCESS_CASES, Case
+from benchmarks.families.references import reference_costs
 from benchmarks.kept import kept_row, rows_of
 from loop_interfaces.files import read_json
 from pdeloop.study.executors import processes
@@ -39,6 +45,13 @@ EVALUATION = 2000
 TUNING_EVALUATION = 1000
 AFFINE = "affine"
 BOUNDS = Path(__file__).parent / "families" / "bounds.json"
+EVERY_CASE = CASES | PROCESS_CASES
+REFERENCES = {
+    "affine": "best affine law",
+    "limit": "limit",
+    "lqr": "LQR of the linearisation",
+    "mpc": "its linear MPC",
+}
 
 
 def run(
@@ -48,6 +61,7 @@ def run(
     budgets: Sequence[int] = (20, 40),
     fields: int = 10,
     laws: Sequence[str] = (AFFINE,),
+    family: Literal["fields", "process"] = "fields",
     tuning: bool = False,
     bounds: bool = False,
     jobs: int | None = None,
@@ -68,6 +82,8 @@ def run(
         Number of held-out initial fields.
     laws
         Laws that each training adapts, in turn.
+    family
+        Fields with sharp and smooth features, or plants of process, flow and structure.
     tuning
         Use the seeds and held-out fields with which constants may be chosen.
     bounds
@@ -79,14 +95,19 @@ def run(
     save
         JSON file to which all rows and bounds are written.
     """
-    beginnings = tuple(word for word in cases if word not in CASES)
+    known_cases = CASES if family == "fields" else PROCESS_CASES
+    if bounds and family == "process":
+        raise ValueError("--bounds needs plants with exact gradients; leave it out for process")
+    beginnings = tuple(word for word in cases if word not in known_cases)
     chosen = {
         name: case
-        for name, case in CASES.items()
+        for name, case in known_cases.items()
         if not cases or name in cases or name.startswith(beginnings)
     }
     if not chosen:
-        raise ValueError(f"no case begins with {' or '.join(cases)}; known: {', '.join(CASES)}")
+        raise ValueError(
+            f"no case begins with {' or '.join(cases)}; known: {', '.join(known_cases)}"
+        )
     evaluation = TUNING_EVALUATION if tuning else EVALUATION
     first = TUNING_SEEDS if tuning else TABLE_SEEDS
     tasks = [
@@ -124,11 +145,15 @@ def train(
         began = time.process_time()
         given: dict[str, Any] = {"rollouts": budget, "seed": seed, "evaluation_fields": fields}
         given |= {"law": law} if law != AFFINE else {}
-        done = trained(CASES[name], evaluation_seed=evaluation, **given)
+        done = trained(EVERY_CASE[name], evaluation_seed=evaluation, **given)
         means = {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
         by_field = {key: done.costs[key][0].tolist() for key in ("lqt", "adapted")}
         seconds = time.process_time() - began
-        return {**means, "by_field": by_field, "spent": done.rollouts[0], "seconds": seconds}
+        found = {**means, "by_field": by_field, "spent": done.rollouts[0], "seconds": seconds}
+        if name in PROCESS_CASES:
+            plant = process.PLANTS[PROCESS_CASES[name].plant]()
+            found |= reference_costs(plant, evaluation_seeds(evaluation, fields))
+        return found
 
     task_row = {"case": name, "budget": budget, "seed": seed, "law": law}
     return kept_row(path, task_row, costs)
@@ -154,7 +179,7 @@ def trained(case: Case, **settings: Any) -> Any:
 
 def bound(name: str) -> dict[str, float]:
     """Costs of the best affine law and of the best inputs on the held-out fields of the table."""
-    from benchmarks.bounds import bounds_of, evaluation_seeds
+    from benchmarks.bounds import bounds_of
 
     costs = bounds_of(CASES[name], TABLE_SEEDS, evaluation_seeds(EVALUATION, 10))
     return {key: float(f"{own.mean():.5g}") for key, own in costs.items()}
@@ -173,12 +198,13 @@ def summaries(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     names = {of_law(row): row["case"] for row in result["rows"]}
     for named, name in names.items():
         own = [row for row in result["rows"] if of_law(row) == named]
-        summary: dict[str, Any] = {"case": named, "group": CASES[name].group}
+        summary: dict[str, Any] = {"case": named, "group": EVERY_CASE[name].group}
         summary |= result["bounds"].get(name, {})
         good = [row for row in own if "error" not in row]
         summary["failed"] = len(own) - len(good)
         for budget in dict.fromkeys(row["budget"] for row in good):
             rows = [row for row in good if row["budget"] == budget]
+            summary |= {key: rows[0][key] for key in REFERENCES if key in rows[0]}
             for key in ("none", "lqt", "adapted"):
                 summary[f"{key} {budget}"] = float(np.mean([row[key] for row in rows]))
             summary[f"highest {budget}"] = max(row["adapted"] for row in rows)
@@ -194,10 +220,12 @@ def text(result: Mapping[str, Any]) -> str:
     budgets = list(dict.fromkeys(row["budget"] for row in result["rows"]))
     head = ["case", "no control", "first law", *(f"{budget} rollouts" for budget in budgets)]
     failed = any("error" in row for row in result["rows"])
-    head += ["best affine law", "limit", "adapted / first law, each seed"]
+    every = summaries(result)
+    references = [key for key in REFERENCES if any(key in each for each in every)]
+    head += [*(REFERENCES[key] for key in references), "adapted / first law, each seed"]
     head += ["failed"] if failed else []
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for each in summaries(result):
+    for each in every:
         known = [budget for budget in budgets if f"none {budget}" in each]
         cells = [each["case"]]
         cells += [number(each[f"{key} {known[0]}"]) if known else "-" for key in ("none", "lqt")]
@@ -207,7 +235,7 @@ def text(result: Mapping[str, Any]) -> str:
             else "-"
             for budget in budgets
         ]
-        cells += [number(each.get(key)) for key in ("affine", "limit")]
+        cells += [number(each.get(key)) for key in references]
         ratios = each.get(f"ratios {known[0]}", ()) if known else ()
         cells += [" ".join(f"{ratio:.2f}" for ratio in ratios)]
         cells += [str(each["failed"] or "")] if failed else []

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.families import plants
+from benchmarks.families import plants, process
 from pde_sim_node.equations import allow
 
 HERE = Path(__file__).parent
@@ -198,3 +198,17 @@ OF_FEW_SENSORS: dict[str, Case] = {
 def case_of(problem: str) -> Case:
     """The case of this name, else that of a shipped problem or of a file, as it is."""
     return {**CASES, **OF_FEW_SENSORS}.get(problem) or Case("", problem)
+
+
+@dataclass(frozen=True)
+class ProcessCase(Case):
+    """A plant of `process`, with a training's defaults."""
+
+    def parameters(self) -> dict[str, Any]:
+        return {"plant": process.PLANTS[self.plant]()}
+
+
+PROCESS_CASES: dict[str, Case] = {
+    name: ProcessCase("process", "", plant=name) for name in process.PLANTS
+}
+"""The cases of `python -m benchmarks general --family process`."""
