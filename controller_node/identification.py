@@ -218,7 +218,6 @@ def designed(
     further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
     *,
     or_no_control: bool = False,
-    constant: bool = False,
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -237,8 +236,6 @@ def designed(
         are those of none.
     or_no_control : bool
         Gains of 0 where there are no stabilising ones.
-    constant : bool
-        Whether a model with a filter may have a constant term, which its rows do not carry.
 
     Raises
     ------
@@ -260,7 +257,6 @@ def designed(
             channels,
             shifted(further, delays) if further else (),
             or_no_control=or_no_control,
-            constant=constant,
         )
         if max(delays) <= 0:
             return inner
@@ -282,7 +278,7 @@ def designed(
             every,
             order=settings.reduced_order,
             channels=channels,
-            constant=constant and regression.needs_constant(every, target.size),
+            constant=regression.needs_constant(every, target.size),
         )
         return Designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
@@ -300,7 +296,6 @@ def designed(
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
         settings=settings.method,
-        constant=False if filtered and not constant else None,
     )
     if settings.action_set.zero_mean:
         model = replace(model, B=model.B @ free.T)
@@ -339,8 +334,6 @@ def designed(
         if not (found.better or or_no_control):
             raise unsolved
     chosen = found.rows if found.better and found.rows else rows
-    if filtered and not constant:
-        chosen = replace(chosen, d=None)
     return Designed(
         lqg.with_filter(chosen, trajectories, settings=settings.method) if filtered else chosen,
         found,

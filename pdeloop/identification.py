@@ -416,7 +416,6 @@ def _identified(
             settings,
             channels,
             or_no_control=target is None,
-            constant=True,
         )
         model, field, innovations = found.rows, found.field, found.innovations
     else:
@@ -499,8 +498,7 @@ def save(found: Identified, path: Path) -> None:
         arrays["L"] = model.L
     elif isinstance(model, ModelRows):
         arrays |= model.arrays
-        if model.L is None or model.d is None:  # the rows have no d, which a filter needs
-            arrays["model"] = pack(model)[np.newaxis]
+        arrays["model"] = pack(model)[np.newaxis]
     if found.sample_time is not None:
         arrays["sample_time"] = np.array(found.sample_time)
     for name in ("states", "inputs"):

@@ -14,7 +14,7 @@ from loop_interfaces.action_set import ActionSet
 from loop_interfaces.actuators import indicators, placed_indicators
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
-from loop_interfaces.model_rows import unpack
+from loop_interfaces.model_rows import completed, unpack
 from loop_interfaces.parameters import measured_size, model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
@@ -66,11 +66,13 @@ def read_model(path: Path, n_a: int, law: type[Law] = Affine) -> NDArray[np.floa
             "'pdeloop identify' and to the training"
         )
     model: NDArray[np.float64] = rows[0]
+    if filtered and "U" in arrays:
+        model = completed(model, n_a, len(arrays["U"]))
     try:
         basis = unpack(model, n_a, law.filtered).U
     except ValueError as error:
         raise ValueError(f"{path} holds the model of another plant: {error}") from error
-    if not basis.any(axis=0).all():
+    if not (basis.any() if filtered else basis.any(axis=0).all()):
         raise ValueError(f"the model in {path} has modes that are zero; identify a new one")
     return model
 

@@ -390,6 +390,7 @@ def timestamp() -> str:
 def model_of(rows: NDArray[np.float64], values: Mapping[str, Any]) -> model_rows.ModelRows:
     """The model in rows of a run's policy.npz. ValueError where there is no room for it."""
     n_a, n_z = values["n_a"], measured_size(values)
+    rows = model_rows.completed(rows, n_a, n_z)
     filtered = model_rows.has_filter(rows, n_a, n_z)
     # A tuner that was not told the components of the state counts one; then the law shows it.
     law = OWN_LAWS.shipped.get(values["law"])

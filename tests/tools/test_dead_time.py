@@ -1,5 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A training on a plant whose actions act late: its first law is the optimum of the delayed plant."""
+"""A training on a plant whose actions act late: its first law is the optimum of the delayed plant.
+
+With an ambient temperature as well, about which the plant is linear.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +22,21 @@ TARGET = np.array([2.0, 1.5, 1.5, 2.0])
 
 class Late(pdeloop.Dynamics):
     n_z, n_a, horizon, sample_time = 4, 2, HORIZON, 0.1
-    action_weight, target, stateful = R, TARGET, True
+    action_weight, stateful = R, True
+
+    def __init__(self, ambient: float = 0.0) -> None:
+        self.ambient, self.target = ambient, ambient + TARGET
 
     def initial_state(self, rng: np.random.Generator) -> np.ndarray:
         self.waiting = [np.zeros(2)] * DELAY
-        return rng.normal(size=4)
+        return self.ambient + rng.normal(size=4)
 
     def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
         self.waiting = [*self.waiting, a.copy()]
-        return A @ z + B @ self.waiting.pop(0)
+        return self.ambient + A @ (z - self.ambient) + B @ self.waiting.pop(0)
 
 
-def optimum() -> Callable[[int, np.ndarray], np.ndarray]:
+def optimum(ambient: float) -> Callable[[int, np.ndarray], np.ndarray]:
     """The optimal controller of the delayed plant over the horizon, by dynamic programming."""
     n = 4 + 2 * DELAY + 1  # z, the waiting actions, 1
     F, G, E = np.zeros((n, n)), np.zeros((n, 2)), np.zeros((4, n))
@@ -49,18 +55,18 @@ def optimum() -> Callable[[int, np.ndarray], np.ndarray]:
     def law(k: int, z: np.ndarray) -> np.ndarray:
         if k == 0:
             waiting[:] = [np.zeros((len(z), 2))] * DELAY
-        x = np.hstack([z, *waiting[-DELAY:], np.ones((len(z), 1))])
+        x = np.hstack([z - ambient, *waiting[-DELAY:], np.ones((len(z), 1))])
         waiting.append(x @ gains[min(k, HORIZON - 1)].T)
         return waiting[-1]
 
     return law
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_observer_knows_of_the_dead_time(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("seed", "ambient"), [(0, 0.0), (1, 0.0), (0, 20.0)])
+def test_the_observer_knows_of_the_dead_time(seed: int, ambient: float, tmp_path: Path) -> None:
     with pytest.warns(pdeloop.TrainingWarning, match="no other law is better"):
         run = pdeloop.train(
-            plant=Late(),
+            plant=Late(ambient),
             law="observer",
             reduced_order=4,
             rollouts=6,
@@ -68,7 +74,7 @@ def test_the_observer_knows_of_the_dead_time(seed: int, tmp_path: Path) -> None:
             seed=seed,
             out=tmp_path / "run",
         )
-    best = pdeloop.rollout(Late(), optimum(), *run.evaluation)
+    best = pdeloop.rollout(Late(ambient), optimum(ambient), *run.evaluation)
     least = float(np.mean(best.costs.mean))
     # The law of the infinite horizon knows no end, where actions no longer pay.
     assert least * (1 - 1e-9) < float(np.mean(run.costs["lqt"])) < 1.02 * least
