@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""
+UNLIKE = 1e3
+"""Ratio of the variations of two states of which one has no say in the cost."""
 DEAD = 1e-12
 """Size of a pole, relative to the largest, that is one of a dead time."""
 Trajectories = Sequence[tuple[Array, Array]]
@@ -95,6 +97,19 @@ class Identified:
                 f"on the model the law ends with {100 * loop.left:.3g} % of the distance to the target "
                 "left: the actuators hardly reach it, or the model is wrong; take a target that they "
                 "reach, a lower action_weight, or a log that comes nearer to the target"
+            )
+        spread = self.trajectory[0].std(axis=0)
+        most, least = int(spread.argmax()), int(np.where(spread > 0.0, spread, np.inf).argmin())
+        if (
+            loop is not None
+            and self.channels.states
+            and spread[most] > UNLIKE * spread[least] > 0.0
+        ):
+            small, large = self.channels.state(least), self.channels.state(most)
+            found.append(
+                f"{small} varies by {spread[least]:.3g} and {large} by {spread[most]:.3g}, so {small} "
+                "has no say in a cost with one weight for all: give states in units in which they vary "
+                "alike"
             )
         if isinstance(self.model, ModelRows) and d is not None and not self.model.s_r.any():
             found.append(

@@ -113,6 +113,27 @@ def test_identify_gives_its_verdict_and_the_orders_of_its_method(
     assert "residuals: " in text
 
 
+def test_units_in_which_a_state_has_no_say_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    z, a = logged((0, 0))
+    for factor, told in ((100.0, False), (1e5, True)):
+        lines = ["t,level,b,c,pressure,a1,a2", "target,1,1,1,1,,"]
+        for k, (state, action) in enumerate(zip(z * [1, 1, 1, factor], a, strict=False)):
+            lines.append(",".join(map(str, [k, *state, *action])))
+        (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+        words = [
+            "--states",
+            "level,b,c,pressure",
+            "--inputs",
+            "a*",
+            "--identification",
+            "regression",
+        ]
+        assert main(["identify", "--data", str(tmp_path / "log.csv"), *words]) == 0
+        assert ("has no say in a cost" in capsys.readouterr().err) == told
+
+
 def test_logs_to_validate_with_are_of_the_same_plant(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
