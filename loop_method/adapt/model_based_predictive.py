@@ -224,16 +224,14 @@ class ModelBasedPredictive(Optimizer):
         tried: list[tuple[float, Planner, Array]] = []
         for steps in lengths:
             ways = (True, False) if not tried else (tried[-1][1].around,)
-            found = []
             for around in ways:
                 planner = replace(plain, around=around, steps=steps)
                 costs = simulated(planner, fields)
-                found.append((float(np.sum(costs)), planner, costs))
-            best = min(found, key=lambda each: each[0])
-            if tried and not best[0] < (1.0 - SHORTER) * tried[-1][0]:
-                break
-            tried.append(best)
-        return tried[-1][1:]
+                tried.append((float(np.sum(costs)), planner, costs))
+            if len(ways) == 2:
+                tried = [min(tried, key=lambda each: each[0])]
+        most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
+        return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
 
     def _judge(self, results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
