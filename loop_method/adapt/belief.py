@@ -218,6 +218,8 @@ def also_around(
     if len(own) < FEWEST or _reads(context):
         return belief
     away = np.concatenate([record.states for record in own]) - context.target
+    if not away.any():
+        return belief
     units = np.sqrt(np.mean(away**2, axis=0))
     units = np.maximum(units, LEAST * max(float(units.max()), 1e-300))
     limit = float(np.abs(away / units).max())

@@ -191,9 +191,12 @@ class _Regression:
         moving = unit > 1e-12 * np.abs(states).max()
         if not moving.any():
             return None
-        V = np.diag(1.0 / unit[moving])
-        if len(V) > MODES:
-            V = V @ linalg.svd((states - mean)[:, moving] @ V, full_matrices=False)[2][:MODES].T
+        scale = 1.0 / unit[moving]
+        if len(scale) > MODES:
+            scaled = (states - mean)[:, moving] * scale
+            V = scale[:, None] * linalg.svd(scaled, full_matrices=False)[2][:MODES].T
+        else:
+            V = np.diag(scale)
         inputs = np.concatenate([a for _, a in known])
         middle, width = inputs.mean(axis=0), inputs.std(axis=0)
         width[width == 0.0] = 1.0

@@ -30,7 +30,9 @@ ROWS = [(seed, -1, 0, 0) for seed in SEEDS]
 def models() -> np.ndarray:
     """Those of the affine law with a filter gain each, which believes half of a measurement."""
     rows = affine_models()
-    return np.concatenate([rows, [0.5 * np.eye(rows.shape[2])] * len(rows)], axis=1)
+    n_s = rows.shape[2]
+    filters = np.vstack([0.5 * np.eye(n_s), np.zeros(n_s)])  # and no constant term
+    return np.concatenate([rows, [filters] * len(rows)], axis=1)
 
 
 def policies() -> np.ndarray:

@@ -20,9 +20,18 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
     other = "dmdc" if name == "identification" else known[name] + 1
     assert design_digest(known | {name: other}) != design_digest(known)
-    # An action has the first of these, D the second, the third and the fourth count where they are not
-    # empty, and the last two with another law than the affine one.
-    own = {"n_a", "action_set", "measurement_noise", "cost", "constants", "law", "horizon"}
+    # An action has the first of these, D the second, the next count where they are not empty or 0, and
+    # the last two with another law than the affine one.
+    own = {
+        "n_a",
+        "input_delay",
+        "action_set",
+        "measurement_noise",
+        "cost",
+        "constants",
+        "law",
+        "horizon",
+    }
     assert {*DESIGN, *own} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
 

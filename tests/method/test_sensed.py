@@ -290,7 +290,7 @@ def test_two_noisy_rollouts_are_not_the_last_word_on_an_equation() -> None:
 
     def recorded(problem: SensedProblem, start: Array, *given: Any) -> tuple[float, Array, Array]:
         starts.append(start)
-        mosts.append(given[2:])
+        mosts.append(given[1:])
         spreads.append(problem.prior.spread)
         return worse, likelier, np.zeros_like(problem.interpolated())
 

@@ -26,7 +26,8 @@ from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
 from tests.support.small import same_bits
 from tuner_node.build import build_training
-from tuner_node.narration import warnings
+from tuner_node.narration import misjudged_noise, warnings
+from tuner_node.readings import seeming_noise
 from tuner_node.results import check_result, summarise
 from tuner_node.training_state import arrays_of, restore
 
@@ -226,16 +227,15 @@ def test_a_training_accounts_for_noise_that_was_not_declared_and_says_so() -> No
             made.restore({**made.state(), "noise": np.array(-found)})
 
 
-def test_a_training_that_was_too_short_for_a_find_warns_of_readings_that_seem_noisy() -> None:
-    sigma, given = (
-        0.05,
-        {"optimizer": "model_based", "optimizer_settings.fields": 1, "rollouts": 8},
-    )
-    values, pair = with_noise(sigma, **given)
+def test_without_a_find_the_first_readings_tell_that_they_seem_noisy() -> None:
+    sigma = 0.05
+    values, pair = with_noise(sigma)
     training = build_training(values)
-    train(training, pair, lambda row: None)
-    summary = summarise(training)
-    assert summary["noise"]["found"] == [0.0]
-    assert summary["noise"]["seeming"] == [pytest.approx(sigma, rel=0.1)]
-    (said,) = (text for text in warnings(summary) if "noise" in text)
+    batch = training.next_batch()
+    assert batch is not None
+    training.finish(pair.run(batch))
+    seeming = seeming_noise(training, 0)
+    assert seeming == pytest.approx(sigma, rel=0.1)
+    noise = {"declared": 0.0, "found": [0.0], "seeming": [seeming]}
+    (said,) = misjudged_noise({"seeds": 1, "noise": noise})
     assert "seem to have" in said and "none was declared" in said

@@ -85,7 +85,8 @@ def test_the_trajectories_of_a_run_that_was_not_recorded_are_those_it_measured(
         )
         episodes = list(run.trajectories())
         closing = episodes[-1]
-        assert np.array_equal(np.sort(closing.costs.mean), np.sort(np.ravel([*run.costs.values()])))
+        costs = [*np.ravel([*run.costs.values()]), run.result["repeated"][0]["now"]]
+        assert np.array_equal(np.sort(closing.costs.mean), np.sort(costs))
         assert sum(len(episode.costs.mean) for episode in episodes[:-1]) == run.rollouts[0]["total"]
         for episode in episodes:
             assert (episode.applied >= 0.0).all() and (episode.applied <= 1.0).all()

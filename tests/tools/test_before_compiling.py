@@ -54,7 +54,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ((*TRAIN, "--in-process", "--record"), "leave out --in-process"),
         ((*TRAIN, "--equation", "stokes"), "unknown equation 'stokes'"),
         ((*TRAIN, "--equation", "nowhere.py:Own"), "does not exist"),
-        (("reproduce", str(SMALL), "--iterations", "1"), "expected at least 9"),
+        (("reproduce", str(SMALL), "--iterations", "1"), "expected at least 6"),
         (("check", str(SMALL), "--equation", "stokes"), "unknown equation"),
         (("check", "nowhere.yaml"), "no problem file"),
         (("study", "study.yaml"), "small, variant 'bad': parameter 'n_a' is 0"),
