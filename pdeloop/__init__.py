@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pde_sim_node.plants.gymnasium_plant import from_gymnasium as from_gymnasium
     from pde_sim_node.plants.process import from_process as from_process
     from pdeloop.api import Problem as Problem
-    from pdeloop.api import TrainingWarning as TrainingWarning
     from pdeloop.api import identify as identify
     from pdeloop.api import problem as problem
     from pdeloop.api import train as train
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     from pdeloop.plots import plot_gains as plot_gains
     from pdeloop.plots import plot_spectrum as plot_spectrum
     from pdeloop.plots import plot_training as plot_training
+    from pdeloop.training_warning import TrainingWarning as TrainingWarning
 
 _NAMES = {
     "loop_method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
@@ -72,7 +72,7 @@ _NAMES = {
     "pde_sim_node.plants.fmu": ("from_fmu",),
     "pde_sim_node.plants.gymnasium_plant": ("from_gymnasium",),
     "pde_sim_node.plants.process": ("from_process",),
-    "pdeloop.api": ("Problem", "TrainingWarning", "identify", "problem", "train"),
+    "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),
     "pdeloop.episode": ("projected_law", "rollout"),
     "pdeloop.finished_run": ("FinishedRun", "load_run"),
@@ -85,6 +85,7 @@ _NAMES = {
         "plot_spectrum",
         "plot_training",
     ),
+    "pdeloop.training_warning": ("TrainingWarning",),
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_MODULES)

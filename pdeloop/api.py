@@ -41,6 +41,7 @@ from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
 from pdeloop.problem_values import problem_values
 from pdeloop.training_run import begin, carry_out, continuing
+from pdeloop.training_warning import TrainingWarning
 from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
@@ -402,10 +403,6 @@ def train(
     for text in (*narration.warnings(run.result), *narration.reasons(run.result)):
         warnings.warn(text.strip(), TrainingWarning, stacklevel=2)
     return run
-
-
-class TrainingWarning(UserWarning):
-    """What the user of a training should know: a law is no better, or a plant drifts."""
 
 
 def _check_count(name: str, value: object, least: int) -> None:
