@@ -95,7 +95,7 @@ def noise_seeds(
     if phase == "evaluate":
         fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
         first = [derive(settings.all_seeds[m], NOISE["adapt"], 0) for m in again]
-        return fields * (settings.seeds * len(EVALUATED)) + first
+        return first + fields * (settings.seeds * len(EVALUATED))
     rows_of: Counter[int] = Counter()
     noise = []
     for m in rows[:, StartColumn.MODEL].astype(int).tolist():

@@ -8,9 +8,9 @@
     check     no control and the warm start on a field  identify again for seeds whose warm start is no
                                                         better, while they may; else adapt
     adapt     what the optimiser asks for               evaluate, once all optimisers are done
-    evaluate  no control, LQT and the adapted policy    done
-              on the same sampled fields; and the first
-              rollout of the adaptation once more
+    evaluate  the adaptation's first rollout again; no  done
+              control, LQT and the adapted policy on
+              the same sampled fields
 
 The first three share the budget of a seed. A seed whose last warm start is not better than no control
 starts the adaptation from no control. Pure: it uses neither topics nor time, so the training is the
@@ -130,7 +130,7 @@ class Training:
             batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
             wanted = rollouts.evaluations(self.settings, self.warm_starts(), self.policies())
-            batch = batch_of([*wanted, *self._first_again()])
+            batch = batch_of([*self._first_again(), *wanted])
         else:
             return None
         if not self.settings.noise:
@@ -420,12 +420,12 @@ class Training:
     def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
         settings = self.settings
         again = [m for m, _ in self._first_again()]
-        costs = result.costs[: len(result.costs) - len(again)]
-        for m, cost in zip(again, result.costs[len(costs) :, CostColumn.MEAN], strict=True):
+        for m, cost in zip(again, result.costs[: len(again), CostColumn.MEAN], strict=True):
             self.repeated[m].append(float(cost))
+        costs = result.costs[len(again) :]
         self.evaluation = costs[:, CostColumn.MEAN].reshape(self.evaluation_shape)
         self.ended = costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
-        counted = [*np.repeat(np.arange(settings.seeds), self.ended[0].size), *again]
+        counted = [*again, *np.repeat(np.arange(settings.seeds), self.ended[0].size)]
         self.budget.count("evaluate", np.array(counted))
         self.phase = "done"
         return event_rows.evaluated(settings, self.evaluation, self.ended)

@@ -28,7 +28,8 @@ class Rollouts:
     """The rollouts of a finished episode, one for each of its M environments.
 
     explores: whether it was an exploration; controllers (M,): 'none', 'lqt' or 'adapted', the keys
-    of loop_interfaces.controllers, empty for an exploration and if the policy is not known; mean
+    of loop_interfaces.controllers, empty for an exploration, if the policy is not known, and in a
+    comparison with no control for a rollout from a field that no control did not have; mean
     (M,): stage costs; completed (M,): whether they did not diverge; models (M,): indices of the
     reduced models; fields (M,): seeds of the initial fields.
     """
@@ -95,13 +96,18 @@ class RolloutCosts:
         start, policy = self._starts.get(ids), self._policies.get(ids)
         if start is None or len(start.values) != len(frame.values):
             return None
+        empty = np.empty(0, np.str_)
+        controllers = empty if policy is None else self._controllers(start, policy.values)
+        fields = start.values[:, StartColumn.SEED].astype(np.int64)
+        if (none := controllers == "none").any():
+            controllers = np.where(np.isin(fields, fields[none]), controllers, "")
         return Rollouts(
             _explores(start),
-            np.empty(0, np.str_) if policy is None else self._controllers(start, policy.values),
+            controllers,
             frame.values[:, CostColumn.MEAN],
             frame.values[:, CostColumn.ENDED] == COMPLETED,
             start.values[:, StartColumn.MODEL].astype(np.int64),
-            start.values[:, StartColumn.SEED].astype(np.int64),
+            fields,
         )
 
     def controller(self, run: int, episode: int, environment: int) -> str:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
 from tuner_node.budget import PURPOSES
 from tuner_node.build import build_training
+from tuner_node.training import Training
 
 _TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
 
@@ -126,8 +127,10 @@ class RecordedRun:
         while unseen or (claims is not None and not claims.reached(training)):
             if (batch := training.next_batch()) is None:
                 break
-            for key in _keys(batch.rows, batch.policies, training.generation):
-                lost.look(key, training.phase)
+            keys = _keys(batch.rows, batch.policies, training.generation)
+            again = _repeated(keys, batch.rows, training)
+            for key in keys:
+                lost.look(key, training.phase, again=key in again)
                 if unseen.pop(key, None) and not batch.exploratory:
                     self._report.count_compared("policies", self._answered[key])
             if batch.policies is not None and (
@@ -250,13 +253,19 @@ class _Lost:
         self._since: Counter[str] = Counter()
         """Those since the last one that was recorded: they may come after the end of the recording."""
 
-    def look(self, key: bytes, phase: str) -> None:
-        """Take the next rollout that the training asks for, in a phase of it."""
+    def look(self, key: bytes, phase: str, *, again: bool) -> None:
+        """Take the next rollout that the training asks for, in a phase of it.
+
+        again: it asks for that one once more at its end, so that a recording which begins later can
+        have it, too.
+        """
+        if again and not self._begun and self._complete[key] < 2:
+            return
         if key in self._recorded:
             self._begun = True
             self.reach_end()
         if self._complete[key]:
-            self._complete[key] -= 1  # the training asks for its first rollout again at its end
+            self._complete[key] -= 1
         elif self._begun:
             (self._lost if key in self._recorded else self._since)[phase] += 1
 
@@ -272,6 +281,16 @@ class _Lost:
         parts = ", ".join(f"{PURPOSES[phase]} {count}" for phase, count in self._lost.items())
         many = "1 rollout" if total == 1 else f"{total} rollouts"
         return f"{many} that the training asked for ({parts}), in no complete episode"
+
+
+def _repeated(keys: Sequence[bytes], rows: Array, training: Training) -> set[bytes]:
+    """The keys of a batch that the evaluation repeats: of the first rollout of every adaptation."""
+    if training.phase != "adapt" or any(optimizer.tells for optimizer in training.optimizers):
+        return set()
+    firsts: dict[float, bytes] = {}
+    for row, key in zip(rows, keys, strict=True):
+        firsts.setdefault(float(row[StartColumn.MODEL]), key)
+    return set(firsts.values())
 
 
 def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
