@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -101,6 +102,52 @@ for a in (1.0, 2.0, 4.0):
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     np.testing.assert_allclose(np.array(done.stdout.split(), float), held(0.1), rtol=1e-8)
+
+
+@needs("jax_cfd", "jax-cfd")
+def test_velocities_of_jax_cfd_sit_on_upper_faces() -> None:
+    script = """
+import jax.numpy as jnp, jax_cfd.base as cfd
+grid = cfd.grids.Grid((4, 8), domain=((0.0, 1.0), (0.0, 2.0)))
+u, v = grid.cell_faces
+for offset in (u, v, grid.cell_center):
+    print([[float(x) for x in axis] for axis in grid.axes(offset)])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    u, v, p = map(ast.literal_eval, done.stdout.splitlines())
+    h = 0.25
+    x, y = h * np.arange(4), h * np.arange(8)
+    for axes, offset in ((u, (h, h / 2)), (v, (h / 2, h)), (p, (h / 2, h / 2))):
+        np.testing.assert_allclose(axes[0], x + offset[0], rtol=1e-6)
+        np.testing.assert_allclose(axes[1], y + offset[1], rtol=1e-6)
+    # As many faces as cells: the last one is the wall, or the first of the next period.
+    ours = pdeloop.Axis("x", 1.0, 4, periodic=False, walls=False)
+    np.testing.assert_allclose(p[0], ours.points, rtol=1e-6)
+
+
+@needs("phi", "phiflow")
+def test_phiflow_computes_in_single_precision_on_cells_of_size_one() -> None:
+    script = """
+import numpy as np
+from phi.flow import *
+wave = tensor(np.cos(np.pi * (np.arange(8) + 0.5) / 8), spatial("x"))
+free = CenteredGrid(wave, extrapolation.ZERO_GRADIENT)
+print(free.points.numpy("x,vector").ravel().tolist(), free.values.dtype, (2.0 * free).values.dtype)
+math.set_global_precision(64)
+grid = CenteredGrid(wave, extrapolation.ZERO_GRADIENT, bounds=Box(x=2.0))
+after = diffuse.explicit(grid, 0.4, 0.025)
+print(grid.points.numpy("x,vector").ravel().tolist(), after.values.dtype)
+print(after.values.numpy("x").tolist())
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    first, second, values = done.stdout.splitlines()
+    assert first.endswith("] float64 float32") and second.endswith("] float64"), done.stderr
+    np.testing.assert_allclose(ast.literal_eval(first.split("]")[0] + "]"), np.arange(8) + 0.5)
+    ours = pdeloop.Axis("x", 2.0, 8, periodic=False, walls=False)
+    np.testing.assert_allclose(ast.literal_eval(second.split("]")[0] + "]"), ours.points)
+    factor = 1.0 - 0.4 * 0.025 * (2.0 - 2.0 * np.cos(np.pi / 8)) / 0.25**2
+    wave = np.cos(np.pi * ours.points / 2.0)
+    np.testing.assert_allclose(ast.literal_eval(values), factor * wave, atol=1e-12)
 
 
 @needs("casadi", "CasADi")
