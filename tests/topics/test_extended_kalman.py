@@ -27,7 +27,7 @@ PARAMETERS = {
     "evaluation_fields": 2,
 }
 SETTINGS = {
-    "optimizer_settings": {"iterations": 2, "mixtures": 1, "judging": 1},
+    "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1},
     "field_model_settings": {
         "sensed_iterations": 2,
         "sensed_last_iterations": 3,
