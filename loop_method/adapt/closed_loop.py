@@ -191,7 +191,7 @@ class ClosedLoop(ClosedLoopProblem):
         states = np.empty((T + 1, *begin.shape))
         actions = np.empty((T, count, n_a))
         features = np.full((T, count, n_s + n_p + 1), self.constant_feature)
-        costs, finite = np.zeros(count), np.ones(count, dtype=bool)
+        costs, finite, all_finite = np.zeros(count), np.ones(count, dtype=bool), True
         noise = self._noise_of(count)
         gains, constants = theta[:, : n_s + n_p].T, self.constant_feature * theta[:, n_s + n_p :]
         states[0] = begin
@@ -206,15 +206,19 @@ class ClosedLoop(ClosedLoopProblem):
                 a = out[:, :n_a]
                 self.action_set.project(a, out=a)
                 self._add_stage(costs, states[k], outputs, a, k)
-                # Diverged fields stay marked and continue with numbers that a model can take.
                 memory = out[:, n_a:] + a @ B.T
-                finite &= np.isfinite(costs) & np.isfinite(memory).all(axis=1)
-                for part in (a, memory, known):
-                    part[~finite] = 0.0
+                # Diverged fields stay marked and continue with numbers that a model can take.
+                if not (all_finite and np.isfinite(costs).all() and np.isfinite(memory).all()):
+                    all_finite = False
+                    finite &= np.isfinite(costs) & np.isfinite(memory).all(axis=1)
+                    for part in (a, memory, known):
+                        part[~finite] = 0.0
                 actions[k] = a
                 after = self._step(k, states[k], a, fields)
-                finite &= np.isfinite(after).all(axis=1)
-                after[~finite] = 0.0
+                if not (all_finite and np.isfinite(after).all()):
+                    all_finite = False
+                    finite &= np.isfinite(after).all(axis=1)
+                    after[~finite] = 0.0
                 states[k + 1] = after
             if self.cost is not None:
                 self.cost.add_terminal(costs, states[-1])
@@ -223,12 +227,16 @@ class ClosedLoop(ClosedLoopProblem):
         costs[~finite] = np.inf
         return Simulation(states, actions, costs, features)
 
-    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
+    def gradient(
+        self, theta: Array, fields: Array, weights: Array, simulation: Simulation | None = None
+    ) -> tuple[float, Array]:
         """The weighted sum of the costs, and its gradient, of the shape of theta.
 
         Infinite, with a gradient of zero, where a cost of positive weight is.
+
+        simulation: of theta from the fields, if there is one.
         """
-        simulation = self.simulate(theta, fields)
+        simulation = self.simulate(theta, fields) if simulation is None else simulation
         gradient = np.zeros_like(theta)
         if not np.isfinite(simulation.costs[weights > 0.0]).all():
             return np.inf, gradient
@@ -241,13 +249,13 @@ class ClosedLoop(ClosedLoopProblem):
         if self.cost is not None:
             eta = weight * self.cost.terminal_slope(states[-1])
         share = 2.0 / self.horizon * weights[:, None]
+        state_share, action_share = self.state_weight * share, self.action_weight * share
         for k in reversed(range(self.horizon)):
             z, a = states[k], actions[k]
             eta, g = self.model.pull_back(z, a, eta)
             if self.cost is None:
                 error = self._outputs(k, z, fields) - self.target
-                on_z = self._pull_outputs(self.state_weight * share * error)
-                on_a = self.action_weight * share * a
+                on_z, on_a = self._pull_outputs(state_share * error), action_share * a
             else:
                 on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
             g = g + on_a + mu @ B

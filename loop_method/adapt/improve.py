@@ -23,7 +23,7 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.closed_loop import ClosedLoop, Simulation
 from loop_method.adapt.settings import ImprovementSettings
 from loop_method.design.finite_horizon import action_curvature
 
@@ -134,7 +134,15 @@ def improve(
     moment[np.diag_indices(len(moment))] += _ISOTROPY * units
     gain = settings.least_gain if least_gain is None else least_gain
     return _descend(
-        loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain, trust
+        loop,
+        theta,
+        fields,
+        weights,
+        Coordinates(curvature, moment),
+        settings,
+        gain,
+        trust,
+        simulation if finite.all() else None,
     )
 
 
@@ -147,11 +155,12 @@ def _descend(
     settings: ImprovementSettings,
     least_gain: float,
     trust: float,
+    simulation: Simulation | None,
 ) -> Improvement:
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
 
-    before, by_theta = loop.gradient(theta, fields, weights)
+    before, by_theta = loop.gradient(theta, fields, weights, simulation)
     # Of a quadratic cost the step -g/2 leads to its minimum. L-BFGS begins with one of unit length.
     unit = 0.5 * float(np.linalg.norm(coordinates.gradient(by_theta)))
     if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):
@@ -198,6 +207,8 @@ def _descend(
 
 def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
     """The law that is finite from most of the fields, and cheapest where all of those are."""
+    if all(np.array_equal(law, laws[0]) for law in laws):
+        return laws[0]
     return laws[index_of_cheapest(np.array([loop.costs(theta, fields) for theta in laws]), weights)]
 
 

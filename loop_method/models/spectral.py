@@ -107,12 +107,13 @@ class SpectralModel:
         )
         return PolynomialStep(equation)
 
-    def _alike(self, states: Array) -> Iterator[tuple[PolynomialStep, NDArray[np.bool_]]]:
+    def _alike(self, states: Array) -> Iterator[tuple[PolynomialStep, slice | NDArray[np.bool_]]]:
         """The rows of states that are stepped alike, and by what."""
         level = np.searchsorted(self.fewer[:, 0], np.abs(states).max(axis=1, initial=0.0))
         level = np.minimum(level, len(self.fewer))  # NaN is beyond infinity
-        for i in np.unique(level):
-            yield self.steps[i], level == i
+        for i in dict.fromkeys(level.tolist()):
+            alike = level == i
+            yield self.steps[i], slice(None) if alike.all() else alike
 
     def step(self, states: Array, actions: Array) -> Array:
         after = np.empty(states.shape)
