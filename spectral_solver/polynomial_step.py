@@ -172,20 +172,17 @@ class PolynomialStep:
         found = np.empty((len(z), 2, self._last + 1))
         if self._whole:
             analysed(z, found, self._plans)
-        else:  # row by row: in a batch, rounding depends on the other rows
-            for i, row in enumerate(z):
-                spectrum = np.fft.rfft(row) / self._n_x
-                found[i] = spectrum.real, spectrum.imag
+        else:  # NumPy transforms one row after the other: rounding does not depend on the others
+            spectrum = np.fft.rfft(z) / self._n_x
+            found[:, 0], found[:, 1] = spectrum.real, spectrum.imag
         return found
 
     def states(self, spectra: Array) -> Array:
         """The states (M, n_x) of spectra."""
+        if not self._whole:
+            return np.fft.irfft(_complex(spectra) * self._n_x, self._n_x)
         found = np.empty((len(spectra), self._n_x))
-        if self._whole:
-            synthesised(spectra, found, self._plans)
-        else:
-            for i, spectrum in enumerate(_complex(spectra)):
-                found[i] = np.fft.irfft(spectrum * self._n_x, self._n_x)
+        synthesised(spectra, found, self._plans)
         return found
 
 
