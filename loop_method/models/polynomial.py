@@ -247,9 +247,10 @@ def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
             return None
         rest = np.concatenate([np.arange(begin, end) for begin, end in others])
         data = _Scaled.of(_rows(samples, rest))
+        pieces = _Pieces.of(samples, own, data.scale)
         for i, q in enumerate(leading):
             for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
-                errors[i, j] += _error(model, samples, own, data.scale)
+                errors[i, j] += _error(model, pieces, data.scale)
     i, j = divmod(int(np.argmin(errors)), len(ridges))
     data = _Scaled.of(samples)
     return data.fits(data.empty(kind, leading[i]), [ridges[j]])[0]
@@ -270,22 +271,42 @@ def _pieces(samples: Samples) -> list[tuple[int, int]]:
     return cuts
 
 
-def _error(
-    model: PolynomialModel, samples: Samples, cuts: Sequence[tuple[int, int]], scale: Array
-) -> float:
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """What is measured along pieces of rollouts that models predict.
+
+    first: their beginnings (n, n_z); steps: for each the pieces that are as long, their actions and the
+    states after it; size: the sum of their mean squared scaled changes (n,).
+    """
+
+    first: Array
+    steps: list[tuple[NDArray[np.int64], Array, Array]]
+    size: Array
+
+    @staticmethod
+    def of(samples: Samples, cuts: Sequence[tuple[int, int]], scale: Array) -> _Pieces:
+        begins, ends = np.array(cuts).T
+        first, size = samples.before[begins], np.zeros(len(cuts))
+        steps = []
+        for k in range(int((ends - begins).max())):
+            alive = np.flatnonzero(begins + k < ends)
+            after = samples.after[begins[alive] + k]
+            steps.append((alive, samples.actions[begins[alive] + k], after))
+            with np.errstate(all="ignore"):
+                size[alive] += np.mean(((after - first[alive]) / scale) ** 2, axis=1)
+        return _Pieces(first, steps, size)
+
+
+def _error(model: PolynomialModel, pieces: _Pieces, scale: Array) -> float:
     """Mean square of the scaled error over pieces, relative to their change; at most 1 a piece."""
-    z = samples.before[[begin for begin, _ in cuts]]
-    first, error, size = z.copy(), np.zeros(len(cuts)), np.zeros(len(cuts))
+    z, error = pieces.first.copy(), np.zeros(len(pieces.first))
     with np.errstate(all="ignore"):
-        for k in range(_PIECE):
-            alive = [i for i, (begin, end) in enumerate(cuts) if begin + k < end]
-            if not alive:
-                break
-            rows = [cuts[i][0] + k for i in alive]
-            z[alive] = model.step(z[alive], samples.actions[rows])
-            error[alive] += np.mean(((z[alive] - samples.after[rows]) / scale) ** 2, axis=1)
-            size[alive] += np.mean(((samples.after[rows] - first[alive]) / scale) ** 2, axis=1)
+        for alive, actions, measured in pieces.steps:
+            after = model.step(z[alive], actions)
+            error[alive] += np.mean(((after - measured) / scale) ** 2, axis=1)
+            z[alive] = after
             far = ~(np.abs(z / scale).max(axis=1) < _FAR)
-            error[far], z[far] = np.inf, first[far]
-        relative = np.nan_to_num(error / size, nan=1.0, posinf=1.0)
+            if far.any():
+                error[far], z[far] = np.inf, pieces.first[far]
+        relative = np.nan_to_num(error / pieces.size, nan=1.0, posinf=1.0)
     return float(np.minimum(relative, 1.0).mean())

@@ -26,9 +26,10 @@ def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
             rows = np.flatnonzero(alive).tolist()
             a = np.vstack([_action(rollouts[i], k, z[i : i + 1]) for i in rows])
             z[rows] = model.step(z[rows], a)
+            finite = np.asarray(np.isfinite(z).all(axis=1))
             for i in rows:
-                alive[i] = np.isfinite(z[i]).all() and k + 1 < steps[i]
-                if np.isfinite(z[i]).all():
+                alive[i] = finite[i] and k + 1 < steps[i]
+                if finite[i]:
                     found[i].append(z[i].copy())
             if not alive.any():
                 break
