@@ -11,7 +11,7 @@ from loop_interfaces.topics import ACTION, START
 from tests.simulation.agenda import Agenda
 from tests.simulation.disk import Disk
 from tests.simulation.network import Network
-from tests.simulation.plan import MAIN, STALE, Fault, Plan
+from tests.simulation.plan import AIMED, MAIN, Fault, Plan
 from tests.simulation.processes import (
     RUN,
     ControllerProcess,
@@ -201,7 +201,7 @@ class History:
             self.network.forge(who, end)
         elif kind in ("late action", "late start"):
             self.network.contradict(ACTION if kind == "late action" else START)
-        elif kind in STALE:
+        elif kind in AIMED:
             self.network.send_beside(kind, who, end)
         elif kind == "second controller":
             if who == "signs":  # with another limit of the actions

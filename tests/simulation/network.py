@@ -270,7 +270,7 @@ class Network:
         self._forged[topic] = end
 
     def send_beside(self, kind: str, topic: str, end: float) -> None:
-        """Until then each message on a topic comes with one of this kind of `STALE`."""
+        """Until then each message on a topic comes with one of this kind of `AIMED`."""
         self._beside[kind, topic] = end
 
     def replay(self) -> None:

@@ -39,7 +39,7 @@ FORGED = (
     "samples",
 )
 """Topics on which messages are forged."""
-STALE = {
+AIMED = {
     "stale": (
         "episode/start",
         "policy",
@@ -53,10 +53,11 @@ STALE = {
     "another plant": ("state", "action", "episode/cost", "model/identified"),
     "late action": ("",),
     "late start": ("",),
+    "forgery": ("episode/cost", "model/identified"),
 }
 """Faults of `aimed`, and the topics that each is on: beside each message comes one of an earlier
-episode, of another run or of another plant, with the same step; or an action or a start of an episode
-that has ended comes once more, with its header and other values."""
+episode, of another run or of another plant, with the same step; an action or a start of an episode
+that has ended comes once more, with its header and other values; or each answer comes with another."""
 OTHERS = ("another plant", "late action", "late start")
 """Those of them that somebody else causes who takes part in the run."""
 HOSTILE = ("second controller", "second tuner", "early cost", "episode ahead", "forgery", *OTHERS)
@@ -188,10 +189,10 @@ def aimed(seed: int) -> Plan:
     rng = random.Random(seed)
     delay, iterations = rng.choice([1e-3, 1e-2]), rng.choice([0, 1])
     length = 0.1 + (70 + 20 * iterations) * delay
-    kind = rng.choice(list(STALE))
+    kind = rng.choice(list(AIMED))
     late = kind.startswith("late")
     begin = rng.uniform(0.2, 1.0) * length if late else 0.0
-    faults = [Fault(begin, kind, rng.choice(STALE[kind]), 0.0 if late else 100.0)]
+    faults = [Fault(begin, kind, rng.choice(AIMED[kind]), 0.0 if late else 100.0)]
     if not late and rng.random() < 0.3:
         who = rng.choice(MAIN[:2])
         faults.append(Fault(rng.uniform(0.0, length), "crash", who, 0.1))
