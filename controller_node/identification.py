@@ -14,6 +14,7 @@ from scipy import linalg
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.action_set import ANY_ACTION, ActionSet
 from loop_interfaces.cost import Cost
+from loop_interfaces.grid import axes_of
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.one_thread import one_thread
 from loop_interfaces.parameters import model_order
@@ -67,6 +68,9 @@ class DesignSettings:
     input_delay : sequence of int
         Steps after which each input acts (`loop_method.reduce.input_delay`); empty: none. A dead time
         needs a law with a filter, in whose state the last inputs are.
+    grid : str
+        Axes and components of the state (`loop_interfaces.grid.Grid.parse`), for "field"; empty: one
+        axis.
     constants : dict
         Parameters of `loop_interfaces.signature.CONSTANTS` as given; others have their
         defaults.
@@ -85,6 +89,7 @@ class DesignSettings:
     law: str = "affine"
     horizon: int = 1
     input_delay: Sequence[int] = ()
+    grid: str = ""
     constants: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -326,6 +331,7 @@ def designed(
             noise=settings.measurement_noise,
             settings=settings.method,
             models=settings.field_models,
+            axes=axes_of(settings.grid),
             **weights,
         )
     if unsolved is not None:

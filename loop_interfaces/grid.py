@@ -364,6 +364,11 @@ class Grid:
         return min(found, key=unequal)
 
 
+def axes_of(text: str) -> tuple[int, ...]:
+    """Points of each axis of the grid in a text; none where that is empty, or of a plain vector."""
+    return tuple(axis.size for axis in Grid.parse(text).axes) if text else ()
+
+
 def _factorisations(count: int, factors: int) -> list[tuple[int, ...]]:
     """All ways to write a number as an ordered product."""
     if factors == 1:

@@ -106,7 +106,7 @@ PROBLEM = _section(
         "your own plant instead of an equation: an installed name, or a class or function that the "
         "user must allow, 'file.py:Name' or 'module:Name'"
     ),
-    Spec("grid", "", nodes="PTV").means(
+    Spec("grid", "", nodes="PCTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
     Spec("cost", [], nodes="PCT").means(

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loop_interfaces.grid import axes_of
 from loop_interfaces.spec import FIELD_MODEL_SETTINGS, IDENTIFICATION_SETTINGS, LAW_SETTINGS
 
 NOT_SIGNED = 0.0
@@ -52,9 +53,9 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes.
 
     The name of a law other than the affine one follows, without the file or module that it is in, and
-    the horizon; the noise, where there is any and the identification is "field", which is fitted for
-    it; then the constants of the identification and of the law, by their names, and those of field
-    models with "field".
+    the horizon; with the identification "field", the noise, where there is any, and the points of each
+    axis of a grid of several; then the constants of the identification and of the law, by their names,
+    and those of field models with "field".
     """
     values = [parameters[name] for name in DESIGN]
     values += ["".join(parameters["cost"])] if parameters.get("cost") else []
@@ -62,6 +63,8 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     values += [law, parameters["horizon"]] if law != "affine" else []
     noise = parameters.get("measurement_noise")
     values += [noise] if noise and parameters["identification"] == "field" else []
+    axes = axes_of(parameters.get("grid", ""))
+    values += axes if len(axes) > 1 and parameters["identification"] == "field" else ()
     constants = parameters.get("constants", parameters)
     count = CONSTANTS if parameters["identification"] == "field" else CONSTANTS[:2]
     names = sorted(name for name in constants if name.startswith(count))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loop_interfaces.action_set import ActionSet
 from loop_interfaces.actuators import indicators, placed_indicators
 from loop_interfaces.array_files import read_arrays
-from loop_interfaces.grid import Grid
+from loop_interfaces.grid import Grid, axes_of
 from loop_interfaces.model_rows import completed, unpack
 from loop_interfaces.parameters import measured_size, model_order, noisy
 from loop_interfaces.signature import design_digest
@@ -257,7 +257,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     delayed = (
         bool(sensors) and values["sensor_delays"] > 1
     )  # readings of several steps are no field
-    points = () if grid is None else tuple(axis.size for axis in grid.axes)
+    axes = axes_of(values["grid"])
     centres, widths = declared_actuators(values)
     given |= {
         "law": law,
@@ -269,8 +269,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "actuator_positions": centres,
         "actuator_widths": widths,
         "periodic": not delayed and (grid is None or grid.is_circle),
-        "line": not delayed and (grid is None or len(grid.axes) < 2),
-        "shape": points if len(points) > 1 and not sensors else (),
+        "line": not delayed and len(axes) < 2,
+        "shape": axes if len(axes) > 1 and not sensors else (),
         "measurement_noise": values["measurement_noise"] * scale,
         "model": given_model(values, law),
         "field_models": field_model_settings(values),

@@ -25,6 +25,7 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -195,6 +196,7 @@ def best_model(
     settings: IdentificationSettings = DEFAULTS,
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
+    axes: tuple[int, ...] = (),
 ) -> tuple[FittedModel | None, float, list[Measured]]:
     """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
 
@@ -203,12 +205,14 @@ def best_model(
     predicted even by models that take noise for the field, so noise that was not declared is
     looked for before. A target far outside of the data makes every error small, so a model that does
     not reproduce what the data do is chosen again by that. The work grows with the third power of the
-    size of the state, so there is a largest one. Last, what the model was chosen by.
+    size of the state, so there is a largest one. Last, what the model was chosen by. axes: as for
+    `field_law`; noise that was not declared is looked for on one axis alone.
     """
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
     if len(target) > _FIELD_LARGEST:
         return None, 0.0, rollouts
-    scale = variation(trajectories)
+    scale, line = variation(trajectories), len(axes) < 2
+    shape = () if line or len(target) % math.prod(axes) else axes
 
     def fitted(data: Sequence[Measured], by_scale: bool = False) -> FittedModel | None:
         return fit_field_model(
@@ -217,23 +221,26 @@ def best_model(
             action_set=action_set,
             noise=noise,
             settings=models,
+            line=line,
+            shape=shape,
             scale=scale,
             by_scale=by_scale,
         )
 
     whole = fitted(rollouts)
     error = np.inf if whole is None else whole.error
-    misjudged = fit_undeclared_noise(
-        rollouts,
-        target,
-        settings=models,
-        most=settings.field_error,
-        better_than=np.inf if noise else error,
-        declared=noise,
-        action_set=action_set,
-    )
-    if misjudged is not None:
-        return *misjudged, rollouts
+    if line:
+        misjudged = fit_undeclared_noise(
+            rollouts,
+            target,
+            settings=models,
+            most=settings.field_error,
+            better_than=np.inf if noise else error,
+            declared=noise,
+            action_set=action_set,
+        )
+        if misjudged is not None:
+            return *misjudged, rollouts
     data, best = rollouts, whole
     if error > settings.field_error:
         parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
@@ -290,6 +297,7 @@ def field_law(
     noise: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
     models: FieldModelSettings = MODEL_DEFAULTS,
+    axes: tuple[int, ...] = (),
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
 
@@ -313,8 +321,12 @@ def field_law(
         Those whose names begin with `field_`. Errors are relative to the variation of the data.
     models : FieldModelSettings
         How models are fitted and one is chosen.
+    axes : tuple of int
+        Points of each axis of the fields; of one axis, or none, they need not be known.
     """
-    fitted, found, rollouts = best_model(trajectories, target, action_set, settings, noise, models)
+    fitted, found, rollouts = best_model(
+        trajectories, target, action_set, settings, noise, models, axes
+    )
     if fitted is None or found:
         return FieldLaw(fitted, noise=found)
     n_s, scale = other.U.shape[1], variation(trajectories)

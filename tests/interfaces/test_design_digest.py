@@ -10,6 +10,7 @@ from hashlib import blake2b
 import pytest
 
 from controller_node.identification import DesignSettings
+from loop_interfaces.grid import Axis, Grid
 from loop_interfaces.signature import DESIGN, design_digest, digest_of
 
 N_A, N_S = 4, 3
@@ -27,6 +28,7 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
         "input_delay",
         "action_set",
         "measurement_noise",
+        "grid",
         "cost",
         "constants",
         "law",
@@ -48,6 +50,15 @@ def test_the_noise_counts_where_a_model_is_fitted_for_it():
     digests = {design_digest(field | {"measurement_noise": noise}) for noise in (0.0, 0.1, 0.2)}
     assert len(digests) == 3
     assert design_digest(known | {"measurement_noise": 0.1}) == design_digest(known)
+
+
+def test_the_axes_count_where_there_are_several_and_a_field_on_them_is_fitted():
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    plates = [Grid((Axis("y", 1.0, 4), Axis("x", 1.0, n))).text for n in (6, 8)]
+    for identification, count in (("field", 3), ("regression", 1)):
+        own = known | {"identification": identification}
+        grids = ("", Grid((Axis("x", 2.0, 24),)).text, Grid.vector(3).text, *plates)
+        assert len({design_digest(own | {"grid": grid}) for grid in grids}) == count
 
 
 @pytest.mark.parametrize("name", ["identification_settings.energy", "law_settings.gain"])

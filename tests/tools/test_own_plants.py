@@ -222,7 +222,7 @@ def test_an_installed_package_offers_plants_by_name(
     ("name", "given", "method"),
     [
         (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
-        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, "identification": "regression", **FEW_FITS}),
+        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, **FEW_FITS}),
     ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(
@@ -393,7 +393,7 @@ def test_no_model_of_a_field_on_one_axis_is_fitted_to_a_plate(
     """Its points have other neighbours; linear models in modes or of all numbers know of none."""
     for name in ("fit_spectral", "fit_finite_difference"):
         monkeypatch.setattr(kinds, name, lambda *_, **__: pytest.fail("was fitted"))
-    settings = {"optimizer": "model_based", "identification": "regression", "horizon": 30}
+    settings = {"optimizer": "model_based", "horizon": 30}
     settings |= {"physical.nx": 6, "physical.ny": 4}
     run = pdeloop.train(plant=PLATE, rollouts=12, evaluation_fields=2, **settings)
     assert run.costs["adapted"].mean() < run.costs["lqt"].mean()
