@@ -25,7 +25,7 @@ from pdeloop.study.executors import processes
 from tests.simulation.audit import undisturbed, verdict
 from tests.simulation.plan import aimed, draw
 
-SEEDS = 60
+SEEDS = 120
 
 
 @dataclass(frozen=True)
