@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg, signal
+import scipy  # whose signal module loads when it is used
+from scipy import linalg
 
 from loop_method.design.lqt import track
 from loop_method.reduce.reduced_model import ReducedModel
@@ -86,8 +87,8 @@ def test_what_is_no_model_is_refused(parts: dict[str, Any], words: str) -> None:
 
 def test_a_system_in_continuous_time_is_sampled_with_held_inputs() -> None:
     rates = linalg.logm(linalg.expm(0.1 * A)).real
-    system = signal.StateSpace(rates, B, np.eye(3), np.zeros((3, 2)))
-    held = signal.cont2discrete((rates, B, np.eye(3), np.zeros((3, 2))), 0.25)
+    system = scipy.signal.StateSpace(rates, B, np.eye(3), np.zeros((3, 2)))
+    held = scipy.signal.cont2discrete((rates, B, np.eye(3), np.zeros((3, 2))), 0.25)
     model = ReducedModel.of(system, 0.25)
     np.testing.assert_allclose(model.A, held[0], rtol=1e-12)
     np.testing.assert_allclose(model.B, held[1], rtol=1e-12)
@@ -97,11 +98,11 @@ def test_a_system_in_continuous_time_is_sampled_with_held_inputs() -> None:
 
 def test_a_system_in_discrete_time_is_taken_as_it_is() -> None:
     nothing = np.zeros((3, 2))
-    model = ReducedModel.of(signal.StateSpace(A, B, np.eye(3), nothing, dt=0.5), 0.5)
+    model = ReducedModel.of(scipy.signal.StateSpace(A, B, np.eye(3), nothing, dt=0.5), 0.5)
     assert np.array_equal(model.A, A) and np.array_equal(model.B, B)
     for system, words in (
-        (signal.StateSpace(A, B, np.eye(3), nothing, dt=0.4), "0.4 s; expected 0.5 s"),
-        (signal.StateSpace(A, B, np.eye(3), nothing + 1, dt=0.5), "D of the system is not 0"),
+        (scipy.signal.StateSpace(A, B, np.eye(3), nothing, dt=0.4), "0.4 s; expected 0.5 s"),
+        (scipy.signal.StateSpace(A, B, np.eye(3), nothing + 1, dt=0.5), "D of the system is not 0"),
         (
             SimpleNamespace(A=A, B=B, C=A, D=nothing, dt=None, isctime=None),
             "dt of the system is None",

@@ -154,7 +154,7 @@ def test_a_front_that_looks_like_noise_in_its_short_waves_is_none(
 
 def test_noise_that_is_found_is_told_and_makes_no_first_law() -> None:
     """A model of short pieces takes it for the field, and one for noise has the wrong actuators."""
-    sigma, plant = 0.05, {"n_z": 96, "n_a": 6, "horizon": 64}
+    sigma, plant = 0.05, {"n_z": 96, "n_a": 6, "horizon": 40}
     rollouts, target = explored("allen-cahn-modes", measurement_noise=sigma, **plant)
     values = pdeloop.problem("allen-cahn-modes", **plant).values
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg, signal
+import scipy  # whose modules load when they are used
 
 import pdeloop
 from loop_method.design.lqg import kalman_filter
@@ -239,8 +239,8 @@ def test_an_unweighted_marginal_mode_is_refused_by_both() -> None:
 def test_a_simulation_of_scipy_begins_before_the_first_step() -> None:
     """In `make test` too: it needs SciPy alone."""
     z, a = trajectory(30)
-    system = signal.dlti(A, B, np.eye(3), np.zeros((3, 2)), dt=1.0)
-    _, y, x = signal.dlsim(system, np.vstack([a, a[-1:]]), x0=z[0])
+    system = scipy.signal.dlti(A, B, np.eye(3), np.zeros((3, 2)), dt=1.0)
+    _, y, x = scipy.signal.dlsim(system, np.vstack([a, a[-1:]]), x0=z[0])
     np.testing.assert_allclose(y, z, atol=1e-10)
     agrees(pdeloop.ReducedModel.of(system, 1.0), x, a)
 
@@ -249,17 +249,22 @@ def test_only_a_held_input_leaves_the_state_what_it_is() -> None:
     """In `make test` too: of `signal.cont2discrete`, which python-control calls."""
     F, G = np.array([[-1.0, 0.5], [0.0, -2.0]]), np.array([[0.0], [1.0]])
     plant, h = (F, G, np.eye(2), np.zeros((2, 1))), 0.1
-    held = pdeloop.ReducedModel.of(signal.dlti(*signal.cont2discrete(plant, h)[:4], dt=h), h)
-    np.testing.assert_allclose(held.A, linalg.expm(h * F), atol=EXACT)
+    held = pdeloop.ReducedModel.of(
+        scipy.signal.dlti(*scipy.signal.cont2discrete(plant, h)[:4], dt=h), h
+    )
+    np.testing.assert_allclose(held.A, scipy.linalg.expm(h * F), atol=EXACT)
     ramp = np.zeros((4, 4))  # of x, u = t and 1
     ramp[:2, :2], ramp[:2, 2:3], ramp[2, 3] = F, G, 1.0
     exact = {
-        "foh": ([[0.0], [h], [2 * h]], [linalg.expm(k * h * ramp)[:2, 3] for k in range(3)]),
-        "impulse": ([[1 / h], [0], [0]], [linalg.expm(k * h * F) @ G[:, 0] for k in range(3)]),
+        "foh": ([[0.0], [h], [2 * h]], [scipy.linalg.expm(k * h * ramp)[:2, 3] for k in range(3)]),
+        "impulse": (
+            [[1 / h], [0], [0]],
+            [scipy.linalg.expm(k * h * F) @ G[:, 0] for k in range(3)],
+        ),
     }
     for method, (u, response) in exact.items():
-        sampled = signal.dlti(*signal.cont2discrete(plant, h, method)[:4], dt=h)
-        _, y, x = signal.dlsim(sampled, u)
+        sampled = scipy.signal.dlti(*scipy.signal.cont2discrete(plant, h, method)[:4], dt=h)
+        _, y, x = scipy.signal.dlsim(sampled, u)
         np.testing.assert_allclose(y, response, atol=EXACT)
         assert np.abs(x - response).max() > 1e-3
         with pytest.raises(ValueError, match="D of the system is not 0"):

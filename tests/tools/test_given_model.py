@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import signal
+import scipy  # whose signal module loads when it is used
 
 import pdeloop
 from pdeloop.cli import FAILED, main
@@ -63,8 +63,8 @@ def test_the_first_law_is_that_of_the_matrices(tmp_path: Path) -> None:
 
 def test_a_state_space_system_is_sampled_as_the_plant_is() -> None:
     rates = np.diag([-0.2, -0.3, -0.1])
-    system = signal.StateSpace(rates, B, np.eye(3), np.zeros((3, 2)))
-    sampled = signal.cont2discrete((rates, B, np.eye(3), np.zeros((3, 2))), Rod.sample_time)
+    system = scipy.signal.StateSpace(rates, B, np.eye(3), np.zeros((3, 2)))
+    sampled = scipy.signal.cont2discrete((rates, B, np.eye(3), np.zeros((3, 2))), Rod.sample_time)
     assert first_law(system) == pytest.approx(
         first_law(pdeloop.ReducedModel(*sampled[:2])), rel=1e-9
     )
