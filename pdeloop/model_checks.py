@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
@@ -112,7 +112,7 @@ def largest_pole(
         except (ValueError, linalg.LinAlgError):
             return size, np.nan, np.nan
     error = np.sqrt((PARTS - 1) * np.var(found))
-    reach = float(stats.t.ppf(0.5 + CONFIDENCE / 2, PARTS - 1) * error)
+    reach = float(special.stdtrit(PARTS - 1, 0.5 + CONFIDENCE / 2) * error)
     return size, size - reach, size + reach
 
 
@@ -166,7 +166,7 @@ def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory
             for lag in range(1, LAGS + 1)
         ]
     )
-    in_time = np.flatnonzero(n * np.sum(rho**2, axis=0) > stats.chi2.isf(level, LAGS))
+    in_time = np.flatnonzero(n * np.sum(rho**2, axis=0) > special.chdtri(LAGS, level))
     X, y = (
         np.concatenate(inputs),
         np.concatenate([e[k] for e, (_, k) in zip(centred, parts, strict=True)]),
@@ -176,7 +176,7 @@ def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory
     if len(X) > LEAST * columns:
         left = y - X @ linalg.lstsq(X, y)[0]
         share = 1.0 - np.sum(left**2, axis=0) / np.maximum(np.sum(y**2, axis=0), 1e-300)
-    moved = np.flatnonzero(len(X) * share > stats.chi2.isf(level, columns))
+    moved = np.flatnonzero(len(X) * share > special.chdtri(columns, level))
     return Residuals(
         n,
         tuple((int(i), float(np.abs(rho[:, i]).max())) for i in in_time),
