@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.ros_environment import steering, with_servers_there
+from loop_interfaces.isolation import NETWORK
+from loop_interfaces.ros_environment import STEERING, steering, with_servers_there
+from loop_interfaces.start import BLAS_THREADS, OWN
 from tests.support.interpreter import ROOT
 
 
@@ -86,3 +88,9 @@ def test_who_waits_names_the_variables_that_may_be_the_cause() -> None:
     assert steering(usual) == ""
     set_ = {"ROS_STATIC_PEERS": "192.0.2.7", "ROS_DISCOVERY_SERVER": "x:1"}
     assert steering(usual | set_) == "ROS_STATIC_PEERS=192.0.2.7, ROS_DISCOVERY_SERVER=x:1"
+
+
+def test_a_table_names_the_variables() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    names = {*STEERING, *OWN, NETWORK, BLAS_THREADS, "ROS_LOG_DIR", "PYTHONIOENCODING"}
+    assert {name for name in names if f"`{name}`" not in page} == set()
