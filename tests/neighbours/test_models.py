@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib.util import find_spec
 from typing import Any
 
@@ -14,6 +15,7 @@ import pdeloop
 from loop_method.design.lqg import kalman_filter
 from loop_method.design.lqt import DesignError
 from loop_method.reduce.subspace import subspace_model
+from tests.support.interpreter import ROOT
 
 A = 0.95 * np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [1.0, 0.0], [0.5, 1.0]])
@@ -269,3 +271,15 @@ def test_only_a_held_input_leaves_the_state_what_it_is() -> None:
         assert np.abs(x - response).max() > 1e-3
         with pytest.raises(ValueError, match="D of the system is not 0"):
             pdeloop.ReducedModel.of(sampled, h)
+
+
+def test_the_page_has_the_pinned_versions() -> None:
+    """In `make test` too."""
+    page = (ROOT / "docs" / "neighbours.md").read_text()
+    pins = (ROOT / "constraints.txt").read_text().lower().split()
+    scripts = "".join(file.read_text() for file in (ROOT / "findings").glob("*.sh")).lower().split()
+    rows = re.findall(r"^\| ([\w. -]+?) (\d[\d.]+)( †)?", page, flags=re.MULTILINE)
+    assert len(rows) > 12
+    for name, version, older in rows:
+        package = name.removeprefix("python-").lower()
+        assert f"{package}=={version}" in (scripts if older else pins), name

@@ -7,6 +7,7 @@ import ast
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,6 +223,21 @@ def test_gymnasium() -> None:
     assert not ClipAction(gymnasium.make("Pendulum-v1")).action_space.is_bounded()
     plant = pdeloop.from_gymnasium("Pendulum-v1", target=[1.0, 0.0, 0.0])
     np.testing.assert_allclose(plant.reset([1])[0], first, rtol=1e-6)
+
+
+def test_returns_of_gymnasium_have_the_precision_of_the_rewards() -> None:
+    import gymnasium
+    from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit, TransformReward
+
+    for kind, error in ((np.float32, 1e-4), (np.float64, 0.0)):
+        each: Any = kind(0.1)
+        constant = TransformReward(gymnasium.make("Pendulum-v1").unwrapped, lambda _, r=each: r)
+        env = RecordEpisodeStatistics(TimeLimit(constant, 2000))
+        env.reset(seed=0)
+        for _ in range(2000):
+            info = env.step(np.zeros(1, np.float32))[4]
+        found = abs(float(info["episode"]["r"]) - 2000 * float(each))
+        assert found > error if error else found < 1e-9
 
 
 def test_vector_environments_of_gymnasium_ignore_the_action_after_an_end() -> None:
