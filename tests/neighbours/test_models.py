@@ -251,9 +251,8 @@ def test_only_a_held_input_leaves_the_state_what_it_is() -> None:
     """In `make test` too: of `signal.cont2discrete`, which python-control calls."""
     F, G = np.array([[-1.0, 0.5], [0.0, -2.0]]), np.array([[0.0], [1.0]])
     plant, h = (F, G, np.eye(2), np.zeros((2, 1))), 0.1
-    held = pdeloop.ReducedModel.of(
-        scipy.signal.dlti(*scipy.signal.cont2discrete(plant, h)[:4], dt=h), h
-    )
+    discrete = scipy.signal.dlti(*scipy.signal.cont2discrete(plant, h)[:4], dt=h)
+    held = pdeloop.ReducedModel.of(discrete, h)
     np.testing.assert_allclose(held.A, scipy.linalg.expm(h * F), atol=EXACT)
     ramp = np.zeros((4, 4))  # of x, u = t and 1
     ramp[:2, :2], ramp[:2, 2:3], ramp[2, 3] = F, G, 1.0
