@@ -274,6 +274,26 @@ class ClosedLoop(ClosedLoopProblem):
         counted = weights > 0.0
         return float(weights[counted] @ simulation.costs[counted]), gradient
 
+    def unsaturated(self, theta: Array, fields: Array, weights: Array) -> Array:
+        """The law with less excess where an action is at a bound from all fields, nearly the same one.
+
+        There the cost does not depend on theta. The mean excess over the bound is taken from the
+        constants, so that actions are on both sides of it.
+        """
+        simulation, n_a = self.simulate(theta, fields), self.model.n_a
+        n_f = theta.shape[1] - self.constants
+        requested = simulation.features[:, :, :-1] @ theta[:n_a, :n_f].T
+        requested += self.constant_feature * theta[:n_a, n_f:].T[:, None][: self.horizon]
+        excess = requested - simulation.actions
+        if self.constants == 1:
+            excess = excess.reshape(1, -1, n_a)
+            weights = np.tile(weights, self.horizon) / self.horizon
+        always = (excess != 0.0).all(axis=1)
+        excess = np.where(always, np.einsum("kfi,f->ki", excess, weights), 0.0)
+        changed = theta.copy()
+        changed[:n_a, n_f:] -= excess.T
+        return changed
+
     def moment(self, simulation: Simulation, weights: Array) -> Array:
         """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields."""
         features = simulation.features

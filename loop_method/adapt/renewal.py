@@ -282,6 +282,12 @@ def _descent(
         every, weights = weighted(fields, drawn, MEASURED_SHARE)
         start = cheapest(loop, starts, every, weights)
         found = improve(loop, start, every, weights, curvature, settings, least_gain)
+        rests = found is not None and not found.after < (1.0 - least_gain) * found.before
+        if loop.action_set.bounded and found and rests:  # the gradient of saturated actions is 0
+            start = loop.unsaturated(found.theta, every, weights)
+            again = improve(loop, start, every, weights, curvature, settings, least_gain)
+            if again and again.after < found.after:
+                found = again
         return None if found is None else (found.theta, found.steps)
 
     return descend

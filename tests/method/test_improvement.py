@@ -293,6 +293,25 @@ def renewed(measured: np.ndarray, **constants: int) -> tuple[Renewal, float]:
     return found, float(closed.costs(found.theta, fields(100)).mean())
 
 
+def test_a_law_that_asks_for_more_than_there_is_everywhere_is_improved() -> None:
+    """All actions are at a bound from all fields, so that the gradient is 0; the target asks for 1."""
+    A, B = 0.8 * np.eye(3), np.eye(3)[:, :2]
+    model = LinearModel("linear", A, B, np.zeros(3))
+    target = np.array([5.0, 5.0, 0.0])
+    closed = ClosedLoop(np.eye(3), target, 1.0, 1e-3, T, ActionSet(2, 0.0, 3.0), model=model)
+    first = np.column_stack([-0.1 * np.eye(2, 3), np.full(2, 40.0)])
+    measured = np.random.default_rng(4).normal(size=(6, 3))
+    assert (closed.simulate(first, measured).actions == 3.0).all()
+    assert not closed.gradient(first, measured, np.full(6, 1 / 6))[1].any()
+    rng, settings = np.random.default_rng(6), ModelBasedSettings(mixtures=2, most_mixtures=2)
+    found = renew(closed, first, first, [], measured, rng, settings)
+    assert found is not None and found.fraction == 1.0 and found.change.is_negative(1.0)
+    # The law that is best from every field: 3 until the target is there, and then 1.
+    best = np.column_stack([-0.8 * np.eye(2, 3), np.full(2, 5.0)])
+    own, least, before = (closed.costs(law, measured).mean() for law in (found.theta, best, first))
+    assert least < 0.4 * before and own < 1.05 * least
+
+
 def test_a_law_that_other_fields_do_not_confirm_is_made_again_on_more_draws() -> None:
     """The fields look alike everywhere, so that draws of their distribution tell what eight do not."""
     measured = np.random.default_rng(101).normal(size=(8, N_Z))
