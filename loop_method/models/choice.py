@@ -132,7 +132,8 @@ def fit_field_model(
         return None
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
-        settings = replace(settings, reproduced=settings.reproduced_noisy)
+        enough = min(settings.reproduced_noisy, _share_of_noise(rollouts, target, noise))
+        settings = replace(settings, reproduced=max(settings.reproduced, enough))
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
     if knows_noise:
         kinds = [kind for kind in kinds if kind.fit_noisy is not None]
@@ -185,6 +186,14 @@ def fit_kind(
     kinds = {kind.name: kind for kind in kinds_of(n_z, 1, settings, line=line, shape=shape)}
     with one_thread():
         return _fitted(kinds[name], rollouts, noise)
+
+
+def _share_of_noise(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
+    """Variance of noise over that of z - z_r: what an uncertain initial state is worth."""
+    sums = np.zeros(2)
+    for rollout in usable(rollouts):
+        sums += rollout.states.size * noise**2, np.sum((rollout.states - target) ** 2)
+    return float(sums[0] / sums[1]) if sums[1] else np.inf
 
 
 def with_clean(

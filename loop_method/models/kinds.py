@@ -199,7 +199,7 @@ def _polynomial(n_z: int) -> list[Kind]:
     if n_z > LARGEST_STATE:
         return []
     fit = partial(fit_polynomial, kind="polynomial")
-    return [Kind("polynomial", fit, (n_z + 1.0, 0), needed=NEAR_NEEDED)]
+    return [Kind("polynomial", fit, (n_z + 1.0, 0))]
 
 
 def _finite_difference(

@@ -48,6 +48,26 @@ def test_products_of_state_and_action_are_found_and_linear_models_are_not_enough
     assert dict(chosen.candidates)["linear"] > 0.02
 
 
+def test_noise_explains_no_more_of_an_error_than_it_is_worth() -> None:
+    """A tank that a valve empties: linear but for the product, which noise of 0.2 % does not hide."""
+    rng, noise = np.random.default_rng(5), 0.01
+    L = np.eye(8, k=1) + np.eye(8, k=-1) - np.diag([1, 2, 2, 2, 2, 2, 2, 1])
+    rollouts = []
+    for _ in range(8):
+        z = 5.0 + rng.normal() + 0.3 * rng.normal(size=8)
+        states, actions = [z], rng.uniform(size=(T, 2))
+        for heat, valve in actions:
+            z = z + 0.1 * L @ z + 0.3 * heat - 0.2 * valve * z
+            states.append(z)
+        measured = np.array(states) + noise * rng.normal(size=(T + 1, 8))
+        rollouts.append(Measured(measured, actions))
+    found = fit_field_model(rollouts, np.full(8, 3.0), noise=noise, line=False)
+    assert found is not None and found.model.kind == "polynomial"
+    assert 0.01 < dict(found.candidates)["linear1e-4"] < 0.05  # enough where noise is large
+    z, a = np.full((1, 8), 4.0), np.array([[0.0, 1.0]])
+    np.testing.assert_allclose(found.model.step(z, a) - z, -0.2 * z, rtol=0.1)
+
+
 def test_units_change_nothing() -> None:
     units = np.array([1.0, 1e3, 1e-3, 50.0, 273.0])
     plain, scaled = fitted(), fitted(units)
