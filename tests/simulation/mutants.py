@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -86,9 +87,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "loop_interfaces.signature": _SIGNATURE,
 }
 """The modules that are changed, and their tests."""
-ENDS = {1: "simulation", 2: "tests", 3: "time limit", 0: "survived"}
+ENDS = {4: "simulation", 2: "tests", 3: "time limit", 0: "survived"}
 """What found a mutant, by the exit code of its process."""
 _NOT_PLANTED = 9
+_RAISED = 1
+"""How a process ends that could not judge its mutant, as Python has it."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,9 @@ def tested(files: tuple[str, ...]) -> bool:
     """True if the tests in these files, below `tests/`, pass."""
     words = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly"]
     paths = [str(ROOT / "tests" / file) for file in files]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    silent = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
+    # The tests leave a temporary folder of theirs as that of the process, and later ones remove it.
+    with silent[0], silent[1], mock.patch.dict(os.environ), mock.patch("tempfile.tempdir", None):
         return pytest.main([*words, *paths]) == pytest.ExitCode.OK
 
 
@@ -186,7 +191,7 @@ def judge(mutant: Mutant) -> None:
     for seed in range(SEEDS):
         for plan in (aimed(seed), draw(seed)):
             if verdict(plan)[1]:
-                os._exit(1)
+                os._exit(4)
     os._exit(0 if tested(TESTS[mutant.module]) else 2)
 
 
@@ -206,8 +211,9 @@ def tried(mutants: list[Mutant]) -> Iterator[tuple[Mutant, str]]:
             mutant, process, deadline = entry
             if process.exitcode is None and time.monotonic() < deadline:
                 continue
-            end = ENDS[3] if process.exitcode is None else ENDS.get(process.exitcode, "tests")
             assert process.exitcode != _NOT_PLANTED, f"{mutant} could not be planted"
+            assert process.exitcode != _RAISED, f"{mutant} was not judged"
+            end = ENDS[3] if process.exitcode is None else ENDS.get(process.exitcode, "tests")
             process.kill()
             process.join()
             begun.remove(entry)
