@@ -33,6 +33,8 @@ from loop_method.models.settings import DEFAULTS, FieldModelSettings
 
 _HOPELESS = 20.0
 """Multiple of the best E, or of `reproduced`, above which a kind is dropped from further folds."""
+_GROWN = 10.0
+"""E that the noise of an initial state may lead to, per share of the noise in the states."""
 
 FEWEST_SAMPLES = 4
 
@@ -132,7 +134,8 @@ def fit_field_model(
         return None
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
-        enough = min(settings.reproduced_noisy, _share_of_noise(rollouts, target, noise))
+        enough = _GROWN * _share_of_noise(rollouts, target, noise)
+        enough = min(enough, settings.reproduced_noisy)
         settings = replace(settings, reproduced=max(settings.reproduced, enough))
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
     if knows_noise:
@@ -189,7 +192,7 @@ def fit_kind(
 
 
 def _share_of_noise(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
-    """Variance of noise over that of z - z_r: what an uncertain initial state is worth."""
+    """Variance of noise over that of z - z_r."""
     sums = np.zeros(2)
     for rollout in usable(rollouts):
         sums += rollout.states.size * noise**2, np.sum((rollout.states - target) ** 2)

@@ -45,7 +45,10 @@ class FieldModelSettings(Settings):
     # The choice of a kind.
     reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
     reproduced_noisy: float = setting(
-        0.05, "the same with measurement noise, which leaves initial states uncertain", 0, 1
+        0.05,
+        "its largest value with measurement noise, which leaves initial states uncertain",
+        0,
+        1,
     )
     better: float = setting(
         3.0,
