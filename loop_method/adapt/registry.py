@@ -15,7 +15,7 @@ GROUP = "pdeloop.optimizers"
 """The group of entry points by which an installed package offers optimisers."""
 
 
-_REMOVED = {"gauss_newton": "was removed: use model_based, which costs as little, or two_point"}
+_REMOVED = {"gauss_newton": "was removed: use model_based, or two_point"}
 """Optimisers of earlier versions, and what to use in their place."""
 
 
