@@ -29,9 +29,9 @@ def add(commands: Commands) -> None:
         commands,
         "reproduce",
         _reproduce,
-        help="reproduce the paper's experiment over several seeds, and compare `model_based` with it",
+        help="reproduce the paper's experiment over several seeds, and compare model_based with it",
         description="For each problem and seed, train the paper's LQT-PO and pure PO, and "
-        "`model_based`, and compare them with LQT and no control on the same evaluation fields. Ctrl-C "
+        "model_based, and compare them with LQT and no control on the same evaluation fields. Ctrl-C "
         "interrupts; --out DIR of an interrupted reproduction continues it.",
         example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
