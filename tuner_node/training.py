@@ -153,7 +153,11 @@ class Training:
             together = self.settings.explorations
             if lost := void_exploration.diverged_steps(result, self.pending, together):
                 return self._explored_in_vain(lost)
-            assert result.models is not None
+            if result.models is None:
+                raise ValueError(
+                    "the plant completed an exploration of which the controller says that it cannot "
+                    "be identified from; expected one plant and one controller: stop the other ones"
+                )
             remarks: list[dict[str, Any]] = []
             if result.trajectories is not None:
                 seen = iter(result.trajectories)
