@@ -285,9 +285,9 @@ def _descent(
         rests = found is not None and not found.after < (1.0 - least_gain) * found.before
         if loop.action_set.bounded and found and rests:  # the gradient of saturated actions is 0
             start = loop.unsaturated(found.theta, every, weights)
-            again = improve(loop, start, every, weights, curvature, settings, least_gain)
-            if again and again.after < found.after:
-                found = again
+            if not np.array_equal(start, found.theta):
+                again = improve(loop, start, every, weights, curvature, settings, least_gain)
+                found = again if again and again.after < found.after else found
         return None if found is None else (found.theta, found.steps)
 
     return descend

@@ -3,9 +3,9 @@
 
 Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
 from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
-share their coefficients, used for both. The first kind with E of at most `reproduced` is
-selected; if there is none, the one with the fewest unknowns that is not `better` times worse than the
-best. It is then fitted to all rollouts.
+share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
+ten times its share of the states up to `reproduced_noisy`, is selected; if there is none, the one with
+the fewest unknowns that is not `better` times worse than the best. It is then fitted to all rollouts.
 """
 
 from __future__ import annotations
