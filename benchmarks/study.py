@@ -19,23 +19,29 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from operator import sub
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.processes import markdown
+from loop_interfaces.affinity import usable_cores
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import local_workers
-from pdeloop.study.results import reading
+from pdeloop.study.results import Ended, reading
+from pdeloop.study.run import Pool, ended_well
 from pdeloop.study.status import status
 from pdeloop.study.training import train_one
+from spectral_solver.workers import use_cores
 
-SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 40}
+SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 20}
 DRIVER_KILLS = 2
+BLOCK = 6
 
 
 def run(
@@ -43,7 +49,7 @@ def run(
     trainings: int = 1000,
     workers: int = 8,
     every: float = 2.0,
-    alone: int = 20,
+    alone: int = 5,
     tasks: int = 10_000,
     simulated: int = 64,
     seconds: float = 1.0,
@@ -60,7 +66,7 @@ def run(
     every
         Seconds between two kills of a worker.
     alone
-        Trainings of the comparison with a bare loop; 0: leave this part out.
+        Blocks of `BLOCK` trainings of the comparison with a bare loop; 0: leave this part out.
     tasks
         Tasks that sleep; 0: leave this part out.
     simulated
@@ -74,47 +80,62 @@ def run(
     with TemporaryDirectory(prefix="pdeloop-") as place:
         folder = Path(place)
         if alone:
-            result["overhead"] = overhead(_study(problem, alone), folder)
+            result["overhead"] = overhead(problem, folder, alone)
         if trainings:
-            result["killed"] = killed(_study(problem, trainings), folder, workers, every)
+            result["killed"] = killed(_study(problem, range(trainings)), folder, workers, every)
         if tasks:
             result["simulated"] = without_work(problem, folder, tasks, simulated, seconds)
     return result
 
 
-def _study(problem: str, seeds: int) -> Study:
-    content = {"problems": [problem], "seeds": seeds, "settings": SETTINGS}
+def _study(problem: str, seeds: range) -> Study:
+    content = {"problems": [problem], "seeds": [*seeds], "settings": SETTINGS}
     return Study.of({**content, "variants": {"two-point": {}}})
 
 
-def overhead(study: Study, folder: Path) -> dict[str, Any]:
-    """Seconds per training: in a bare loop, and in a study on one process and on two."""
-    values = study.trainings()
-    first = next(iter(values))
-    train_one(values[first])  # compiles
-    times = {}
-    began = time.perf_counter()
-    for name in values:
-        train_one(values[name])
-    times["bare"] = time.perf_counter() - began
+def overhead(problem: str, folder: Path, blocks: int) -> dict[str, Any]:
+    """Seconds per training on one process of a study, against the same one in a bare loop here.
+
+    Both take turns, block by block, so that what else the machine does meets both: the medians are of
+    pairs of the same training. Then the speed-up with two processes.
+    """
+    use_cores(usable_cores()[:1])  # as a process of a study does
+    pairs: list[tuple[float, float]] = []
+    with local_workers(1) as one:
+        for block in range(blocks + 1):
+            study = _study(problem, range(block * BLOCK, (block + 1) * BLOCK))
+            bare = []
+            for values in study.trainings().values():
+                began = time.perf_counter()
+                train_one(values)
+                bare.append(time.perf_counter() - began)
+            at = _ends(study, folder / f"block{block}", lambda: contextlib.nullcontext(one))
+            if block:  # the first one compiles and loads
+                pairs += [*zip(bare[1:], map(sub, at[1:], at), strict=True)]
+    rates = []
     for count in (1, 2):
-        at: list[float] = []
-
-        def tell(done: int, total: int, status: str, at: list[float] = at) -> None:
-            if done > len(at):
-                at.extend([time.perf_counter()] * (done - len(at)))
-
-        carry_out(study, folder / f"alone{count}", partial(local_workers, count), tell=tell)
+        study = _study(problem, range(2 * BLOCK))
+        at = _ends(study, folder / f"alone{count}", partial(local_workers, count))
         # From the first that are finished on: processes import and load for some seconds.
-        times[str(count)] = (at[-1] - at[count - 1]) / (len(at) - count) * len(values)
-    each = {name: total / len(values) for name, total in times.items()}
+        rates.append((len(at) - count) / (at[-1] - at[count - 1]))
     return {
-        "trainings": len(values),
-        "bare_seconds": each["bare"],
-        "study_seconds": each["1"],
-        "overhead_percent": 100 * (each["1"] / each["bare"] - 1),
-        "speed_up_two": each["1"] / each["2"],
+        "pairs": len(pairs),
+        "bare_seconds": median(bare for bare, _ in pairs),
+        "study_seconds": median(own for _, own in pairs),
+        "overhead_percent": 100 * (median(own / bare for bare, own in pairs) - 1),
+        "speed_up_two": rates[1] / rates[0],
     }
+
+
+def _ends(study: Study, folder: Path, pool: Pool) -> list[float]:
+    """When each training of a study was kept."""
+    at: list[float] = []
+
+    def tell(done: int, total: int, status: str) -> None:
+        at.extend([time.perf_counter()] * (done - len(at)))
+
+    carry_out(study, folder, pool, tell=tell)
+    return at
 
 
 def killed(study: Study, folder: Path, workers: int, every: float) -> dict[str, Any]:
@@ -183,22 +204,23 @@ def without_work(
     problem: str, folder: Path, tasks: int, simulated: int, seconds: float
 ) -> dict[str, Any]:
     """Processor time and memory of a driver whose trainings are tasks that sleep."""
-    study = _study(problem, tasks)
-    values = study.trainings()
-    files = train_one(values[next(iter(values))])
+    study = _study(problem, range(tasks))
+    name, values = next(iter(study.trainings().items()))
+    ended = ended_well(name, values, train_one)
 
-    def sleep(values: Mapping[str, Any]) -> Mapping[str, bytes]:
-        time.sleep(seconds)
-        return files
+    class Sleeping(ThreadPoolExecutor):
+        """Sleeps for each training, and has a result for it, as its worker would return it."""
 
-    @contextlib.contextmanager
-    def pool() -> Iterator[Executor]:
-        with ThreadPoolExecutor(simulated) as executor:
-            yield executor
+        def submit(self, task: Any, name: str, *arguments: Any) -> Future[Any]:  # type: ignore[override]
+            return super().submit(self.sleep, name)
+
+        def sleep(self, name: str) -> Ended:
+            time.sleep(seconds)
+            return ended._replace(name=name)
 
     before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began = time.perf_counter()
-    carry_out(study, folder / "simulated", pool, tasks={"two-point": sleep})
+    carry_out(study, folder / "simulated", partial(Sleeping, simulated))
     elapsed = time.perf_counter() - began
     spent = time.process_time() - before
     kept = [path for path in (folder / "simulated").rglob("*") if path.is_file()]

@@ -19,7 +19,8 @@ from loop_interfaces.module_path import SAFE_PATH
 from pdeloop.study import training
 from pdeloop.study.deaths import LINES
 from pdeloop.study.description import StudyError
-from pdeloop.study.executors import AHEAD, Death, Files, LostWorkerError, Workers
+from pdeloop.study.executors import AHEAD, Death, LostWorkerError, Workers
+from pdeloop.study.results import Ended
 
 CONNECTING = 10.0
 """Seconds in which a scheduler has to answer, and to be found again."""
@@ -81,7 +82,7 @@ class Cluster(Workers):
         return AHEAD * max(1, len(self._kinds))
 
     def submit(
-        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+        self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
     ) -> None:
         dataset = f"pdeloop/{self._study}/{identity}/{name}"
         only = [at for at, own in self._kinds.items() if own == kind]
@@ -102,11 +103,11 @@ class Cluster(Workers):
                     workers=self._only[name] or None,
                 )
                 self._new[dataset] = future
-        own: Future[Files] = Future()
+        own: Future[Ended] = Future()
         self._waiting[own], self._at[name], self._datasets[name] = name, future, dataset
         self._client.loop.add_callback(self._pass_on, future, own)
 
-    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+    def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
         time.sleep(PACE)
         found = super().collect(timeout)
         for name, _ in found:
@@ -204,7 +205,7 @@ class Cluster(Workers):
                 self._at[name].cancel()
                 own.set_exception(LostWorkerError())
 
-    async def _pass_on(self, future: Any, own: Future[Files]) -> None:
+    async def _pass_on(self, future: Any, own: Future[Ended]) -> None:
         """Give a future of Dask's outcome to one of concurrent.futures."""
         from distributed import KilledWorker
 
@@ -224,7 +225,7 @@ class Cluster(Workers):
                 own.set_result(found)
 
 
-def on_worker(topic: str, name: str, task: Callable[..., Files], *arguments: Any) -> Files:
+def on_worker(topic: str, name: str, task: Callable[..., Ended], *arguments: Any) -> Ended:
     """Carry out a task on a worker, which tells the driver how far it is."""
     from distributed import get_worker
 

@@ -18,20 +18,19 @@ from concurrent.futures import (
 )
 from functools import partial
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from loop_interfaces.affinity import usable_cores
 from loop_interfaces.module_path import safe_children
 from loop_interfaces.start import die_with
 from pdeloop.study import training
+from pdeloop.study.results import Ended
 from spectral_solver.workers import use_cores
 
 AHEAD = 2
 """Trainings for each worker that an executor has at a time, the running ones among them."""
 UNKNOWN = 64
 """Workers of an executor that does not say how many it has."""
-
-Files: TypeAlias = "Mapping[str, bytes]"
 
 
 class Death(NamedTuple):
@@ -57,7 +56,7 @@ class Workers:
 
     def __init__(self, pool: Executor) -> None:
         self.pool = pool
-        self._waiting: dict[Future[Files], str] = {}
+        self._waiting: dict[Future[Ended], str] = {}
 
     def kinds(self) -> Mapping[str, int]:
         """The number of workers by the kinds of `environments`."""
@@ -72,7 +71,7 @@ class Workers:
         """Work for the study with this id."""
 
     def submit(
-        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+        self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
     ) -> None:
         """Have a training carried out by a worker of a kind of `environments`.
 
@@ -80,7 +79,7 @@ class Workers:
         """
         self._waiting[self.pool.submit(task, *arguments)] = name
 
-    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+    def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
         """The trainings that have ended since, after at most `timeout` seconds, results first."""
         done, _ = wait(self._waiting, timeout=timeout, return_when=FIRST_COMPLETED)
         ordered = sorted(done, key=lambda one: one.cancelled() or one.exception() is not None)
@@ -120,7 +119,7 @@ class Processes(Workers):
         return len(self._pools)
 
     def submit(
-        self, name: str, kind: str, identity: str, task: Callable[..., Files], *arguments: Any
+        self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
     ) -> None:
         # Here and not in a callback: a process dies with the thread that has started it.
         place = next(i for i in range(len(self._pools)) if i not in self._at.values())
@@ -139,7 +138,7 @@ class Processes(Workers):
             return
         self._waiting[future] = name
 
-    def collect(self, timeout: float) -> list[tuple[str, Future[Files]]]:
+    def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
         found = []
         for name, future in super().collect(timeout):
             place = self._at.pop(name)

@@ -56,14 +56,38 @@ CREATE TABLE IF NOT EXISTS files (
 class Ended(NamedTuple):
     """A training that has ended.
 
-    name: PROBLEM/VARIANT/SEED; parameters: the resolved ones; files: content by name, empty of a
-    failure; failure: why it cannot be carried out.
+    name: PROBLEM/VARIANT/SEED; row: entries of `trainings`, by column; files: content by name,
+    compressed; empty of a failure.
     """
 
     name: str
-    parameters: Mapping[str, Any]
+    row: Mapping[str, Any]
     files: Mapping[str, bytes]
-    failure: str | None = None
+
+    @classmethod
+    def well(cls, name: str, parameters: Mapping[str, Any], files: Mapping[str, bytes]) -> Ended:
+        """A training with these resolved parameters, and files, result.json among them."""
+        result = parse_json(files["result.json"])
+        costs = result["costs_by_field"]
+        means = {n: sum(costs[n][0]) / len(costs[n][0]) for n in costs}
+        row = {
+            "parameters": json.dumps(dict(parameters), sort_keys=True),
+            "failure": None,
+            "no_control": means.get("none"),
+            "lqt": means.get("lqt"),
+            "cost": means.get("adapted"),
+            "rollouts": result["rollouts"][0]["total"],
+            "costs": json.dumps(costs),
+            "plant": result.get("plant"),
+            "environment": json.dumps(result.get("environment", {}), sort_keys=True),
+        }
+        return cls(name, row, {file: zlib.compress(own, 1) for file, own in files.items()})
+
+    @classmethod
+    def failed(cls, name: str, parameters: Mapping[str, Any], why: str) -> Ended:
+        """A training that cannot be carried out."""
+        text = json.dumps(dict(parameters), sort_keys=True)
+        return cls(name, {"parameters": text, "failure": why}, {})
 
 
 class Results:
@@ -116,13 +140,16 @@ class Results:
         """Keep what has ended, all or nothing."""
         with self._transaction():
             for one in ended:
-                self._add(one)
+                self._set(one.name, {"ended": time.time(), **one.row})
+                self._connection.executemany(
+                    "INSERT OR REPLACE INTO files VALUES (?, ?, ?)",
+                    [(one.name, file, content) for file, content in one.files.items()],
+                )
 
     def died(self, name: str, deaths: int) -> None:
         """Keep how many workers a training has lost so far."""
         with self._transaction():
-            self._row(name)
-            self._execute("UPDATE trainings SET deaths = ? WHERE name = ?", (deaths, name))
+            self._set(name, {"deaths": deaths})
 
     def forget(self, names: Iterable[str]) -> None:
         """Remove these trainings' results."""
@@ -131,36 +158,15 @@ class Results:
                 self._execute("DELETE FROM trainings WHERE name = ?", (name,))
                 self._execute("DELETE FROM files WHERE training = ?", (name,))
 
-    def _row(self, name: str) -> None:
+    def _set(self, name: str, entries: Mapping[str, Any]) -> None:
         problem, variant, seed = name.split("/")
+        of = {"name": name, "problem": problem, "variant": variant, "seed": int(seed), **entries}
+        words = ", ".join(f"{column} = excluded.{column}" for column in entries)
         self._execute(
-            "INSERT OR IGNORE INTO trainings (name, problem, variant, seed) VALUES (?, ?, ?, ?)",
-            (name, problem, variant, int(seed)),
+            f"INSERT INTO trainings ({', '.join(of)}) VALUES ({', '.join('?' * len(of))}) "
+            f"ON CONFLICT (name) DO UPDATE SET {words}",
+            (*of.values(),),
         )
-
-    def _add(self, one: Ended) -> None:
-        self._row(one.name)
-        entries: dict[str, Any] = {"ended": time.time(), "failure": one.failure}
-        entries["parameters"] = json.dumps(dict(one.parameters), sort_keys=True)
-        if one.failure is None:
-            result = parse_json(one.files["result.json"])
-            costs = result["costs_by_field"]
-            means = {n: sum(costs[n][0]) / len(costs[n][0]) for n in costs}
-            entries |= {
-                "no_control": means.get("none"),
-                "lqt": means.get("lqt"),
-                "cost": means.get("adapted"),
-                "rollouts": result["rollouts"][0]["total"],
-                "costs": json.dumps(costs),
-                "plant": result.get("plant"),
-                "environment": json.dumps(result.get("environment", {}), sort_keys=True),
-            }
-        words = ", ".join(f"{column} = ?" for column in entries)
-        values = (*entries.values(), one.name)
-        self._execute(f"UPDATE trainings SET {words} WHERE name = ?", values)
-        for file, content in one.files.items():
-            packed = zlib.compress(content, 1)
-            self._execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?)", (one.name, file, packed))
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         with _reported(self.folder, "read"):
@@ -215,8 +221,8 @@ def writing(folder: Path, study: Study) -> Iterator[Results]:
             why = error.strerror if isinstance(error, OSError) else error
             raise StudyError(f"cannot write to {folder}: {why}") from error
         yield results
-        unfinished = [path for path in (folder / UNFINISHED).iterdir() if path.name != "study"]
-        if not unfinished:
+        files = [path for path in (folder / UNFINISHED).rglob("*") if path.is_file()]
+        if files == [folder / UNFINISHED / "study"]:
             shutil.rmtree(folder / UNFINISHED)
 
 

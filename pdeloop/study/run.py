@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from pde_sim_node.build import fingerprint
 from pdeloop.study.deaths import LINES, MOST_DEATHS, Deaths
 from pdeloop.study.description import Study, StudyError
-from pdeloop.study.executors import Death, Files, LostWorkerError, Processes, Workers
+from pdeloop.study.executors import Death, LostWorkerError, Processes, Workers
 from pdeloop.study.results import STUDY_FILE, UNFINISHED, Ended, Results, writing
 from pdeloop.study.training import CURVE, FILES, Place, differences, train_one
 from pdeloop.training_run import load_compiled
@@ -34,6 +34,7 @@ POLL = 0.1
 """Seconds between two calls of `tell`."""
 
 Progress = Callable[[int, int, str], None]
+Files = Mapping[str, bytes]
 Task = Callable[[Mapping[str, Any]], Files]
 """(resolved parameters) -> content of each file, result.json among them."""
 Pool = Callable[[], AbstractContextManager[Executor | Workers]]
@@ -157,11 +158,13 @@ class _Driver:
         most_deaths: int,
     ) -> None:
         self._trainings, self._results, self._tasks, self._tell = trainings, results, tasks, tell
+        self._study, self._root = results.study_id, str((results.folder / UNFINISHED).resolve())
         self._train = partial(train_one, curves=study.curves)
         self._files = (CURVE, *FILES) if study.curves else FILES
         self._deaths = Deaths(most_deaths)
         self._environments = Environments(any_environment)
         self._plants: dict[str, int] = {}
+        self._identities: dict[str, str] = {}
         self._finished: set[str] = set()
         self._failures: dict[str, str] = {}
         self._began = time.monotonic()
@@ -225,7 +228,7 @@ class _Driver:
                         other[name] = changes
                     if not changes:
                         self._environments.know(name, result.get("environment", {}))
-                        found.append(Ended(name, self._trainings[name], files))
+                        found.append(Ended.well(name, self._trainings[name], files))
                         break
         return found
 
@@ -243,6 +246,15 @@ class _Driver:
             self._plants[whose] = fingerprint(self._trainings[name])
         return self._plants[whose]
 
+    def _identity(self, name: str) -> str:
+        """Of what a training is made with, but its seed, which is in its name."""
+        whose = name.rpartition("/")[0]
+        if whose not in self._identities:
+            content = [{**self._trainings[name], "seed": None}, self._plant(name)]
+            text = json.dumps(content, sort_keys=True)
+            self._identities[whose] = hashlib.sha256(text.encode()).hexdigest()[:16]
+        return self._identities[whose]
+
     def _task(self, name: str) -> Task | None:
         return self._tasks.get(name.split("/")[1])
 
@@ -250,22 +262,24 @@ class _Driver:
         """Train what is missing."""
         todo = deque(name for name in self._trainings if name not in self._finished)
         self._environments.meet(workers.environments, workers.kinds())
-        workers.begin(self._results.study_id)
+        workers.begin(self._study)
         if isinstance(workers, Processes):  # of this machine: once for all of them
             heads = {name.rpartition("/")[0]: name for name in todo}
             each = [self._trainings[name] for name in heads.values()]
             for values in {(v["equation"], v["optimizer"]): v for v in each}.values():
                 load_compiled(values, fits=True)
         waiting: set[str] = set()
-        while todo or waiting:
-            while todo and len(waiting) < workers.window:
-                name = todo.popleft()
-                self._submit(workers, name)
-                waiting.add(name)
-            workers.settle()
-            self._tell(self.done, len(self._trainings), self._status(workers))
-            ended: list[Ended] = []
-            try:
+        ended: list[Ended] = []
+        try:
+            while todo or waiting:
+                while todo and len(waiting) < workers.window:
+                    name = todo.popleft()
+                    self._submit(workers, name)
+                    waiting.add(name)
+                self._keep(ended)  # when the workers have something to do
+                ended.clear()
+                workers.settle()
+                self._tell(self.done, len(self._trainings), self._status(workers))
                 for name, future in workers.collect(POLL):
                     waiting.discard(name)
                     one = self._outcome(name, future)
@@ -283,9 +297,9 @@ class _Driver:
                         waiting.discard(death.name)
                     else:
                         continue
-                    ended.append(Ended(death.name, self._trainings[death.name], {}, reason))
-            finally:
-                self._keep(ended)
+                    ended.append(Ended.failed(death.name, self._trainings[death.name], reason))
+        finally:
+            self._keep(ended)
         self._tell(self.done, len(self._trainings), "")
 
     def _died(self, death: Death) -> str:
@@ -297,37 +311,32 @@ class _Driver:
 
     def _submit(self, workers: Workers, name: str) -> None:
         values, task = self._trainings[name], self._task(name)
-        content = json.dumps([dict(values), self._plant(name)], sort_keys=True)
-        identity = hashlib.sha256(content.encode()).hexdigest()[:16]
-        kind = self._environments.kind_for(name)
+        kind, identity = self._environments.kind_for(name), self._identity(name)
         if task is not None:
-            workers.submit(name, kind, identity, task, values)
+            workers.submit(name, kind, identity, ended_well, name, values, task)
             return
-        root = str((self._results.folder / UNFINISHED).resolve())
-        place = Place(root, self._results.study_id, name)
-        workers.submit(name, kind, identity, self._train, values, place)
+        place = Place(self._root, self._study, name)
+        workers.submit(name, kind, identity, ended_well, name, values, self._train, place)
 
-    def _outcome(self, name: str, future: Future[Files]) -> Ended | None:
+    def _outcome(self, name: str, future: Future[Ended]) -> Ended | None:
         """How a training has ended; None: it has to be submitted again."""
-        values = self._trainings[name]
         try:
-            files = future.result()
-            result = json.loads(files[FILES[-1]])
+            one = future.result()
         except LostWorkerError:
             return None
         except (BrokenExecutor, CancelledError):
             raise
         except (ValueError, RuntimeError) as error:
-            return Ended(name, values, {}, str(error))
+            return Ended.failed(name, self._trainings[name], str(error))
         except Exception as error:  # of a worker: no memory, no disk
-            return Ended(name, values, {}, f"{type(error).__name__}: {error}")
-        self._environments.require(name, result.get("environment", {}))
-        if (plant := result.get("plant")) is not None and plant != self._plant(name):
+            return Ended.failed(name, self._trainings[name], f"{type(error).__name__}: {error}")
+        self._environments.require(name, json.loads(one.row["environment"]))
+        if (plant := one.row["plant"]) is not None and plant != self._plant(name):
             raise StudyError(
                 f"a worker has another plant for {name} than this machine: the code or the data of the "
                 "plant differ; have the same on all"
             )
-        return Ended(name, values, files)
+        return one
 
     def _keep(self, ended: list[Ended]) -> None:
         if not ended:
@@ -338,15 +347,13 @@ class _Driver:
         for one in ended:
             self._finished.add(one.name)
             place = folder / UNFINISHED / one.name
-            if one.failure is not None:
-                self._failures[one.name] = one.failure
+            if one.row["failure"] is not None:
+                self._failures[one.name] = one.row["failure"]
                 if place.is_dir() and not (folder / one.name).exists():
                     (folder / one.name).parent.mkdir(parents=True, exist_ok=True)
                     place.rename(folder / one.name)
-            shutil.rmtree(place, ignore_errors=True)
-            for above in (place.parent, place.parent.parent):
-                if above.is_dir() and not any(above.iterdir()):
-                    above.rmdir()
+            if place.is_dir():
+                shutil.rmtree(place, ignore_errors=True)
 
     def _progress(self, name: str) -> list[Mapping[str, Any]]:
         """The last rows that a training has left in its folder."""
@@ -371,6 +378,13 @@ class _Driver:
         if self._deaths.total:
             words.append(f"{self._deaths.total} workers lost")
         return ", ".join([*words, *filter(None, [self._environments.remark])])
+
+
+def ended_well(
+    name: str, values: Mapping[str, Any], task: Callable[..., Files], *arguments: Any
+) -> Ended:
+    """Carry out a task, and do on its worker what would occupy the driver of many."""
+    return Ended.well(name, values, task(values, *arguments))
 
 
 class Environments:

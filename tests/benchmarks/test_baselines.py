@@ -190,7 +190,7 @@ def write(folder: Path, method: str, seed: int, found: list[float], **more: Any)
     result = {"costs_by_field": {"adapted": [found]}, "rollouts": [{"total": 20}], **more}
     content = json.dumps(result).encode()
     with writing(folder, Study.of({"problems": [str(SMALL)], "seeds": 4})) as results:
-        results.add([Ended(f"small/{method}/{seed}", {}, {"result.json": content})])
+        results.add([Ended.well(f"small/{method}/{seed}", {}, {"result.json": content})])
 
 
 def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_the_models_of_a_study_may_have_different_orders(tmp_path: Path):
     orders, study = (2, 3), Study.of({**CONTENT, "variants": {"own": {}}})
     with writing(tmp_path, study) as results:
         for order, (name, values) in zip(orders, study.trainings().items(), strict=True):
-            results.add([Ended(name, values, train_one({**values, "reduced_order": order}))])
+            results.add([Ended.well(name, values, train_one({**values, "reduced_order": order}))])
             run_folder = results.extract(name, tmp_path)
             assert len(load_run(run_folder).models[0].A) == order
     [row] = rows(study, tmp_path)
@@ -149,12 +149,13 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
     study, true = Study.of(CONTENT), training.environment()
 
     def upgraded(done: int, total: int, status: str) -> None:
-        if done == 3:
+        if done == 2:  # the third has been carried out
             monkeypatch.setattr(training, "environment", lambda: {**true, "numpy": "9.0"})
 
     monkeypatch.setattr(executors, "AHEAD", 1)
+    monkeypatch.setattr(executors, "UNKNOWN", 1)
     with pytest.raises(StudyError, match=r"a worker has numpy 9\.0 instead of .*any-environment"):
-        run(study, tmp_path, here, tell=upgraded)
+        run(study, tmp_path, lambda: Breaking(4), tell=upgraded)
     assert len(contents(tmp_path)) == 3 * len(FILES)
     assert run(study, tmp_path, here, any_environment=True) == []
     files = contents(tmp_path)
