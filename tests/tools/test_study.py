@@ -20,7 +20,7 @@ import pytest
 
 from pdeloop.cli import main
 from pdeloop.finished_run import load_run
-from pdeloop.study import Failure, Study, StudyError, executors, rows, run
+from pdeloop.study import Failure, Study, StudyError, cluster, executors, rows, run
 from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
@@ -195,24 +195,22 @@ def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any
 
 @pytest.mark.usefixtures("forked_workers")
 def test_the_command_runs_continues_and_refuses_another_study(
-    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     file, out = tmp_path / "study.yaml", tmp_path / "out"
     file.write_text(json.dumps({**CONTENT, "seeds": 1}))  # JSON is YAML
     assert main(["study", str(file), "--out", str(out), "--processes", "1"]) == 0
     assert "results in" in capsys.readouterr().out and (out / "costs.png").stat().st_size > 1000
-    assert main(["study", "--out", str(out), "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["rows"]) == 2
     for name in ("table.json", "costs.png"):
         (tmp_path / name).write_text("of somebody else")
         (out / name).unlink()
         (out / name).symlink_to(tmp_path / name)
-    assert main(["study", "--out", str(out)]) == 0
-    assert len(json.loads((out / "table.json").read_text())["rows"]) == 2
+    assert main(["study", "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["rows"]
+    assert len(told) == 2 and json.loads((out / "table.json").read_text())["rows"] == told
     assert {(tmp_path / name).read_text() for name in ("table.json", "costs.png")} == {
         "of somebody else"
     }
-    capsys.readouterr()
     file.write_text(json.dumps(CONTENT))
     assert main(["study", str(file), "--out", str(out)]) == 1
     assert "holds another study" in capsys.readouterr().err
@@ -232,6 +230,7 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert "address is ''; expected one like" in capsys.readouterr().err
     assert main(["study", *words, "tls://127.0.0.1:1"]) == 1
     assert "needs certificates" in capsys.readouterr().err
+    monkeypatch.setattr(cluster, "CONNECTING", 1.0)
     assert main(["study", *words, "tcp://127.0.0.1:1"]) == 1
     assert "no Dask scheduler answers" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()

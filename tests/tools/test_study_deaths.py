@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from pdeloop.study.executors import local_workers
 from pdeloop.study.status import status
 from pdeloop.study.training import Place, listening, train_one
 from tests.support.loop_harness import until
-from tests.support.small_study import CONTENT, LIMIT, contents
+from tests.support.small_study import CONTENT, LIMIT, contents, here
 
 
 def at(rollouts: float) -> list[dict[str, Any]]:
@@ -102,13 +103,15 @@ def test_a_training_continues_from_its_checkpoint_to_the_same_bits(
     assert elsewhere.run_folder() is None
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_process_that_is_killed_costs_only_its_training(reference: Path, tmp_path: Path):
     out, killed = tmp_path / "out", []
+    before = {*multiprocessing.active_children()}
 
     def kill_one(done: int, total: int, status: str) -> None:
         if not killed and [*out.rglob("progress.jsonl")]:
-            children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-            killed.append(max(map(int, children)))
+            (worker,) = {*multiprocessing.active_children()} - before
+            killed.append(worker.pid)
             os.kill(killed[0], signal.SIGKILL)
 
     assert run(Study.of(CONTENT), out, partial(local_workers, 1), tell=kill_one) == []
@@ -132,6 +135,6 @@ def test_a_killed_driver_leaves_no_temporary_folder_and_is_continued(
         driver.kill()
         driver.wait(LIMIT)
     assert not [path for path in temporary.iterdir() if path.name.startswith("pdeloop")]
-    assert run(Study.of(CONTENT), out, partial(local_workers, 1)) == []
+    assert run(Study.of(CONTENT), out, here) == []
     assert contents(out) == contents(reference)
     assert {path.name for path in out.iterdir()} == {"study.json", "results.sqlite", "lock"}

@@ -22,6 +22,7 @@ import pytest
 
 from pdeloop.cli import main
 from pdeloop.study import Study, StudyError, run
+from pdeloop.study import cluster as dask_client
 from pdeloop.study.cluster import cluster
 from pdeloop.study.results import read_study, reading
 from pdeloop.study.status import status
@@ -76,6 +77,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path,
     assert contents(out) == contents(reference)
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
 def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -116,16 +118,14 @@ from functools import partial
 from pathlib import Path
 from pdeloop.study import Study, run
 from pdeloop.study.cluster import cluster
-from pdeloop.study.results import read_study, reading
-from pdeloop.study.status import status
 from tests.support import study_tasks
 from tests.support.small_study import CONTENT
 
 if __name__ == "__main__":
-    address, out, notes, seeds = sys.argv[1:]
-    study = Study.of({**CONTENT, "seeds": int(seeds), "variants": {"noted": {}}})
+    address, out, notes = sys.argv[1:]
+    study = Study.of({**CONTENT, "seeds": 6, "variants": {"noted": {}}})
     tasks = {"noted": partial(study_tasks.noted, notes, 0.5)}
-    print(run(study, Path(out), partial(cluster, address), tasks=tasks))
+    run(study, Path(out), partial(cluster, address), tasks=tasks)
 """
 
 
@@ -136,10 +136,9 @@ def test_a_driver_that_dies_loses_nothing_and_what_was_finished_is_not_done_agai
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     with dask_cluster(tmp_path / "dask", 2) as dask:
-        words = [sys.executable, "-c", DRIVER, dask.address, str(out), str(notes), "6"]
+        words = [sys.executable, "-c", DRIVER, dask.address, str(out), str(notes)]
         own = {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
-        how: dict[str, Any] = {"env": {**os.environ, **own}, "text": True}
-        first = subprocess.Popen(words, **how)
+        first = subprocess.Popen(words, env={**os.environ, **own})
         until(lambda: len(runs_in(notes)) > 2, LIMIT, "third task")
         with pytest.raises(StudyError, match="another process is working on the study in"):
             run(read_study(out), out, partial(cluster, dask.address))
@@ -148,8 +147,8 @@ def test_a_driver_that_dies_loses_nothing_and_what_was_finished_is_not_done_agai
         first.wait()
         known = status(out)
         assert not known["running"] and known["total"] == 6
-        again = subprocess.run(words, capture_output=True, timeout=LIMIT, **how)
-    assert again.returncode == 0 and again.stdout == "[]\n", again.stderr
+        tasks = {"noted": partial(study_tasks.noted, str(notes), 0.5)}
+        assert run(read_study(out), out, partial(cluster, dask.address), tasks=tasks) == []
     assert runs_in(notes) == [1] * 6 and status(out)["finished"] == 6
     assert not [*temporary.iterdir()]
     assert {path.name for path in out.iterdir()} == {"study.json", "results.sqlite", "lock"}
@@ -181,7 +180,7 @@ def test_what_kills_its_worker_or_raises_is_told_from_what_a_dying_worker_loses(
 
 @pytest.mark.filterwarnings("default")
 def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     notes, file, out = tmp_path / "notes", tmp_path / "study.yaml", tmp_path / "out"
     file.write_text(json.dumps(CONTENT))
@@ -192,6 +191,7 @@ def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
 
         def kill(folder: Path) -> None:
             until(lambda: [*folder.rglob("run.json")], LIMIT, "training that has begun")
+            monkeypatch.setattr(dask_client, "CONNECTING", 1.0)
             scheduler.kill()
 
         killer = threading.Thread(target=kill, args=(out,))
