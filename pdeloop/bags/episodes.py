@@ -66,6 +66,8 @@ class RecordedEpisode:
         Messages that were recorded twice with different content, in words.
     state_every : int
         Steps from one state that was to be recorded to the next.
+    asked, stamps : set of float
+        The times (s) of all its starts, and of all its states.
     """
 
     key: Key
@@ -81,6 +83,8 @@ class RecordedEpisode:
     bases: Frame | None = None
     contradictions: list[str] = field(default_factory=list)
     state_every: int = 1
+    asked: set[float] = field(default_factory=set)
+    stamps: set[float] = field(default_factory=set)
 
     @property
     def number(self) -> int:
@@ -158,6 +162,8 @@ class RecordedEpisode:
         """Keep a message."""
         assert source.array is not None
         topic, before = source.array, None
+        if topic in (START, STATE):
+            (self.asked if topic is START else self.stamps).add(frame.time)
         if topic in (STATE, ACTION):
             samples = self.states if topic is STATE else self.actions
             before, samples[frame.step] = samples.get(frame.step), frame

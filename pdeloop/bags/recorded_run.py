@@ -17,6 +17,7 @@ from loop_interfaces.parameters import PLANT, recorded_values, with_budget
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pdeloop.bags.episodes import RecordedEpisode
+from pdeloop.bags.headers import Headers
 from pdeloop.bags.numbering import gaps, gaps_text
 from pdeloop.bags.report import Report
 from pdeloop.bags.run_claims import RunClaims, compare_parameters, compare_results
@@ -72,6 +73,9 @@ class RecordedRun:
             raise ParameterError(f"{self._name}: {error}") from error
         self._pair = LocalPair(self._values)
         self._fingerprint = self._pair.fingerprint
+        self._headers = Headers(
+            self._name, self._pair.plant, DesignSettings.of(self._values), report
+        )
         self._same_plant = True
         if target is not None:
             own = self._pair.plant.target[np.newaxis]
@@ -83,6 +87,8 @@ class RecordedRun:
         self._numbers.add(episode.number)
         for text in episode.contradictions:
             report.differs(f"{where}: {text}")
+        if self._values is not None:
+            self._headers.note(episode)
         if episode.void:
             return
         if episode.missing:
@@ -100,6 +106,16 @@ class RecordedRun:
         if not episode.missing:
             self._run_again(episode, where)
 
+    @property
+    def sample_time(self) -> float | None:
+        """The plant's, in s; None where nothing of the run can be recomputed."""
+        return None if self._values is None else self._pair.plant.sample_time
+
+    @property
+    def publishes_clock(self) -> bool:
+        """True if every state of the plant's went with a time on /clock."""
+        return self._values is not None and bool(self._values.get("publish_clock", False))
+
     def finish(self, claims: RunClaims | None) -> None:
         """Run the training again, until it has asked for all that was recorded.
 
@@ -107,6 +123,8 @@ class RecordedRun:
         """
         if not self._recomputed:
             self._report.unverified.append(self._name)
+        if self._values is not None:
+            self._headers.finish()
         if claims is not None and self._values is not None:
             compare_parameters(claims, self._values, self._report)
         if not self._follow(claims):
@@ -200,6 +218,7 @@ class RecordedRun:
         if states.shape[1:] != (len(rows), plant.state_size) or actions.shape[2] != plant.n_a:
             report.differs(f"{where}: states and actions do not have the plant's shape")
             return
+        self._headers.check(episode, where)
         policies = None if episode.policy is None else episode.policy.values
         if episode.bases is not None:
             self._pair.use_models(episode.bases.values)

@@ -52,6 +52,11 @@ class RunClaims:
     parameters: dict[str, Any] = field(default_factory=dict)
     unreadable: list[str] = field(default_factory=list)
 
+    @property
+    def finished(self) -> bool:
+        """True if the folder has the policies of a finished run."""
+        return (self.folder / "policy.npz").exists()
+
     def reached(self, training: Training) -> bool:
         """True if the training has been followed as far as the folder says that it went."""
         if self.result is not None:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import hashlib
+import struct
+from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,7 +18,7 @@ from loop_interfaces.documents import parse_json
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.mcap_messages import McapFile, Message, unreadable
 from recorder_node.bag import BagError
-from recorder_node.sources import PARAMETERS_TOPIC, source_of
+from recorder_node.sources import CLOCK, PARAMETERS_TOPIC, source_of
 
 MAX_PARAMETERS = 10_000_000
 """Bytes of a message with parameters."""
@@ -46,12 +48,13 @@ class Survey:
     """All files of a bag.
 
     parameters: those of the nodes, by run, where the files have them; target: z_r, None if
-    there is none.
+    there is none; clock: the times on /clock (ns).
     """
 
     files: list[FileSurvey] = field(default_factory=list)
     parameters: dict[int, dict[str, Any]] = field(default_factory=dict)
     target: Array | None = None
+    clock: array[int] = field(default_factory=lambda: array("q"))
 
     @property
     def counts(self) -> Counter[tuple[str, str]]:
@@ -83,6 +86,8 @@ def survey(files: Sequence[Path]) -> Survey:
             digest.update(message.data)
             if message.topic == PARAMETERS_TOPIC:
                 _take_parameters(found.parameters, noted, message, path)
+            if (message.topic, message.type) == (CLOCK.channel.topic, CLOCK.channel.type):
+                found.clock.append(_clock_time(message.data))
             source = None if found.target is not None else known(message.topic)
             if source is not None and source.array is TARGET:
                 found.target = source.codec.decode(message.data).values
@@ -93,6 +98,14 @@ def survey(files: Sequence[Path]) -> Survey:
         raise unreadable(damaged[0])
     found.files.sort(key=lambda file: file.first or 0)
     return found
+
+
+def _clock_time(raw: bytes) -> int:
+    """The time in a message on /clock, in ns; -1 for bytes that are none."""
+    if len(raw) < 12:
+        return -1
+    seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] else ">iI", raw, 4)
+    return int(seconds * 10**9 + nanoseconds)
 
 
 def _take_parameters(

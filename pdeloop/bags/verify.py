@@ -3,9 +3,10 @@
 
 The files of a bag are held against its metadata, and what is recorded of a run against the run's folder
 where it lies there. The target is the plant's. Every complete episode is run again from its seeds,
-policies and models (or the excitation's seed): initial fields, actions, states, costs, and the reduced
-model after exploration. The whole training is run again: every recorded policy, with its models,
-must be one that it asks for, and every rollout that it asks for must be recorded.
+policies and models (or the excitation's seed): initial fields, actions, states, costs, the reduced
+model after exploration, times, signatures and /clock. The whole training is run again: every recorded
+policy, with its models, must be one that it asks for, and every rollout that it asks for must be
+recorded.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from loop_interfaces.documents import parse_json
 from loop_interfaces.files import FileError, read_bounded
 from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.spec import MAX_YAML_BYTES, ParameterError
+from pdeloop.bags.headers import ClockTimes
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.recorded_run import RecordedRun
 from pdeloop.bags.report import Report
@@ -45,6 +47,7 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
     claims = [c for c in map(claims_of, _whole_runs(bags)) if c is not None]
     report.differences_of(text for claim in claims for text in claim.unreadable)
     runs: dict[int, RecordedRun] = {}
+    clock = ClockTimes()
     for bag in bags:
         for episode in bag.episodes():
             report.episodes += 1
@@ -53,9 +56,18 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
                 values = known.get(number, every)
                 runs[number] = RecordedRun(number, values, report, bag.target())
             runs[number].episode(episode)
+            clock.note(episode, runs[number].sample_time)
+    if runs and all(run.sample_time is not None for run in runs.values()):
+        clock.compare(
+            [time for bag in bags for time in bag.survey.clock],
+            report,
+            published=all(run.publishes_clock for run in runs.values()),
+        )
     for number, run in runs.items():
         run.finish(_claims_about(number, runs, claims))
     for claim in claims:
+        if claim.result is None and not claim.unreadable and claim.finished:
+            report.missing.append(f"result.json of the run in {claim.folder}")
         if claim.run is not None and claim.run not in runs:
             report.missing.append(
                 f"all episodes of run {claim.run}, which is the one in {claim.folder}"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loop_interfaces.samples import clock_message
 from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
@@ -47,7 +48,8 @@ def test_a_lost_end_is_seen_by_what_the_run_says(run, messages):
     elsewhere = run.parent / "bag"
     shutil.copytree(run / "bag", elsewhere)
     assert verify(elsewhere).good  # a recorder may have ended there
-    (run / "result.json").unlink()
+    for name in ("result.json", "policy.npz"):
+        (run / name).unlink()
     (missing,) = verify(run).missing
     assert (
         "4 rollouts that the training asked for (adaptation 4)" in missing
@@ -239,12 +241,98 @@ def test_how_many_episodes_were_run_again_is_said(run, messages, tmp_path):
     assert report.recomputed == EPISODES - 1 == report.episodes - 1
 
 
-def test_a_file_that_the_run_lacks_is_named(run):
-    (run / "progress.jsonl").unlink()
-    assert f"progress.jsonl of the run in {run}" in verify(run).missing
+@pytest.mark.parametrize("name", ["progress.jsonl", "result.json", "run.json", "policy.npz"])
+def test_a_file_that_the_run_lacks_is_named(run, name):
+    (run / name).unlink()
+    assert f"{name} of the run in {run}" in verify(run).missing
 
 
 def test_gaps_in_the_numbers_are_named_where_no_training_can_be_followed(run, messages, tmp_path):
     parts = by_episodes([m for m in messages if m.topic != PARAMETERS_TOPIC], 2, 4)
     bag = write(tmp_path / "copy", parts[::2])
     assert any("episodes 1.3 to 1.4" in text for text in verify(bag).missing)
+
+
+def changed_headers(topic: str, change: Callable[[Any], Any]) -> Callable[[list[Message]], None]:
+    """Changes the header of the last but two messages of a topic that are about an episode."""
+
+    def apply(messages: list[Message]) -> None:
+        at = [i for i, m in enumerate(messages) if m.topic == topic][-3 if topic != MODEL else -1]
+        source = source_of(topic)
+        assert source is not None and source.array is not None
+        frame = change(source.codec.decode(messages[at].data))
+        messages[at] = replace(messages[at], data=source.array.codec().encode(frame))
+
+    return apply
+
+
+def other_clock(messages: list[Message]) -> None:
+    at = [i for i, m in enumerate(messages) if m.topic == "/clock"][5]
+    data = clock_message(0.3125)
+    assert data is not None
+    messages[at] = replace(messages[at], data=data)
+
+
+def no_clock(messages: list[Message]) -> None:
+    del messages[[i for i, m in enumerate(messages) if m.topic == "/clock"][7]]
+
+
+MODEL = "/model/identified"
+HEADERS: dict[str, tuple[Callable[[list[Message]], None], str]] = {
+    "a later state": (
+        changed_headers("/state", lambda f: replace(f, time=np.nextafter(f.time, 9e9))),
+        "times of the states and the cost of episode",
+    ),
+    "a later cost": (
+        changed_headers("/episode/cost", lambda f: replace(f, time=f.time + 1e-9)),
+        "times of the states and the cost of episode",
+    ),
+    "an earlier start": (
+        changed_headers("/episode/start", lambda f: replace(f, time=f.time / 2)),
+        "which no cost up to then has",
+    ),
+    "another policy, model and target": (
+        changed_headers("/action", lambda f: replace(f, time=f.time + 1.0)),
+        "signatures of the actions of episode",
+    ),
+    "an unsigned action": (
+        changed_headers("/action", lambda f: replace(f, time=0.0)),
+        "signatures of the actions of episode",
+    ),
+    "another start": (
+        changed_headers("/episode/start", lambda f: replace(f, plant=f.plant + 1)),
+        "signature of the start of episode",
+    ),
+    "another design": (
+        changed_headers(MODEL, lambda f: replace(f, time=f.time + 1.0)),
+        "signature of the model of episode",
+    ),
+    "another plant": (
+        changed_headers("/state", lambda f: replace(f, plant=f.plant + 1)),
+        "the fingerprints of several plants",
+    ),
+    "another clock": (other_clock, "/clock has the time 0.3125 s, which no state has"),
+    "a clock less": (no_clock, "1 of the times on /clock, the first at"),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_times_signatures_and_the_clock_are_compared(messages, tmp_path, name):
+    change, words = HEADERS[name]
+    change(messages)
+    report = verify(write(tmp_path / "bag", [messages]))
+    assert not report.good
+    assert words in words_of(report)
+
+
+def test_an_episode_whose_times_are_all_later_is_a_difference(messages, tmp_path):
+    """Its states follow each other as they must, but not the episode before."""
+    for at, message in enumerate(messages):
+        if episode_of(message) == PART + 4 and message.topic in ("/state", "/episode/cost"):
+            source = source_of(message.topic)
+            assert source is not None and source.array is not None
+            frame = source.codec.decode(message.data)
+            later = source.array.codec().encode(replace(frame, time=frame.time + 64.0))
+            messages[at] = replace(message, data=later)
+    text = words_of(verify(write(tmp_path / "bag", [messages])))
+    assert "z_0 of episode 1.5 has the time" in text or "times of the states" in text

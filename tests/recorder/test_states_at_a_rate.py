@@ -17,7 +17,7 @@ from pdeloop.identification import identify_bag
 from pdeloop.pairs import Transport
 from recorder_node.bag import BagError
 from recorder_node.recording import Recording, large_bag
-from recorder_node.sources import PARAMETERS_TOPIC, source_of, sources
+from recorder_node.sources import CLOCK, PARAMETERS_TOPIC, source_of, sources
 from tests.support.recorded_here import messages_of, record_run
 
 EVERY = 4
@@ -36,9 +36,12 @@ def record_again(folder: Path, values: dict, changed: int = -1) -> None:
     """The run's bag with every fourth state; changed: a state of this step is another one."""
     messages = messages_of(folder / "bag")
     shutil.rmtree(folder / "bag")
-    recording, number = Recording(folder / "bag", sources("/"), EVERY), 0
+    recording, number = Recording(folder / "bag", [*sources("/"), CLOCK], EVERY), 0
     for message in messages:
         if message.topic == PARAMETERS_TOPIC:
+            continue
+        if message.topic == CLOCK.channel.topic:
+            recording.take(CLOCK, message.when, message.data)
             continue
         source, data = source_of(message.topic), message.data
         assert source is not None

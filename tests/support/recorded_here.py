@@ -5,17 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from controller_node.identification import design_each
+from controller_node.identification import DesignSettings, design_each
 from loop_interfaces.arrays import Array
 from loop_interfaces.documents import parse_yaml
 from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import Frame
+from loop_interfaces.samples import clock_message
+from loop_interfaces.signature import design_digest, digest_of, signature
 from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
@@ -34,7 +37,7 @@ from pdeloop.bags.reader import Bag
 from pdeloop.in_process import LocalPair
 from recorder_node.bag import FILE, METADATA, BagWriter, Channel
 from recorder_node.recording import Recording
-from recorder_node.sources import source_of, sources
+from recorder_node.sources import CLOCK, source_of, sources
 from tests.support.small import parameters
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
@@ -52,12 +55,26 @@ class _Sent:
         self._recording, self._run, self._plant = recording, run, plant
         self._sources = {source.array: source for source in sources("/") if source.array}
         self._when = 10**18
+        self.time = 0.0
+        """Simulated, of the messages to come."""
 
-    def __call__(self, topic: Topic, episode: int, step: int, values: Array) -> None:
+    def __call__(
+        self,
+        topic: Topic,
+        episode: int,
+        step: int,
+        values: Array,
+        *,
+        time: float | None = None,
+        plant: int | None = None,
+    ) -> None:
         self._when += MILLISECOND
-        frame = Frame(self._run, episode, step, 0.0, values, self._plant)
-        raw = topic.codec().encode(frame)
+        time, plant = self.time if time is None else time, self._plant if plant is None else plant
+        raw = topic.codec().encode(Frame(self._run, episode, step, time, values, plant))
         self._recording.take(self._sources[topic], self._when, raw)
+        clock = clock_message(time) if topic is STATE else None
+        if clock is not None:
+            self._recording.take(CLOCK, self._when, clock)
 
 
 def record_run(folder: Path, **options: Any) -> dict[str, Any]:
@@ -71,7 +88,7 @@ def record_run(folder: Path, **options: Any) -> dict[str, Any]:
     with ExitStack() as locks:
         writer, identity = open_run(values, training, locks, print)
         assert writer is not None
-        recording = Recording(folder / "bag", sources("/"))
+        recording = Recording(folder / "bag", [*sources("/"), CLOCK])
         sent, episode = _Sent(recording, identity.run, pair.fingerprint), EPISODES_PER_START
         sent(TARGET, 0, 0, pair.plant.target)
         recording.note(identity.run, values)
@@ -104,22 +121,27 @@ def _send_episode(
     values: dict[str, Any],
 ) -> None:
     generation = training.generation if training.ready else 0
+    settings, signed = DesignSettings.of(values), [batch.rows]
+    signed.append(np.asarray(settings.action_set.signed))
     if batch.policies is not None:
-        sent(POLICY, episode, generation, batch.policies)
-    sent(START, episode, generation, batch.rows)
-    record = pair.roll_out(batch)
+        assert training.models is not None
+        sent(POLICY, episode, generation, batch.policies, plant=0)
+        signed += [batch.policies, np.array(float(digest_of(training.models)))]
+    digest = digest_of(*signed)
+    sent(START, episode, generation, batch.rows, plant=digest)
+    record, signature_of_actions = pair.roll_out(batch), signature(digest, pair.plant.target)
     for k, state in enumerate(record.states):
+        sent.time += pair.plant.sample_time
         sent(STATE, episode, k, state)
         if k < len(record.actions):
-            sent(ACTION, episode, k, record.actions[k])
+            sent(ACTION, episode, k, record.actions[k], time=signature_of_actions)
     costs = record.costs.rows()
     sent(COST, episode, len(record.actions), costs)
     if batch.exploratory and (costs[:, CostColumn.ENDED] == COMPLETED).all():
         numbers = batch.rows[:, 3].astype(int).tolist()
-        models = design_each(
-            record.states, record.actions, numbers, pair.plant.target, pair._settings
-        )
-        sent(MODEL_IDENTIFIED, episode, len(record.actions), models)
+        models = design_each(record.states, record.actions, numbers, pair.plant.target, settings)
+        time = signature(digest, design_digest(asdict(settings)))
+        sent(MODEL_IDENTIFIED, episode, len(record.actions), models, time=time)
 
 
 def messages_of(bag: Path) -> list[Message]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.report import Report
 from pdeloop.cli import main
+from recorder_node.sources import CLOCK
 from tests.support.recorded_here import PART, episode_of
 
 EPISODES = 1 + 1 + 3 + 4
@@ -15,11 +16,15 @@ EPISODES = 1 + 1 + 3 + 4
 
 
 def by_episodes(messages: list[Message], *ends: int) -> list[list[Message]]:
-    """The messages cut after these episodes, counted from 1; what is about none goes to the first."""
+    """The messages cut after these episodes, counted from 1; what is about none goes to the first.
+
+    A time on /clock stays with its state.
+    """
     edges = [PART - 1, *(PART - 1 + end for end in ends), 2**60]
     parts: list[list[Message]] = [[] for _ in edges[1:]]
+    number = 0
     for message in messages:
-        number = episode_of(message)
+        number = number if message.topic == CLOCK.channel.topic else episode_of(message)
         part = next(i for i, edge in enumerate(edges[1:]) if number <= edge)
         parts[part].append(message)
     return parts
