@@ -146,6 +146,8 @@ def batches(
         if batch is None:
             return
         result = pair.run(batch, max_batch)
+        for row in training.batch_costs(result):
+            report(row)
         for row in training.finish(result):
             report(row)
         pair.follow(training)

@@ -7,7 +7,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.topics import COMPLETED
+from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import RolloutResult
 from tuner_node.batch import TrainingSettings
 from tuner_node.rollouts import EVALUATED
@@ -44,6 +44,25 @@ def designed(seed: int, attempt: int, model: Array, own: ModelRows) -> Row:
         "reduced_order": model.shape[1],
         "spectral_radius": float(np.abs(np.linalg.eigvals(own.A)).max()),
         "stabilised": bool(own.K_a.any()),
+    }
+
+
+def measured(seed: int, phase: str, paid: int, costs: Array) -> Row:
+    """Rollouts of a seed are over, before anything is made of them.
+
+    paid: rollouts of the seed with these; costs (n, 3): of these, as in episode/cost.
+    """
+    known = costs[costs[:, CostColumn.ENDED] == COMPLETED, CostColumn.MEAN]
+    told = (
+        {"cost": known.mean(), "lowest": known.min(), "highest": known.max()} if len(known) else {}
+    )
+    return {
+        "event": "measured",
+        "seed": seed,
+        "phase": phase,
+        "rollouts": paid,
+        **{name: float(value) for name, value in told.items()},
+        "diverged": len(costs) - len(known),
     }
 
 

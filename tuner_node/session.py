@@ -70,6 +70,8 @@ class Session:
             return publications
         self.established = True
         training = self.training
+        for row in training.batch_costs(result):
+            self._report(row)
         try:
             rows = training.finish(result)
         except DispatchError:

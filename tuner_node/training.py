@@ -29,7 +29,7 @@ import numpy as np
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import digest
-from loop_interfaces.topics import CostColumn
+from loop_interfaces.topics import CostColumn, StartColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
@@ -140,6 +140,22 @@ class Training:
         again = [m for m, _ in self._first_again()]
         noise = rollouts.noise_seeds(self.settings, self.phase, batch.rows, counts, again)
         return replace(batch, rows=np.column_stack([batch.rows, noise]))
+
+    def batch_costs(self, result: BatchResult) -> list[dict[str, Any]]:
+        """The costs of the batch that `finish` takes next, where it computes more from them."""
+        if self.phase not in ("identify", "check", "adapt"):
+            return []
+        if self.phase == "adapt" and not self.settings.trajectories:
+            return []
+        batch = self.next_batch()
+        assert batch is not None
+        models = batch.rows[:, StartColumn.MODEL].astype(int)
+        rows = []
+        for m in np.unique(models).tolist():
+            own, paid = result.costs[models == m], int(self.budget.paid[m])
+            seed = self.settings.all_seeds[m]
+            rows.append(event_rows.measured(seed, self.phase, paid + len(own), own))
+        return rows
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
         """Take the results of the batch that `next_batch` gave, in its order."""

@@ -122,6 +122,7 @@ class EpisodeSamples:
         self.components = components if components > 0 and n_z % components == 0 else 1
         self.first = self.last = frame.step
         self.stride = 1
+        self._horizon = horizon
         while horizon >= COLUMNS * self.stride:
             self.stride *= 2
         self.fields = _empty(len(rows_of(n_z, self.components)))
@@ -159,8 +160,9 @@ class EpisodeSamples:
         self.version = next(_VERSIONS)
 
     def action(self, frame: Frame) -> None:
-        """Take a_k of all environments."""
-        if len(frame.values) != self.batch or frame.step < self.first:
+        """Take a_k of all environments; what answers the last state is not applied."""
+        unapplied = 0 < self._horizon <= frame.step
+        if len(frame.values) != self.batch or frame.step < self.first or unapplied:
             return
         a = frame.values[self.environment, :MAX_ACTIONS]
         if not self.actions.size:

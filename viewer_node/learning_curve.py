@@ -27,7 +27,7 @@ _VERSIONS = itertools.count(1)
 
 @dataclass
 class LearningCurve:
-    """Mean stage cost by the rollouts that a seed has made, or by episode where only topics tell.
+    """Mean stage cost by the rollouts of a seed from its first one on, or by episode.
 
     axis, phase: what x is, what the training does; budget: the rollouts of a seed, 0 if unknown;
     references: mean stage costs of the closing evaluation, by controller, all on the same fields;
@@ -43,6 +43,8 @@ class LearningCurve:
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
     checked: dict[str, float] = field(default_factory=dict)
     diverged: int = 0
+    laws: bool = False
+    """Whether a law has been measured, and not only explorations."""
     version: int = field(default_factory=lambda: next(_VERSIONS))
     _points: dict[int, dict[int, tuple[float, float, float]]] = field(default_factory=dict)
     """By seed and x: mean cost, lowest and highest of the rollouts that it is made of."""
@@ -60,6 +62,8 @@ class LearningCurve:
                     self._rollouts.setdefault(int(row["seed"]), 0)
                 case "phase":
                     self._phase(row)
+                case "measured":
+                    self._measured(row)
                 case "adapted":
                     self._adapted(row)
                 case "checked" if row["accepted"]:
@@ -83,6 +87,17 @@ class LearningCurve:
             self._rollouts = dict(zip(self.seeds, paid, strict=True))
             self._marks.append((float(row.get("time", 0.0)), sum(paid)))
 
+    def _measured(self, row: Mapping[str, Any]) -> None:
+        seed = int(row["seed"])
+        if seed not in self._rollouts and len(self._rollouts) >= MAX_SEEDS:
+            return
+        self._rollouts.setdefault(seed, 0)
+        if "cost" in row:
+            self.laws |= row["phase"] == "adapt"
+            names = ("cost", "lowest", "highest")
+            cost, lowest, highest = (float(row[name]) for name in names)
+            self._add(seed, int(row["rollouts"]), (cost, lowest, highest))
+
     def _adapted(self, row: Mapping[str, Any]) -> None:
         seed, x = int(row["seed"]), int(row["rollouts"])
         if seed not in self._rollouts and len(self._rollouts) >= MAX_SEEDS:
@@ -90,6 +105,7 @@ class LearningCurve:
         self._rollouts[seed] = x
         self._marks.append((float(row.get("time", 0.0)), sum(self._rollouts.values())))
         self.diverged += int(row.get("diverged", 0))
+        self.laws = True
         if "cost" in row and math.isfinite(cost := float(row["cost"])):
             pair = [float(row[name]) for name in ("cost_plus", "cost_minus") if name in row]
             made_of = [value for value in pair if math.isfinite(value)] or [cost]
@@ -99,12 +115,10 @@ class LearningCurve:
         """Take an episode that is over, from the topics alone.
 
         One with a rollout without control is a comparison, and one of all three controllers gives the
-        references. Any other one with a policy is a point.
+        references. Any other one is a point.
         """
         self.version = next(_VERSIONS)
         self.phase = "identify" if rollouts.explores else "policy"
-        if rollouts.explores:
-            return
         if "none" in rollouts.controllers:
             self.phase = "compare"
             if all_three := rollouts.compared("none", "lqt", "adapted"):
@@ -112,7 +126,8 @@ class LearningCurve:
             elif only_two := rollouts.compared("none", "lqt"):
                 self.checked = only_two
             return
-        self.diverged += int((~rollouts.completed).sum())
+        self.laws |= not rollouts.explores
+        self.diverged += 0 if rollouts.explores else int((~rollouts.completed).sum())
         x = 1 + max(self._rollouts.values(), default=0)
         for model in np.unique(rollouts.models).tolist()[:MAX_SEEDS]:
             self._rollouts[model] = x
@@ -177,6 +192,7 @@ class LearningCurve:
             "seeds": self.seeds,
             "paid": [min(paid, default=0), max(paid, default=0)],
             "diverged": self.diverged,
+            "laws": self.laws,
             "references": self.references,
             "checked": self.checked,
             "evaluations": self.evaluations,

@@ -414,3 +414,20 @@ def test_an_affine_law_of_few_delayed_readings_is_improved():
     training = train_here(values)
     _, first, adapted = training.evaluation[0].mean(axis=1)
     assert adapted < first
+
+
+def test_what_explorations_and_checks_cost_is_told_before_anything_is_made_of_it():
+    values = parameters(seeds=2, iterations=1)
+    training, pair = build_training(values), LocalPair(values)
+    while training.phase in ("identify", "check"):
+        phase, before = training.phase, training.budget.paid.copy()
+        result = pair.run(training.next_batch())
+        told = training.batch_costs(result)
+        training.finish(result)
+        pair.follow(training)
+        assert [row["rollouts"] for row in told] == training.budget.paid.tolist()
+        count = training.budget.paid[0] - before[0]
+        for row, own in zip(told, result.costs.reshape(2, count, -1), strict=True):
+            assert row["event"] == "measured" and row["phase"] == phase and not row["diverged"]
+            assert row["cost"] == pytest.approx(own[:, CostColumn.MEAN].mean(), rel=1e-12)
+    assert training.batch_costs(pair.run(training.next_batch())) == []  # two_point tells at once

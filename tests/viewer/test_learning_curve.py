@@ -118,9 +118,9 @@ def test_from_the_topics_alone_policies_are_points_and_all_three_controllers_an_
     episode(acts, gains, [8.0, 10.0, 1.0, 1.0])
     assert curve.references == {} and len(points(curve)) == 1  # LQT's law is not known
     episode([[3, 17, 0.1, 0]], gains, [50.0])
-    assert len(points(curve)) == 1 and curve.phase == "identify"
+    assert points(curve)[1:] == [(2, 28.0, 6.0, 50.0)] and curve.phase == "identify"
     episode(acts, np.ones((4, 2, 3)), [1e9, 1e9, 2.0, 2.0], ended=12)
-    assert len(points(curve)) == 1 and curve.message()["diverged"] == 4
+    assert len(points(curve)) == 2 and curve.message()["diverged"] == 4
 
 
 def test_episodes_that_come_in_at_once_are_a_point_each():
@@ -139,3 +139,15 @@ def test_episodes_that_come_in_at_once_are_a_point_each():
     view.policy(frame(np.ones((1, 2, 3)), episode=5), 1.0)
     view.cost(cost([9.0], episode=5, ended=VOID), 1.0)
     assert len(points(view.curve)) == 3
+
+
+def test_the_curve_begins_with_the_first_rollout_and_says_whether_a_law_was_measured():
+    curve = LearningCurve()
+    told = {"event": "measured", "seed": 0, "diverged": 0}
+    curve.row({**told, "phase": "identify", "rollouts": 2, "cost": 9, "lowest": 8, "highest": 10})
+    assert points(curve) == [(2, 9, 8, 10)] and not curve.message()["laws"]
+    curve.row({**told, "phase": "adapt", "rollouts": 6, "cost": 4, "lowest": 3, "highest": 5})
+    curve.row({**told, "phase": "adapt", "rollouts": 8, "diverged": 2})
+    assert points(curve)[1:] == [(6, 4, 3, 5)] and curve.message()["laws"]
+    curve.row(adapted(0, 6, 4.5))  # what the optimiser makes of the same rollouts
+    assert points(curve)[1:] == [(6, 4.5, 4.5, 4.5)]

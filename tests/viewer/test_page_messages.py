@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Axis, Grid
 from loop_interfaces.places import Box, text_of
 from tests.support.viewed import frame, state
 from viewer_node.loop_view import LoopView
-from viewer_node.web.page import Page, axes_of, places_of
+from viewer_node.web.page import Page, axes_of, bounds_of, path_of, places_of
 
 
 def unpacked(message: str | bytes) -> tuple[dict[str, Any], np.ndarray]:
@@ -198,3 +199,56 @@ def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
     assert first == [-10.0, 10.0]
     assert colours(1) == first
     assert colours(90)[1] > 80
+
+
+def test_the_bounds_of_each_actuator_are_told_as_the_plant_says_them():
+    page = Page()
+    page.take_parameters({"n_a": 2, "actuators": "[]", "action_limit": 3.0})
+    assert page.parameters["bounds"] == {"low": [-3.0, -3.0], "high": [3.0, 3.0]}
+    bounds = [0.0, -1e300, 4.0, 1e300, 0.0]
+    page.take_parameters(
+        {"n_a": 2, "actuators": "[]", "action_limit": 0.0, "action_bounds": bounds}
+    )
+    assert page.parameters["bounds"] == {"low": [0.0, -3.0], "high": [3.0, 3.0]}
+    json.dumps(page.parameters, allow_nan=False)
+    assert bounds_of({"n_a": 2, "action_bounds": bounds}) == {
+        "low": [0.0, None],
+        "high": [4.0, None],
+    }
+    for told in ({}, {"n_a": 2}, {"n_a": 2, "action_bounds": [1.0]}, {"n_a": "x"}):
+        assert bounds_of(told) is None
+
+
+def test_a_moving_target_is_sent_once_for_all_columns_and_as_it_is_at_the_newest_step():
+    rows = np.arange(32.0).reshape(8, 4)
+    told = {"n_a": 1, "actuators": "[]", "cost": Cost(4, 1, 8, target=rows).texts, "horizon": 8}
+    page, sent = Page(), {}
+    page.take_parameters(told)
+    page.view.target(frame(rows[0]), 0.0)
+    for k in range(3):
+        page.view.state(frame([np.zeros(4)], step=k), 0.0)
+    page.refresh(10.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    header, numbers = parts["path"]
+    assert (header["columns"], header["begin"], header["stride"]) == (9, 0, 1)
+    # Beyond its last row the target stays where it is.
+    np.testing.assert_array_equal(numbers.reshape(9, 4), rows[[0, 1, 2, 3, 4, 5, 6, 7, 7]])
+    np.testing.assert_array_equal(parts["target"][1], [*rows[2], *rows[2]])
+    page.view.state(frame([np.zeros(4)], step=3), 0.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    assert "path" not in parts
+    np.testing.assert_array_equal(parts["target"][1], [*rows[3], *rows[3]])
+    assert path_of({"cost": Cost(4, 1, 8, target=rows[0]).packed}) is None
+    assert path_of({"cost": ["{"]}) is None and path_of({}) is None
+
+
+def test_what_answers_the_last_state_is_not_shown_as_an_applied_action():
+    page, sent = Page(), {}
+    page.take_parameters({"n_a": 1, "actuators": "[]", "horizon": 2})
+    for k in range(3):
+        page.view.state(frame([np.zeros(4)], step=k), 0.0)
+        page.view.action(frame([[1.0]], step=k), 0.0)
+    page.refresh(10.0)
+    header, numbers = dict(map(part, page.updates(sent, 0.0)))["episode"]
+    actions = numbers[12 : 12 + header["columns"] * header["actions"]]
+    np.testing.assert_array_equal(actions, [1.0, 1.0, np.nan])

@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.action_set import ActionSet
+from loop_interfaces.cost import Cost
 from loop_interfaces.frames import Frame
 from loop_interfaces.grid import Axis, Grid
 from loop_interfaces.places import parse
@@ -38,7 +40,9 @@ COLOUR_PERIOD = 0.5
 """Seconds between two computations of the range of the colours."""
 PARAMETERS = ("problem", "n_a", "sample_time")
 """Parameters that the page takes from any node."""
-OF_PLANT = ("grid", "length", "sensors", "actuators", "horizon")
+OF_PLANT = (
+    "grid", "length", "sensors", "actuators", "horizon", "n_a", "action_limit", "action_bounds", "cost",
+)  # fmt: skip
 """Those that it takes from a plant alone: other nodes have mere defaults of one that tells none."""
 MOST_PANELS = 4
 """Components shown side by side; of more, one is chosen."""
@@ -99,6 +103,35 @@ def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
     return {"actuators": [] if sensors and dimensions > 1 else told, "sensors": sensors}
 
 
+def bounds_of(values: Mapping[str, Any]) -> dict[str, list[float | None]] | None:
+    """Bounds of each actuator from a plant's parameters, None where it has none; None without any.
+
+    Examples
+    --------
+    >>> bounds_of({"n_a": 2, "action_bounds": [0.0, 0.0, 4.0, 1e300, 0.0]})
+    {'low': [0.0, 0.0], 'high': [4.0, None]}
+    """
+    try:
+        known = ActionSet.of({"n_a": int(values["n_a"]), "action_limit": 0.0, **values})
+    except (KeyError, TypeError, ValueError):
+        return None
+    low, high = (np.broadcast_to(part, int(values["n_a"])) for part in (known.low, known.high))
+    if not np.isfinite([low, high]).any():
+        return None
+    told = {"low": low.tolist(), "high": high.tolist()}
+    return {name: [b if np.isfinite(b) else None for b in part] for name, part in told.items()}
+
+
+def path_of(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """The target of each step from a plant's parameters; None where it is constant or of an output."""
+    try:
+        cost = Cost.parse(values["cost"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    moves = cost is not None and cost.target.ndim > 1 and cost.output is None
+    return cost.target if cost is not None and moves else None
+
+
 @dataclass(frozen=True)
 class ShowLoop:
     """A request to show the loop in this namespace of the domain."""
@@ -128,6 +161,8 @@ class Page:
         self._status: str | None = None
         self._of_plant: dict[str, Any] = {}
         """Its parameters that say where things are."""
+        self._path: NDArray[np.float64] = np.empty((0, 0))
+        """The target of each step, where it moves."""
         self._colours: dict[int, Range] = {}
         self._coloured = float("-inf")
         self._counts: deque[tuple[float, int, int]] = deque()
@@ -146,6 +181,7 @@ class Page:
             view.environment = self.view.environment
             self.view = view
             self.parameters, self.controls, self._of_plant = {}, [], {}
+            self._path = np.empty((0, 0))
             self._colours, self._coloured = {}, float("-inf")
             self._counts.clear()
             self.place = {
@@ -166,6 +202,9 @@ class Page:
             self.parameters["axes"] = axes_of(self._of_plant)
             self.parameters["places"] = places_of(self._of_plant)
             self.view.grid = Grid.parse(str(self._of_plant.get("grid")))
+        self.parameters["bounds"] = bounds_of(self._of_plant)
+        if (path := path_of(self._of_plant)) is None or not np.array_equal(path, self._path):
+            self._path = np.empty((0, 0)) if path is None else path
         self.parameters["horizon"] = self.view.horizon = int(self._of_plant.get("horizon", 0))
 
     def request_call(self, node: object, verb: object) -> bool:
@@ -256,7 +295,13 @@ class Page:
             return
         target = view.target_of(shown.key)
         chosen = (self.place["begun"], shown.components, shown.plane, *panels)
-        yield "target", (*chosen, id(target)), partial(self._target, target, shown)
+        known: tuple[object, ...] = (*chosen, id(target))
+        if self._path.shape[1] == shown.z.size:
+            target = self._path[min(shown.last, len(self._path) - 1)]
+            known = (*chosen, id(self._path), shown.last)
+            path = (*chosen, id(self._path), shown.first, shown.stride)
+            yield "path", path, partial(self._moving, shown)
+        yield "target", known, partial(self._target, target, shown)
         ranges = tuple(self._colours.get(i, (0.0, 1.0)) for i in panels)
         samples = (*chosen, shown.version, shown.ended, ranges)
         yield "episode", samples, partial(self._episode, shown)
@@ -281,6 +326,16 @@ class Page:
             )
         header = {"part": "target", "panels": panels, "plane": shown.plane}
         return _pack({**header, "rows": shown.fields.shape[1] // _kept(shown)}, z_r)
+
+    def _moving(self, shown: EpisodeSamples) -> bytes:
+        """The target of each column to the horizon, (columns, panels, rows)."""
+        panels, last = self._of_shown(shown), len(self._path) - 1
+        end = max(self.view.horizon, shown.last, 1)
+        steps = np.minimum(np.arange(shown.first, end + 1, shown.stride), last)
+        rows = self._path[:, rows_of(shown.z.size, shown.components)][steps]
+        own = np.stack([rows[:, shown.part(i)] for i in panels], axis=1)
+        header = {"part": "path", "columns": len(steps), "begin": shown.first}
+        return _pack({**header, "stride": shown.stride, "panels": panels}, own.ravel())
 
     def _episode(self, shown: EpisodeSamples) -> bytes:
         """The shown episode.

@@ -51,7 +51,7 @@ export class Chart {
   draw() {
     const { data, series, x, y, caption = "", words = caption } = this.shown;
     if (!this.box.clientWidth) return;
-    const look = JSON.stringify([series, x.label, x.whole, y.label, y.log, DARK.matches]);
+    const look = JSON.stringify([series, x.label, x.whole, y.label, y.whole, y.log, DARK.matches]);
     if (look !== this.look) this.build(look);
     else this.plot.setData(data);
     if (!this.pointed) this.say(caption);
@@ -78,7 +78,7 @@ export class Chart {
       ...this.size(0),
       padding: [8, this.right, 0, 0],
       legend: {
-        show: this.legend && series.length <= MOST_NAMES,
+        show: this.legend && series.length <= MOST_NAMES && series.some(({ label }) => label),
         markers: {
           width: 2,
           stroke: (plot, i) => plot.series[i].stroke(plot, i),
@@ -97,7 +97,7 @@ export class Chart {
         }),
         axis(y.label, SPACE_Y, {
           size: 46,
-          values: (_, at) => at.map((v) => (v === null ? "" : text(v))),
+          values: (_, at) => at.map((v) => (v === null || (y.whole && v % 1) ? "" : text(v))),
           ...(y.log ? { filter: (_, at) => at.map(oneTwoFive) } : {}),
         }),
       ],

@@ -2,10 +2,10 @@
 // Actions, profile and learning curve.
 
 import { Chart } from "./chart.js";
-import { RIGHT } from "./field.js";
+import { RIGHT, bar, paint } from "./field.js";
 import { colour, text } from "./format.js";
 
-// Okabe and Ito's colours, readable with any colour vision; more lines than these go from the first to the second.
+// Okabe and Ito's colours, readable with any colour vision; more actions than these are a picture.
 const LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"];
 const DOTTED = [2, 3];
 const DASHED = [7, 4];
@@ -23,10 +23,70 @@ export function extent(...lists) {
   return low <= high ? [low, high] : [0, 1];
 }
 
+// The actions of an episode, as they were applied, with the bounds of their actuators.
 export function actionsChart(model) {
-  const chart = new Chart("actions", { right: RIGHT });
-  const along = (share) => `color-mix(in oklab, ${LINES[1]} ${Math.round(100 * share)}%, ${LINES[0]})`;
-  const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
+  const chart = new Chart("actions", { right: RIGHT, hooks: { draw: [(plot) => picture(plot)] } });
+
+  // Many actions: a row of colours for each.
+  function picture(plot) {
+    const { episode } = model;
+    const count = episode.header?.actions ?? 0;
+    if (count <= LINES.length) return;
+    const columns = episode.actions.length / count;
+    const colours = range();
+    const ratio = devicePixelRatio;
+    const area = Object.fromEntries(
+      Object.entries({ x: "left", y: "top", w: "width", h: "height" }).map(([k, of]) => [k, plot.bbox[of] / ratio]),
+    );
+    const [from, to] = [0, columns].map((i) => plot.valToPos(episode.time(episode.step(i)), "x") + area.x);
+    const c = plot.ctx;
+    c.save();
+    c.scale(ratio, ratio);
+    c.imageSmoothingEnabled = false;
+    const drawn = paint(count, columns, colours, (j, i) => episode.actions[i * count + j]);
+    c.save();
+    c.beginPath();
+    c.rect(area.x, area.y, area.w, area.h);
+    c.clip();
+    c.drawImage(drawn, from, area.y, to - from, area.h);
+    c.restore();
+    bar(c, area.x + area.w + 8, area, colours);
+    c.restore();
+  }
+
+  // [low, high] of what is shown: the actions, 0, and bounds that are not far away.
+  function range() {
+    let [low, high] = extent(model.episode.actions.filter((a) => !Number.isNaN(a)), [0]);
+    const reach = 2 * Math.max(high, -low);
+    for (const bound of limits()) {
+      if (Math.abs(bound) <= reach) [low, high] = [Math.min(low, bound), Math.max(high, bound)];
+    }
+    return high > low ? [low, high] : [low - 1, high + 1];
+  }
+
+  // The bounds that there are.
+  function limits() {
+    const { low = [], high = [] } = model.facts.bounds ?? {};
+    return [...new Set([...low, ...high])].filter((bound) => bound !== null);
+  }
+
+  // Share of the actions that are at a bound, in words; empty without bounds.
+  function saturation(count) {
+    if (!count || !limits().length) return "";
+    const at = (bounds, j, sign) => {
+      const bound = bounds[j] ?? null;
+      return bound === null ? Infinity : sign * Math.fround(bound);
+    };
+    const { low, high } = model.facts.bounds;
+    let [all, full] = [0, 0];
+    model.episode.actions.forEach((a, i) => {
+      if (Number.isNaN(a)) return;
+      all += 1;
+      const j = i % count;
+      if (a >= at(high, j, 1) || -a >= at(low, j, -1)) full += 1;
+    });
+    return `${text(Number(((100 * full) / Math.max(1, all)).toPrecision(3)))} % at a bound`;
+  }
 
   chart.update = () => {
     const { facts, episode } = model;
@@ -39,20 +99,28 @@ export function actionsChart(model) {
         const a = episode.actions[Math.min(i, columns - 1) * count + j];
         return Number.isNaN(a) ? null : a;
       });
-    const [low, high] = extent(episode.actions);
-    const largest = 1.1 * (count ? Math.max(Math.abs(low), Math.abs(high)) || 1 : 1);
+    const few = count <= LINES.length;
+    const [low, high] = range();
+    const room = 0.06 * (high - low);
+    const lines = few
+      ? Array.from({ length: count }, (_, j) => [held(j), { label: `a${j + 1}`, stroke: LINES[j], width: 1.3, steps: true }])
+      : [[times.map(() => 1), { class: "unnamed", label: "", stroke: "transparent", width: 0 }]];
+    const shown = few && count ? limits().filter((bound) => bound >= low && bound <= high) : [];
+    shown.forEach((bound, i) => {
+      const named = i ? { class: "unnamed" } : {};
+      const style = { label: "bounds", stroke: colour("muted"), dash: DOTTED, width: 1.3, ...named };
+      lines.push([times.map(() => bound), style]);
+    });
+    const first = facts.n_a > count && count ? `the first ${count} of ${facts.n_a} actuators` : "";
     chart.show({
-      data: count ? [times, ...Array.from({ length: count }, (_, j) => held(j))] : [[]],
-      series: Array.from({ length: count }, (_, j) => ({
-        label: `a${j + 1}`,
-        stroke: style(j, count),
-        width: 1.3,
-        steps: true,
-      })),
+      data: count ? [times, ...lines.map(([values]) => values)] : [[]],
+      series: count ? lines.map(([, style]) => style) : [],
       x: { label: header ? episode.timeLabel : "t (s)", range: header ? episode.span(facts.horizon) : [0, 1] },
-      y: { label: "action", range: [-largest, largest] },
-      caption: facts.n_a > count && count ? `the first ${count} of ${facts.n_a} actuators` : "",
-      words: count ? `Actions of ${count} actuators, at most ${text(largest / 1.1)} in magnitude` : "Actions: nothing yet",
+      y: few
+        ? { label: "action", range: [low - room, high + room] }
+        : { label: "actuator j", range: [0.5, count + 0.5], whole: true },
+      caption: [saturation(count), first].filter(Boolean).join(", "),
+      words: count ? `Actions of ${count} actuators, from ${text(low)} to ${text(high)}` : "Actions: nothing yet",
     });
   };
   return chart;
@@ -204,7 +272,7 @@ export function curveChart(model) {
       bands: [{ series: [1, 2], fill: colour("band") }],
       x: { label: axis, range: [0, end], whole: true },
       y: { label: "mean stage cost", range: span, log },
-      caption: summary(told) || (x.length ? "" : "no rollout of the adaptation yet"),
+      caption: summary(told) || (x.length ? "" : "no rollout yet"),
       words: `Training: ${summary(told) || (x.length ? `${last} ${axis}, mean stage cost ${text(mean[mean.length - 1])}` : "nothing yet")}`,
     });
   };

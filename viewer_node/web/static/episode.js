@@ -16,6 +16,7 @@ export class Episode {
   initial = NOTHING;
   target = NOTHING; // as it is drawn
   targetRows = NOTHING; // and at the numbers of a column
+  moving = null; // where the target moves: { header, numbers }, its numbers of every column
 
   take(header, numbers) {
     const { panels, plane, rows, columns } = header;
@@ -34,6 +35,24 @@ export class Episode {
     this.target = numbers.subarray(0, drawn);
     this.targetRows = numbers.subarray(drawn);
     Object.assign(this, { panels, plane, rows });
+  }
+
+  takePath(header, numbers) {
+    this.moving = { header, numbers };
+  }
+
+  // The moving target's columns, while they are of the shown panels and steps; 0 of a constant one.
+  get pathColumns() {
+    if (!this.moving || !this.header) return 0;
+    const { columns, begin, stride, panels } = this.moving.header;
+    const fits = begin === this.header.begin && stride === this.header.stride && `${panels}` === `${this.panels}`;
+    return fits ? columns : 0;
+  }
+
+  wanted(column, panel, row) {
+    if (!this.pathColumns) return this.targetRows[panel * this.rows + row];
+    const i = Math.min(column, this.pathColumns - 1);
+    return this.moving.numbers[(i * this.panels.length + panel) * this.rows + row];
   }
 
   // Time since the start of the episode of a step; steps where the time is not known.
@@ -82,7 +101,7 @@ export class Episode {
     if (this.targetRows.length !== this.rows * this.panels.length) return null;
     let sum = 0;
     for (let r = 0; r < this.rows; r++) {
-      sum += (this.value(column, panel, r) - this.targetRows[panel * this.rows + r]) ** 2;
+      sum += (this.value(column, panel, r) - this.wanted(column, panel, r)) ** 2;
     }
     return Number.isNaN(sum) ? null : Math.sqrt(sum / this.rows);
   }

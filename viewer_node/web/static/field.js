@@ -21,7 +21,7 @@ export function ticks(low, high, count) {
 }
 
 // A picture of one pixel a value: value(row, column), row 0 below.
-function paint(rows, columns, [low, high], value) {
+export function paint(rows, columns, [low, high], value) {
   const canvas = document.createElement("canvas");
   [canvas.width, canvas.height] = [columns, rows];
   const context = canvas.getContext("2d");
@@ -38,6 +38,22 @@ function paint(rows, columns, [low, high], value) {
   }
   context.putImageData(image, 0, 0);
   return canvas;
+}
+
+// A bar of the colours from low to high, with numbers beside it.
+export function bar(c, left, { y, h }, [low, high]) {
+  for (let i = 0; i < h; i++) {
+    c.fillStyle = css(1 - i / h);
+    c.fillRect(left, y + i, BAR, 1.5);
+  }
+  c.font = FONT;
+  c.fillStyle = colour("muted");
+  c.textAlign = "left";
+  for (const share of h > 90 ? [0, 0.25, 0.5, 0.75, 1] : [0, 0.5, 1]) {
+    c.textBaseline = share === 0 ? "bottom" : share === 1 ? "top" : "middle";
+    const u = low + share * (high - low);
+    c.fillText(text(u, (high - low) / 40), left + BAR + 5, y + (1 - share) * h);
+  }
 }
 
 // Where so many pictures of this size go in the room that there is, so that the first one, the newest
@@ -133,9 +149,11 @@ export class FieldChart {
     const half = rows > 1 ? (last - first) / (rows - 1) / 2 : length / 2;
     const span = header ? episode.span(facts.horizon) : [0, 1];
     const w = Math.max(40, width - LEFT - RIGHT);
-    const h = (height - TOP - BOTTOM - GAP * (panels.length - 1)) / panels.length;
+    const whole = (height - TOP - BOTTOM - GAP * (panels.length - 1)) / panels.length;
+    const path = episode.pathColumns; // a moving target is a picture below the field
+    const h = path ? (whole - GAP) / 2 : whole;
     panels.forEach((component, p) => {
-      const area = { x: LEFT, y: TOP + p * (h + GAP), w, h };
+      const area = { x: LEFT, y: TOP + p * (whole + GAP), w, h };
       const [low, high] = episode.range(p);
       const up = (u) => area.y + h * (1 - u / length);
       const at = (t) => area.x + (w * (t - span[0])) / (span[1] - span[0]);
@@ -157,7 +175,19 @@ export class FieldChart {
       }, length);
       c.restore();
       const target = episode.ofTarget(p);
-      if (target.length) {
+      const foot = path ? { ...area, y: area.y + h + GAP } : area;
+      if (path) {
+        const picture = paint(rows, path, [low, high], (r, i) => episode.wanted(i, p, r));
+        const from = at(episode.time(episode.step(0)));
+        c.save();
+        c.beginPath();
+        c.rect(foot.x, foot.y, w, h);
+        c.clip();
+        c.drawImage(picture, from, place[0] + h + GAP, at(episode.time(episode.step(path))) - from, place[1]);
+        this.tag(c, foot, "target");
+        c.restore();
+        this.axisY(c, foot, length, "");
+      } else if (target.length) {
         c.save();
         c.beginPath();
         c.rect(area.x + w + 6, area.y, STRIP, h);
@@ -169,10 +199,10 @@ export class FieldChart {
         c.textBaseline = "top";
         if (p === panels.length - 1) c.fillText("target", area.x + w + 6 + STRIP / 2, area.y + h + 22);
       }
-      this.bar(c, area.x + w + 6 + STRIP + 8, area, [low, high]);
+      bar(c, area.x + w + 6 + STRIP + 8, area, [low, high]);
       const name = panels.length > 1 ? `${facts.names[component] ?? ""}:  ${axis.label}` : axis.label;
       this.axisY(c, area, length, name);
-      if (p === panels.length - 1) this.axisX(c, area, span, header ? episode.timeLabel : "t (s)");
+      if (p === panels.length - 1) this.axisX(c, foot, span, header ? episode.timeLabel : "t (s)");
       const say = (a, b) => {
         const time = span[0] + a * (span[1] - span[0]);
         const column = Math.floor((time / (header?.sample_time || 1) - header?.begin) / header?.stride);
@@ -232,7 +262,7 @@ export class FieldChart {
         };
         this.areas.push({ ...area, say });
       });
-      this.bar(c, LEFT + across * (w + GAP) - 4, { y: top, h: tall * (h + GAP) - GAP }, episode.range(p));
+      bar(c, LEFT + across * (w + GAP) - 4, { y: top, h: tall * (h + GAP) - GAP }, episode.range(p));
     });
   }
 
@@ -271,20 +301,6 @@ export class FieldChart {
           c.strokeRect(left, above, right - left, below - above);
         }
       }
-    }
-  }
-
-  bar(c, left, { y, h }, [low, high]) {
-    for (let i = 0; i < h; i++) {
-      c.fillStyle = css(1 - i / h);
-      c.fillRect(left, y + i, BAR, 1.5);
-    }
-    c.fillStyle = colour("muted");
-    c.textAlign = "left";
-    for (const share of h > 90 ? [0, 0.25, 0.5, 0.75, 1] : [0, 0.5, 1]) {
-      c.textBaseline = share === 0 ? "bottom" : share === 1 ? "top" : "middle";
-      const u = low + share * (high - low);
-      c.fillText(text(u, (high - low) / 40), left + BAR + 5, y + (1 - share) * h);
     }
   }
 

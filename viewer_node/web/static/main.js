@@ -16,7 +16,7 @@ const model = {
   curve: null, // as the monitor tells it, like the status
   status: null,
   controllers: {}, // names, by key
-  facts: { axes: [{ label: "grid point", length: 0 }], actuators: [], horizon: 0, n_a: 0, names: ["u"] }, // as told
+  facts: { axes: [{ label: "grid point", length: 0 }], actuators: [], horizon: 0, n_a: 0, bounds: null, names: ["u"] }, // as told
   connected: null,
   notice: "",
   called: null, // "role/verb" of the button that was pressed, until the next status
@@ -46,8 +46,8 @@ const take = {
     for (const chart of [training, ...ofEpisode]) chart.restyle();
   },
   status(status) {
-    const { axes = model.facts.axes, places = {}, horizon = 0, n_a = 0 } = status.parameters;
-    const facts = { axes, actuators: places.actuators ?? [], horizon, n_a, names: status.components };
+    const { axes = model.facts.axes, places = {}, horizon = 0, n_a = 0, bounds = null } = status.parameters;
+    const facts = { axes, actuators: places.actuators ?? [], horizon, n_a, bounds, names: status.components };
     if (model.status?.place.begun !== status.place.begun) model.episode = new Episode();
     set({ status, facts, called: null });
     update(ofEpisode);
@@ -58,6 +58,10 @@ const take = {
   },
   target(header, numbers) {
     model.episode.takeTarget(header, numbers);
+    update(ofEpisode);
+  },
+  path(header, numbers) {
+    model.episode.takePath(header, numbers);
     update(ofEpisode);
   },
   episode(header, numbers) {

@@ -154,11 +154,11 @@ function Notice({ status, notice }) {
 
 // The result so far, how far the training is, and how fast.
 function Result({ status, curve, controllers }) {
-  const { mean, references, checked, budget, axis, phase, seeds, paid } = curve;
+  const { mean, laws, references, checked, budget, axis, phase, seeds, paid } = curve;
   const { remaining, rounds, episodes } = status;
   const { none, lqt, adapted } = references; // of the closing evaluation: all on the same fields
   const evaluated = adapted !== undefined;
-  const cost = adapted ?? mean.at(-1) ?? null;
+  const cost = adapted ?? (laws ? mean.at(-1) : null) ?? null;
   const said = [];
   if (evaluated && lqt) said.push(below(lqt, adapted, controllers.lqt));
   if (evaluated && none) said.push(`${((100 * adapted) / none).toPrecision(3)} % of the cost without control remains`);
