@@ -54,6 +54,7 @@ SKIPS = {
     "tests/topics/test_own_plants.py": ["{module} is not installed: extra solvers"],
     "tests/tools/test_other_solvers.py": ["{package} is not installed: extra solvers"],
     "tests/tools/test_logs.py": ["{name} is not installed: extra logs"],
+    "tests/tools/test_warm_start.py": ["stable-baselines3 is not installed: extra rl"],
     "tests/tools/test_stable_baselines.py": ["stable-baselines3 is not installed: extra rl"],
     "tests/benchmarks/test_baselines.py": ["stable-baselines3 is not installed: extra rl"],
     "tests/tools/test_environment_pictures.py": ["MoviePy is not installed: extra rl"],
