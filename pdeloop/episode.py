@@ -39,6 +39,10 @@ class EpisodeRecord:
         Mean and sum of the stage costs, and where an environment diverged.
     applied : (T, M, n_a) array
         The actions that the actuators applied for these, within their bounds.
+    stage_costs : (T, M) array or None
+        l_0 .. l_{T-1}; None where only their sum is known.
+    seeds : (M,) int array or None
+        Seeds of the initial fields, -1 for the mean field; None where the fields were given.
     """
 
     states: Array
@@ -46,6 +50,8 @@ class EpisodeRecord:
     actions: Array
     costs: EpisodeCosts
     applied: Array
+    stage_costs: Array | None = None
+    seeds: NDArray[np.int64] | None = None
 
     def __repr__(self) -> str:
         steps, cost = len(self.actions), self.costs.mean
@@ -117,7 +123,7 @@ def rollout(
     batch, kept = len(z), plant.horizon if keep else -1
     states = np.empty((kept + 1, *z.shape))
     actions = np.empty((max(kept, 0), batch, plant.n_a))
-    applied = actions.copy()
+    applied, stage_costs = actions.copy(), np.empty(actions.shape[:2])
     own = not plant.instruments.ideal
     fields = np.empty((kept + 1, batch, plant.n_z)) if own else states
     for k in range(plant.horizon + 1):
@@ -127,10 +133,14 @@ def rollout(
                 fields[k] = plant.states
         if k < plant.horizon:
             a = law(k, z)
+            before = plant.totals.copy()
             z = plant.step(a)
             if keep:
-                actions[k], applied[k] = a, plant.actions
-    return EpisodeRecord(states, fields, actions, plant.episode_costs(), applied)
+                actions[k], applied[k], stage_costs[k] = a, plant.actions, plant.totals - before
+    drawn = np.asarray(seeds, dtype=np.int64) if np.ndim(seeds) == 1 else None
+    return EpisodeRecord(
+        states, fields, actions, plant.episode_costs(), applied, stage_costs, drawn
+    )
 
 
 def mean_field_cost(plant: Plant, law: Law | None = None) -> float:

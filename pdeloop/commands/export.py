@@ -63,6 +63,14 @@ def add(commands: Commands) -> None:
         "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
     )
     add_argument(
+        "--minari",
+        metavar="NAME",
+        help="make a data set of Minari of the rollouts, by this new name",
+    )
+    add_argument(
+        "--parquet", type=a_path, metavar="FILE", help="write the rollouts to this .parquet"
+    )
+    add_argument(
         "--tensorboard",
         type=a_path,
         metavar="DIR",
@@ -76,13 +84,15 @@ def _export(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
+    files["--parquet"] = options.parquet, (".parquet",)
     models = {name: getattr(options, name) for name in MODEL_FILES}
     files |= {f"--{name}": (path, (MODEL_FILES[name][0],)) for name, path in models.items()}
     of_laws = options.out, options.ros2, *models.values()
-    if all(path is None for path in (*of_laws, options.curve, options.tensorboard)):
+    of_runs = options.curve, options.tensorboard, options.minari, options.parquet
+    if all(path is None for path in (*of_laws, *of_runs)):
         options.refuse(
             "expected --out FILE or another form for the law, --curve FILE or --tensorboard DIR for "
-            "the curve"
+            "the curve, --minari NAME or --parquet FILE for the rollouts"
         )
     if options.law is not None:
         print("WARNING: --law of export is now called --controller", file=sys.stderr)
@@ -111,12 +121,21 @@ def _export(options: argparse.Namespace) -> int:
             contents[path] = _model_file(name, run, which or LAWS[0], options.seed)
     if options.curve is not None:
         contents[options.curve] = curve_csv(run)
+    if options.parquet is not None:
+        from pdeloop.data_sets import parquet
+
+        contents[options.parquet] = parquet(run)
     for path, content in contents.items():
         try:
             write_atomically(path, content)
         except OSError as error:
             raise ParameterError(f"cannot write {path}: {error.strerror}") from error
         print(f"written to {path}")
+    if options.minari is not None:
+        from pdeloop.data_sets import write_minari
+
+        write_minari(run, options.minari)
+        print(f"written to Minari's data set {options.minari}")
     if options.tensorboard is not None:
         from pdeloop.tensorboard import write_events
 

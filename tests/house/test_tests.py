@@ -20,6 +20,11 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|assert_")
 SKIPS = {
     "tests/neighbours/test_models.py": ["{package} is not installed: extra neighbours"],
+    "tests/plant/test_cell.py": ["PyBaMM is not installed: extra battery"],
+    "tests/tools/test_data_sets.py": [
+        "Minari is not installed: extra minari",
+        "pyarrow is not installed: extra logs",
+    ],
     "tests/plant/test_fmu.py": [
         "FMPy is not installed: extra fmi",
         "needs a C compiler, the command cc (make packages)",
