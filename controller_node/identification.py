@@ -204,17 +204,6 @@ class Designed:
     innovations: InnovationModel | None = None
 
 
-def design(
-    trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    target: NDArray[np.float64],
-    settings: DesignSettings,
-    channels: Channels = NUMBERED,
-    further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
-) -> ModelRows:
-    """The law of `designed`."""
-    return designed(trajectories, target, settings, channels, further).rows
-
-
 def designed(
     trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     target: NDArray[np.float64],

@@ -68,10 +68,10 @@ class _TaggedLoader(_Loader):  # type: ignore[misc, valid-type]
         return ""
 
 
-def compose_yaml(text: str | bytes, most: int = MAX_YAML_NODES) -> list[yaml.Node]:
+def compose_yaml(text: str | bytes) -> list[yaml.Node]:
     """The documents of a text as YAML's nodes, for a reader with rules of its own; see `parse_yaml`."""
     try:
-        _check_yaml(text, most)
+        _check_yaml(text, MAX_YAML_NODES)
         return list(yaml.compose_all(text, _TaggedLoader))
     except yaml.YAMLError as error:
         raise ValueError(_yaml_problem(error)) from error

@@ -16,7 +16,7 @@ Where no equation reproduces the rollouts, it continues with a model of the read
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -268,11 +268,6 @@ def _observers(
     gain = longer.least_gain if final else longer.first_gain
     found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
     return ([], 0) if found is None else ([start, found.theta], found.steps)
-
-
-def costs_of(records: Sequence[Record]) -> Array:
-    """The cost of each rollout."""
-    return np.array([record.cost for record in records])
 
 
 def gained(costs: Array, base: Array) -> Estimate:

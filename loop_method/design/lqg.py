@@ -198,12 +198,11 @@ def noise_of(
 def with_filter(
     rows: ModelRows,
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
-    sigma: float | None = None,
     settings: IdentificationSettings = DEFAULTS,
 ) -> ModelRows:
     """A reduced model with the gain of its Kalman filter; parameters as for `noise_of`."""
     with one_thread():
-        noise = noise_of(rows, trajectories, sigma, settings)
+        noise = noise_of(rows, trajectories, settings=settings)
     found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)
     return replace(rows, L=found.M)
 

@@ -177,12 +177,10 @@ def fit_kind(
     *,
     settings: FieldModelSettings = DEFAULTS,
     noise: float = 0.0,
-    action_set: ActionSet = ANY_ACTION,
     line: bool = True,
     shape: tuple[int, ...] = (),
 ) -> FieldModel | None:
     """The model of one kind, fitted to all rollouts; None where it cannot be. Arguments: as above."""
-    rollouts = [limited(rollout, action_set) for rollout in rollouts]
     if noise:
         rollouts = with_clean(rollouts, noise, line=line)
     n_z = rollouts[0].states.shape[1]

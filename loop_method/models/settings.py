@@ -93,8 +93,6 @@ class FieldModelSettings(Settings):
         16,
         65536,
     )
-    # Fits to noisy data.
-    # Noise that was not declared, or not as it is.
     # The field between few sensors. "Error" is the squared error of simulated readings over their sum
     # of squares, without the share of the noise.
     sensed_most: int = setting(

@@ -126,7 +126,7 @@ def examine(
     return replace(found, remarks=tuple(remarks))
 
 
-def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) -> Identifiability:
+def examine_excitation(trajectory: Trajectory) -> Identifiability:
     """Examine whether an exploration separates the effects of its inputs, for a model of any order.
 
     trajectory : (states (N + 1, n_z), actions (N, n_a))
@@ -134,7 +134,7 @@ def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) ->
     data = steps_of([trajectory])
     with one_thread():
         U = linalg.svd(data.after, full_matrices=False)[2][:1].T
-        return examine_steps(data, U, channels)
+        return examine_steps(data, U)
 
 
 def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Identifiability:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.identification import DesignSettings, design, design_each, designed
+from controller_node.identification import DesignSettings, design_each, designed
 from loop_interfaces.action_set import ActionSet
 from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows, unpack
@@ -54,7 +54,7 @@ def settings(identification: str, **constants: int) -> DesignSettings:
 def law(true: SpectralModel, target: Array) -> ModelRows:
     """The field law, compared with no control."""
     trajectories = [episode(true)]
-    other = design(trajectories, target, settings("regression"))
+    other = designed(trajectories, target, settings("regression")).rows
     none = replace(other, K_a=0.0 * other.K_a, K_b=0.0 * other.K_b)
     found = field_law(trajectories, target, none, state_weight=Q, action_weight=R)
     assert found.better and found.rows is not None
@@ -105,7 +105,7 @@ def test_actions_that_saturate_are_known_as_such() -> None:
     states = [episode(true)[0][0]]
     for a in np.clip(asked, -limit, limit):
         states.append(true.step(states[-1][None], a[None])[0])
-    other = design([(np.array(states), asked)], target, settings("regression"))
+    other = designed([(np.array(states), asked)], target, settings("regression")).rows
     given = [(np.array(states), asked)], target, other
     found = field_law(*given, state_weight=Q, action_weight=R, action_set=ActionSet(limit=limit))
     without = field_law(*given, state_weight=Q, action_weight=R)
@@ -124,7 +124,7 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
         found.fitted.error > IdentificationSettings().field_error
         and "not accurate enough" in found.text()[-1]
     )
-    rows, plain = (design(noisy, target, how) for how in (field, settings("regression")))
+    rows, plain = (designed(noisy, target, how).rows for how in (field, settings("regression")))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
 
 
@@ -148,7 +148,7 @@ def test_stands_alone_where_the_regression_has_no_stabilising_gains(
     assert np.array_equal(found.rows.policy, expected.policy)
     assert found.field is not None and "its law is used" in found.field.text()[-1]
     with pytest.raises(DesignError, match="not stabilisable"):
-        design([episode(true)], target, settings("regression"))
+        designed([episode(true)], target, settings("regression"))
 
 
 def test_two_explorations_give_one_law_for_the_fields_of_both() -> None:
@@ -189,7 +189,7 @@ def test_the_regression_is_that_of_the_first_exploration() -> None:
 
 def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
     true, target = plant(), np.zeros(N_Z)
-    regression = design([episode(true)], target, settings("regression"))
+    regression = designed([episode(true)], target, settings("regression")).rows
     found = field_law([episode(true)], target, regression, state_weight=Q, action_weight=R)
     assert found.rows is not None and found.fitted is not None
     for rows, predicted in ((found.rows, found.cost), (regression, found.other_cost)):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pdeloop
-from controller_node.identification import DesignSettings, design
+from controller_node.identification import DesignSettings, designed
 from loop_interfaces.model_rows import pack
 from loop_interfaces.topics import CostColumn
 from loop_method.laws.calls import laws_of
@@ -226,7 +226,7 @@ def test_with_few_sensors_the_first_law_is_that_of_a_training_with_its_filter() 
     values = resolve(str(SMALL), {"sensors": 8, "optimizer": "model_based", "rollouts": 20})
     made, settings = build_plant(values), DesignSettings.of(values)
     explored = problem_check._explore(made, values)
-    rows = design([(explored.states[:, 1], explored.actions[:, 1])], made.target, settings)
+    rows = designed([(explored.states[:, 1], explored.actions[:, 1])], made.target, settings).rows
     assert rows.L is not None
     pair = LocalPair(values)
     pair.use_models(pack(rows)[None])
