@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from loop_method.models.noise_level import contradicting_noise, rows_of, share_of_noise
-from loop_method.models.settings import NOISE_MISJUDGED
 from loop_method.models.undeclared_noise import PREDICTED
 from tuner_node.training import Training
 
@@ -41,7 +40,6 @@ def seeming_noise(training: Training, m: int) -> float:
     seeming = contradicting_noise(
         [row for z in states for row in rows_of(z, settings.shape)],
         declared,
-        NOISE_MISJUDGED,
     )
     if not declared and seeming and not settings.sensors:
         share = share_of_noise(seeming, states, training.target)

@@ -39,6 +39,8 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
 
+_MEASURED_SHARE = 0.5
+"""Weight of the measured fields, where there are drawn ones."""
 KEPT = 0.99
 """Share of the variance whose directions are drawn from."""
 # A field is moved by this share of its distance to another one; without control the costs of a chaotic
@@ -136,9 +138,9 @@ def mixtures(
     return drawn
 
 
-def weighted(fields: Array, drawn: Array, share: float) -> tuple[Array, Array]:
-    """Measured and drawn fields, and their weights, of which the measured ones have this share."""
-    share = share if len(drawn) else 1.0
+def weighted(fields: Array, drawn: Array) -> tuple[Array, Array]:
+    """Measured and drawn fields, and their weights, half of which the measured ones have."""
+    share = _MEASURED_SHARE if len(drawn) else 1.0
     own = np.full(len(fields), share / len(fields))
     others = np.full(len(drawn), (1.0 - share) / max(len(drawn), 1))
     return np.concatenate([fields, drawn]), np.concatenate([own, others])

@@ -34,7 +34,7 @@ from loop_method.adapt.observer_design import compensators
 from loop_method.adapt.progress import JUDGING, RENEWING
 from loop_method.adapt.replay import FEWEST
 from loop_method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
-from loop_method.adapt.settings import MEASURED_SHARE, ModelBasedSettings
+from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -133,7 +133,7 @@ class ModelBasedSensed(ModelBasedReadings):
         # A law with memory has many parameters, and simulations cost no rollout.
         sets = _OBSERVER_DRAWS if final else 1
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
-        every, weights = weighted(fields, drawn, MEASURED_SHARE)
+        every, weights = weighted(fields, drawn)
         now = loop.theta(progress.policy)
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)

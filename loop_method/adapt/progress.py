@@ -97,7 +97,7 @@ class Progress:
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
-        fraction, change = fraction_and_change(state, finite=False)
+        fraction, change = fraction_and_change(state)
         return cls(
             checked_array(state, "policy", "f", shape).copy(),
             stage=stage,
@@ -128,15 +128,13 @@ def held_out(fraction: float, change: Estimate) -> Array:
     return np.array([fraction, change.value, change.error, change.degrees])
 
 
-def fraction_and_change(
-    state: Mapping[str, NDArray[np.generic]], *, finite: bool = True
-) -> tuple[float, Estimate]:
+def fraction_and_change(state: Mapping[str, NDArray[np.generic]]) -> tuple[float, Estimate]:
     """What `held_out` made an array of.
 
     ValueError for numbers whose squares are infinite, unless they are themselves, and for no degrees of
     freedom.
     """
-    numbers = checked_array(state, "held_out", "f", (4,), finite=finite)
+    numbers = checked_array(state, "held_out", "f", (4,), finite=False)
     if (np.abs(numbers[np.isfinite(numbers)]) > LARGEST).any():
         raise ValueError(f"'held_out' has a number beyond {LARGEST:g}")
     fraction, value, error, degrees = numbers.tolist()

@@ -29,7 +29,7 @@ from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.estimate import ZERO, Estimate, mean_change
 from loop_method.adapt.improve import cheapest, curvature_of, improve
 from loop_method.adapt.initial_fields import measured_states, mixtures, weighted
-from loop_method.adapt.settings import MEASURED_SHARE, ImprovementSettings
+from loop_method.adapt.settings import ImprovementSettings
 
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
@@ -279,7 +279,7 @@ def _descent(
 
     def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
         drawn = mixtures(fields, most, rng, components, periodic=periodic)
-        every, weights = weighted(fields, drawn, MEASURED_SHARE)
+        every, weights = weighted(fields, drawn)
         start = cheapest(loop, starts, every, weights)
         found = improve(loop, start, every, weights, curvature, settings, least_gain)
         rests = found is not None and not found.after < (1.0 - least_gain) * found.before

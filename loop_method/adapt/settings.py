@@ -7,9 +7,6 @@ from dataclasses import dataclass
 
 from loop_method.settings import Settings, setting
 
-MEASURED_SHARE = 0.5
-"""Weight of the measured fields relative to the drawn ones."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ImprovementSettings(Settings):

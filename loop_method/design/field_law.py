@@ -374,7 +374,7 @@ def field_law(
     best = saturated(affine_law(K, b - K @ point), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
-    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, n_s, _FIELD_ROOM)
+    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, n_s)
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)
@@ -470,12 +470,12 @@ def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: 
     return predicted(model, [Measured(z[None], nothing, law) for z in fields])
 
 
-def _basis(K: Array, states: Array, target: Array, n_s: int, room: float) -> Array:
+def _basis(K: Array, states: Array, target: Array, n_s: int) -> Array:
     """U (n_z, n_s): the rows of K, and POD modes of the states and the target, so that there is a b."""
     n_a, n_z = K.shape
     weighted = np.vstack([states, np.sqrt(len(states)) * target])
     sensed = np.empty((n_z, 0))
-    if n_s >= room * n_a:
+    if n_s >= _FIELD_ROOM * n_a:
         _, values, rows = linalg.svd(K, full_matrices=False)
         sensed = rows[values > 1e-12 * max(values[0], 1e-300)].T
     left = weighted - weighted @ sensed @ sensed.T

@@ -26,6 +26,7 @@ import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured
+from loop_method.models.settings import FAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +47,11 @@ def filtered(
     rollouts: Sequence[Measured],
     first: Sequence[Array],
     shares: Array,
-    far: float,
 ) -> Filtered:
     """The states of rollouts, each with one state more than actions.
 
-    first: their initial states; shares: g, of each wavenumber; far: a prediction
-    this many times beyond the measured states is rejected.
+    first: their initial states; shares: g, of each wavenumber. A prediction far beyond the measured
+    states is rejected.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]
@@ -59,7 +59,7 @@ def filtered(
         own[0] = state
     lengths = np.array([len(rollout.actions) for rollout in rollouts])
     total, count, lost = np.zeros(len(shares)), 0, 0
-    most = far * max(float(np.abs(rollout.states).max()) for rollout in rollouts)
+    most = FAR * max(float(np.abs(rollout.states).max()) for rollout in rollouts)
     for k in range(int(lengths.max())):
         rows = np.flatnonzero(lengths > k).tolist()
         actions = np.stack([rollouts[i].actions[k] for i in rows])

@@ -23,6 +23,7 @@ import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from loop_interfaces.arrays import Array
+from loop_method.models.settings import NOISE_MISJUDGED
 from loop_method.models.whiteness import correlations
 
 ORDERS = (1, 2, 3, 4)
@@ -51,17 +52,14 @@ def noise_level(trajectories: Sequence[Array]) -> float:
     return sigma if alike and sigma > LEAST * size and not _is_local(usable) else 0.0
 
 
-def contradicting_noise(trajectories: Sequence[Array], declared: float, misjudged: float) -> float:
-    """The noise that states (L, n) seem to have, or at most have; 0 if it contradicts none declared.
-
-    misjudged: ratio of the two that is a contradiction.
-    """
+def contradicting_noise(trajectories: Sequence[Array], declared: float) -> float:
+    """The noise that states (L, n) seem to have, or at most have; 0 if it contradicts none declared."""
     level = noise_level(trajectories)
-    if level > misjudged * declared:
+    if level > NOISE_MISJUDGED * declared:
         return level
     powers = _powers(_usable(trajectories)) if declared else None
     most = np.inf if powers is None else float(np.sqrt(powers.min()))
-    return most if declared > misjudged * most else 0.0
+    return most if declared > NOISE_MISJUDGED * most else 0.0
 
 
 def share_of_noise(noise: float, trajectories: Sequence[Array], target: Array) -> float:

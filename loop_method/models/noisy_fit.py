@@ -46,7 +46,6 @@ from loop_method.models.filtering import Filtered, filtered
 from loop_method.models.prediction import finite
 from loop_method.models.settings import (
     COEFFICIENT_RIDGE,
-    FAR,
     FIRST_SUBSTEPS,
     LEAST_CORRECTION,
     FieldModelSettings,
@@ -162,7 +161,7 @@ def fit_noisy(
     deviation of the noise on every number of their states.
     """
     rollouts = [short for r in rollouts if len((short := finite(r)).actions)]
-    rollouts = _thinned(rollouts, _NOISY_STEPS)
+    rollouts = _thinned(rollouts)
     n_z, n_a = rollouts[0].states.shape[1], rollouts[0].actions.shape[1]
     first = [rollout.known[0] for rollout in rollouts]
     largest = max(float(np.abs(rollout.states).max()) for rollout in rollouts)
@@ -180,7 +179,7 @@ def fit_noisy(
         settings.clip * largest if form.degree > POWERS else np.inf,
     )
     best, least = None, np.inf
-    known = filtered(model, rollouts, first, shares, FAR)
+    known = filtered(model, rollouts, first, shares)
     for window, share in PASSES:
         steps = min(window, _LARGEST_WINDOW)
         growth = max(float(model.linear.real[:cut].max()), 0.0)
@@ -196,7 +195,7 @@ def fit_noisy(
             if found is None:
                 continue
             found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
-            known = filtered(found, rollouts, first, shares, FAR)
+            known = filtered(found, rollouts, first, shares)
             if not known.lost:
                 break
         if found is None:
@@ -212,10 +211,10 @@ def fit_noisy(
     return replace(best, fewer=fewer_of(best.symbols, largest, best.substeps, settings))
 
 
-def _thinned(rollouts: Sequence[Measured], most: int) -> list[Measured]:
-    """Rollouts at equal distances, the first among them: at most so many steps, but at least two."""
+def _thinned(rollouts: Sequence[Measured]) -> list[Measured]:
+    """Rollouts at equal distances, the first among them: few steps, but at least two of them."""
     steps = sum(len(rollout.actions) for rollout in rollouts)
-    count = min(len(rollouts), max(2, len(rollouts) * most // max(steps, 1)))
+    count = min(len(rollouts), max(2, len(rollouts) * _NOISY_STEPS // max(steps, 1)))
     chosen = np.linspace(0, len(rollouts) - 1, count).round().astype(int)
     return [rollouts[i] for i in np.unique(chosen).tolist()]
 

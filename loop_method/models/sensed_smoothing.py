@@ -97,7 +97,7 @@ class Smoothing:
                 size += fields[0] ** 2
                 told += 1.0 - problem.variances(self.shared, fields) / spread**2
             told = np.maximum(told, _LEAST_TOLD * len(problems))
-            spread = _falling(size, told, _LEAST_SPREAD)
+            spread = _falling(size, told)
             for i, problem in enumerate(problems):
                 problem.prior.spread = spread
                 found[i] = problem.refined(self.shared, found[i])
@@ -127,11 +127,10 @@ def settled(spread: Array, before: Array) -> bool:
     return bool(np.linalg.norm(spread - before) <= _SETTLED * np.linalg.norm(before))
 
 
-def _falling(size: Array, told: Array, least: float) -> Array:
+def _falling(size: Array, told: Array) -> Array:
     """The square root of size / told, alike for cosine and sine, and not rising with the wavenumber.
 
-    Between sensors a short wave looks like a long one, which is the likelier one. least: the least of
-    them, relative to the largest.
+    Between sensors a short wave looks like a long one, which is the likelier one.
     """
     squares, weights = (
         np.mean([part[1 : WAVES + 1], part[WAVES + 1 :]], axis=0) for part in (size, told)
@@ -141,5 +140,5 @@ def _falling(size: Array, told: Array, least: float) -> Array:
 
     waves = isotonic_regression(squares / weights, weights=weights, increasing=False).x
     variances = np.concatenate([size[:1] / told[:1], waves, waves])
-    found: Array = np.sqrt(np.maximum(variances, least**2 * variances.max()))
+    found: Array = np.sqrt(np.maximum(variances, _LEAST_SPREAD**2 * variances.max()))
     return found

@@ -114,7 +114,7 @@ def innovations(
     for _ in range(_TURNS):
         left = []
         for rollout in rollouts:
-            if (own := _along(model, rollout, shares, FAR)) is None:
+            if (own := _along(model, rollout, shares)) is None:
                 return None
             left.append(own)
         spectra = np.concatenate([scipy.fft.rfft(own) / model.n_z for own in left])
@@ -123,12 +123,12 @@ def innovations(
     return left
 
 
-def _along(model: FieldModel, rollout: Measured, shares: Array, far: float) -> Array | None:
+def _along(model: FieldModel, rollout: Measured, shares: Array) -> Array | None:
     """The innovations of one rollout, but for the first; None where the model runs away.
 
     Until the share that is given is the best one, it is that of an unknown state that rests, 1/(k + 1).
     """
-    z, most = rollout.known[:1], far * float(np.abs(rollout.states).max())
+    z, most = rollout.known[:1], FAR * float(np.abs(rollout.states).max())
     left = np.empty((len(rollout.actions), model.n_z))
     for k, action in enumerate(rollout.actions):
         with np.errstate(all="ignore"):

@@ -157,7 +157,7 @@ def subspace_model(
         if len(tried) == 1:
             (p, n), errors = tried[0], [np.nan]
         else:
-            p, n, errors = _choose(tried, known, _SUBSPACE_TOLERANCE)
+            p, n, errors = _choose(tried, known)
         error = errors[tried.index((p, n))]
         found = _fitted(known, p, n, channels, error, constant=constant)
         table = tuple((*sizes, own) for sizes, own in zip(tried, errors, strict=True))
@@ -182,7 +182,7 @@ def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
 
 
 def _choose(
-    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory], tolerance: float
+    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory]
 ) -> tuple[int, int, list[float]]:
     """p and n with the least error on parts that were held out, and the errors of all."""
     parts = _parts(known)
@@ -210,7 +210,7 @@ def _choose(
     errors = np.sqrt(ratios)
     if not np.isfinite(errors).any():
         return (*tried[0], [np.nan] * len(tried))
-    good = [i for i in range(len(tried)) if errors[i] <= tolerance * errors.min()]
+    good = [i for i in range(len(tried)) if errors[i] <= _SUBSPACE_TOLERANCE * errors.min()]
     least = min(tried[i][1] for i in good)
     best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
     return (*tried[best], errors.tolist())

@@ -18,7 +18,7 @@ from loop_method.models.filtering import filtered
 from loop_method.models.kinds import FORMS
 from loop_method.models.noisy_fit import fit_noisy, significant
 from loop_method.models.prediction import errors
-from loop_method.models.settings import FAR, FieldModelSettings
+from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral import SpectralModel
 from loop_method.models.spectral_fit import fit_spectral
 
@@ -119,7 +119,6 @@ def test_filtered_states_are_better_than_measured_ones() -> None:
         known,
         [r.known[0] for r in known],
         np.full(POINTS // 2 + 1, 0.1),
-        FAR,
     )
     error = np.mean([np.mean((z - t)[20:] ** 2) for z, t in zip(found.states, true, strict=True)])
     # Without an error of the model, a gain g leaves at most g / (2 - g) of the noise.
@@ -131,7 +130,7 @@ def test_a_gain_of_one_is_what_was_measured() -> None:
     _, rollouts = noisy()
     known = with_clean(rollouts[:1], NOISE)
     ones = np.ones(POINTS // 2 + 1)
-    found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones, FAR)
+    found = filtered(reaction_diffusion(), known, [known[0].states[0]], ones)
     np.testing.assert_allclose(found.states[0], known[0].states, atol=1e-12)
 
 

@@ -142,7 +142,7 @@ def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:
 def whole_law(model: SensedModel, count: int) -> tuple[SensedLoop, WholeFieldLaw, Array, Array]:
     """A loop, the law of the whole field from so many initial fields, and these with their weights."""
     loop, fields = loop_of(model), np.stack([field(model, seed) for seed in range(count)])
-    every, weights = weighted(fields, np.empty((0, model.n_z)), 0.5)
+    every, weights = weighted(fields, np.empty((0, model.n_z)))
     law = whole_field_law(loop, every, weights, ModelBasedSettings(iterations=20), 10)
     assert law is not None
     return loop, law, every, weights
