@@ -199,21 +199,7 @@ def inputs_cost(loop: ClosedLoop, theta: Array, v: Array, fields: Array) -> tupl
 
     Infinite, with a gradient of zero, where a simulation is not finite.
     """
-    T, model = loop.horizon, loop.model
-    q, r = 2.0 * loop.state_weight / T, 2.0 * loop.action_weight / T
-    K, b = theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1]
-    z, states, actions, costs = fields, [], [], np.zeros(len(fields))
-    for k in range(T):
-        states.append(z)
-        actions.append(z @ K.T + b + v[k])
-        costs += 0.5 * q * np.sum((z - loop.target) ** 2, axis=1)
-        costs += 0.5 * r * np.sum(actions[k] ** 2, axis=1)
-        if not (np.isfinite(costs).all() and np.isfinite(z).all()):
-            return np.full(len(fields), np.inf), np.zeros_like(v)
-        z = model.step(z, actions[k])
-    gradient, eta = np.empty_like(v), np.zeros_like(fields)
-    for k in reversed(range(T)):
-        eta, g = model.pull_back(states[k], actions[k], eta)
-        gradient[k] = g + r * actions[k]
-        eta = eta + q * (states[k] - loop.target) + gradient[k] @ K
-    return costs, gradient
+    costs, slopes, _ = loop.slopes(theta, fields, v.swapaxes(0, 1))
+    if not (np.isfinite(costs).all() and np.isfinite(slopes).all()):
+        return np.full(len(fields), np.inf), np.zeros_like(v)
+    return costs, slopes.swapaxes(0, 1)

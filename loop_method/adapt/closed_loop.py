@@ -4,29 +4,17 @@
 The law is linear in the projected state s = U^T z and its memory p, and returns the action and the
 input of the memory:
 
-    [a_k; u_k] = theta [s_k; p_k; 1],        z_{k+1} = f(z_k, a_k),        p_{k+1} = u_k + B a_k,
+    [r_k; u_k] = theta [s_k; p_k; 1],        a_k = P(r_k),
+    z_{k+1} = f(z_k, a_k),                   p_{k+1} = u_k + B a_k,
 
-with f the model, p_0 = s_0, and the nearest admissible action P(a_k) in place of a_k
-(`loop_interfaces.action_set`). The affine law has no memory, and theta = [K_a b]; `observed_loop` has
-that of a law with an observer. From an initial field z_0 the cost is
+with f the model, p_0 = s_0, and P the nearest admissible action (`loop_interfaces.action_set`). The
+affine law has no memory, and theta = [K_a b]; `observed_loop` has that of a law with an observer. From
+an initial field z_0 the cost is
 
-    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2).
+    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),
 
-With eta_k = dJ/dz_k and mu_k = dJ/dp_k, both 0 at k = T, the gradient follows backwards in time,
-
-    g_k     = (df/da)^T eta_{k+1} + B^T mu_{k+1} + 2 r/T a_k        times (dP/da)^T,
-    [v; mu_k] = [theta_s theta_p]^T [g_k; mu_{k+1}],
-    eta_k   = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + U v,
-    dJ/dtheta = sum_k [g_k; mu_{k+1}] [s_k; p_k; 1]^T.
-
-It costs about three simulations, whatever the number of gains.
-
-References
-----------
-Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode).
-El Ghaoui, Oustry, AitRami, "A cone complementarity linearization algorithm for static output-feedback
-and related problems", IEEE Trans. Automatic Control 42(8), 1997, section IV (a law with memory is a
-static law of a larger plant).
+or another quadratic one. With g_k = dJ/d[r_k; u_k] of the adjoint (`loop_method.models.sweep`) its
+gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
 """
 
 from __future__ import annotations
@@ -46,6 +34,7 @@ from loop_interfaces.cost import Cost
 from loop_method.adapt.base import Record
 from loop_method.laws.feedforward import FeedForward
 from loop_method.models import FieldModel
+from loop_method.models.sweep import Sweep, rolled, sweep_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,94 +174,116 @@ class ClosedLoop(ClosedLoopProblem):
 
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         """Roll theta (n_a + n_p, n_s + n_p + constants) out from the fields (F, n_z)."""
-        B, T, count = self.memory_input, self.horizon, len(fields)
-        (n_p, n_a), n_s = B.shape, self.U.shape[1]
-        begin = self._start(fields)
-        states = np.empty((T + 1, *begin.shape))
-        actions = np.empty((T, count, n_a))
-        features = np.full((T, count, n_s + n_p + 1), self.constant_feature)
-        costs, finite, all_finite = np.zeros(count), np.ones(count, dtype=bool), True
-        noise = self._noise_of(count)
-        gains, constants = theta[:, : n_s + n_p].T, self.constant_feature * theta[:, n_s + n_p :]
-        states[0] = begin
-        memory = np.empty((count, n_p))
+        n_z, n_a = self.model.n_z, self.model.n_a
+        states, _, actions = rolled(self._sweep, n_a, *self._rolled(theta, fields))
+        known = np.isfinite(states).all(axis=2)
         with np.errstate(all="ignore"):
-            for k in range(T):
-                outputs = self._outputs(k, states[k], fields)
-                known = features[k, :, :-1]
-                known[:, :n_s] = s = outputs @ self.U + noise[k]
-                known[:, n_s:] = memory if k else s[:, :n_p]
-                out = known @ gains + constants[:, min(k, self.constants - 1)]
-                a = out[:, :n_a]
-                self.action_set.project(a, out=a)
-                self._add_stage(costs, states[k], outputs, a, k)
-                memory = out[:, n_a:] + a @ B.T
-                # Diverged fields stay marked and continue with numbers that a model can take.
-                if not (all_finite and np.isfinite(costs).all() and np.isfinite(memory).all()):
-                    all_finite = False
-                    finite &= np.isfinite(costs) & np.isfinite(memory).all(axis=1)
-                    for part in (a, memory, known):
-                        part[~finite] = 0.0
-                actions[k] = a
-                after = self._step(k, states[k], a, fields)
-                if not (all_finite and np.isfinite(after).all()):
-                    all_finite = False
-                    finite &= np.isfinite(after).all(axis=1)
-                    after[~finite] = 0.0
-                states[k + 1] = after
-            if self.cost is not None:
-                self.cost.add_terminal(costs, states[-1])
-                finite &= np.isfinite(costs)
-        costs /= T
-        costs[~finite] = np.inf
-        return Simulation(states, actions, costs, features)
+            costs = self._slopes(states, actions, fields)[0]
+        costs[~(np.all(known, axis=1) & np.isfinite(costs))] = np.inf
+        known = np.logical_and.accumulate(known, axis=1)
+        states[~known], actions[~known[:, 1:]] = 0.0, 0.0
+        features = np.empty((*actions.shape[:2], states.shape[2] - n_z + self.U.shape[1] + 1))
+        features[..., :-1] = self._features(states, self._offsets(fields)) * known[:, :-1, None]
+        features[..., -1] = self.constant_feature
+        states, actions, features = (x.swapaxes(0, 1) for x in (states, actions, features))
+        return Simulation(states[..., :n_z], actions, costs, features)
 
-    def gradient(
-        self, theta: Array, fields: Array, weights: Array, simulation: Simulation | None = None
-    ) -> tuple[float, Array]:
+    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
         """The weighted sum of the costs, and its gradient, of the shape of theta.
 
         Infinite, with a gradient of zero, where a cost of positive weight is.
-
-        simulation: of theta from the fields, if there is one.
         """
-        simulation = self.simulate(theta, fields) if simulation is None else simulation
-        gradient = np.zeros_like(theta)
-        if not np.isfinite(simulation.costs[weights > 0.0]).all():
-            return np.inf, gradient
-        states, actions = simulation.states, simulation.actions
-        B, n_s = self.memory_input, self.U.shape[1]
-        n_f = n_s + len(B)
-        gains, constants = theta[:, :n_f], self.constant_feature * theta[:, n_f:]
-        eta, mu = np.zeros_like(states[0]), np.zeros((len(fields), len(B)))
-        weight = weights[:, None] / self.horizon
+        fields, weights = fields[weights > 0.0], weights[weights > 0.0]
+        costs, g, features = self.slopes(theta, fields)
+        if not (np.isfinite(costs).all() and np.isfinite(g).all()):
+            return np.inf, np.zeros_like(theta)
+        by_gains = np.einsum("f,fij->ij", weights, g.swapaxes(1, 2) @ features)
+        by_step = np.einsum("f,fki->ik", weights, g)
+        by_b = by_step if self.constants > 1 else by_step.sum(axis=1, keepdims=True)
+        return float(weights @ costs), np.hstack([by_gains, self.constant_feature * by_b])
+
+    def slopes(
+        self, theta: Array, fields: Array, added: Array | float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """J from each of the fields, (F,), and its slopes by what is added to the law's outputs [r; u].
+
+        And [s; p] of each step, (F, T, n_s + n_p). What is not finite is NaN or infinite.
+
+        added: (F, T, n_a + n_p).
+        """
+        begin, v, K, b, e = self._rolled(theta, fields)
+        v, offsets, n_f = v + added, self._offsets(fields), theta.shape[1] - self.constants
+        costs, g, features = np.empty(len(v)), np.empty(v.shape), np.empty((*v.shape[:2], n_f))
+
+        def work(own: Sweep, rows: slice) -> None:
+            with np.errstate(all="ignore"):
+                states, requested, actions = own.roll(begin[rows], v[rows], K, b, _of(e, rows))
+                costs[rows], on_states, on_a, eta = self._slopes(states, actions, fields[rows])
+                g[rows] = own.roll_back(requested[..., : on_a.shape[2]], on_states, on_a, K, eta)
+                features[rows] = self._features(states, _of(offsets, rows))
+
+        self._sweep.each(len(fields), work)
+        return costs, g, features
+
+    @cached_property
+    def _sweep(self) -> Sweep:
+        return sweep_of(self.model, self.action_set, self.horizon, self.memory_input)
+
+    @cached_property
+    def _stage(self) -> Cost:
+        """The cost, of the outputs unless it is another one."""
         if self.cost is not None:
-            eta = weight * self.cost.terminal_slope(states[-1])
-        share = 2.0 / self.horizon * weights[:, None]
-        state_share, action_share = self.state_weight * share, self.action_weight * share
-        for k in reversed(range(self.horizon)):
-            z, a = states[k], actions[k]
-            eta, g = self.model.pull_back(z, a, eta)
-            if self.cost is None:
-                error = self._outputs(k, z, fields) - self.target
-                on_z, on_a = self._pull_outputs(state_share * error), action_share * a
-            else:
-                on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
-            g = g + on_a + mu @ B
-            row = min(k, self.constants - 1)
-            if self.action_set.bounded:
-                requested = simulation.features[k, :, :-1] @ gains.T + constants[:, row]
-                g = self.action_set.pull_back(requested[:, : a.shape[1]], g)
-            out = np.hstack([g, mu])
-            gradient[:, :n_f] += out.T @ simulation.features[k, :, :-1]
-            gradient[:, n_f + row] += self.constant_feature * out.sum(axis=0)
-            known = out @ gains
-            by_s, mu = known[:, :n_s], known[:, n_s:]
-            if k == 0:
-                by_s[:, : len(B)] += mu
-            eta = eta + on_z + self._pull_outputs(by_s @ self.U.T)
-        counted = weights > 0.0
-        return float(weights[counted] @ simulation.costs[counted]), gradient
+            return self.cost
+        return Cost(
+            len(self.target),
+            self.model.n_a,
+            self.horizon,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            target=self.target,
+        )
+
+    def _rolled(
+        self, theta: Array, fields: Array
+    ) -> tuple[Array, Array, Array, Array, Array | None]:
+        """[z_0; p_0], v, K, b and e of `Sweep.roll`."""
+        (n_p, _), n_s = self.memory_input.shape, self.U.shape[1]
+        gains, constants = theta[:, :n_s], self.constant_feature * theta[:, n_s + n_p :]
+        K = np.hstack([self._pull_outputs(gains @ self.U.T), theta[:, n_s : n_s + n_p]])
+        v = np.zeros((len(fields), self.horizon, len(theta)))
+        if self.constants > 1:
+            v += constants.T
+        offsets, begin = self._offsets(fields), self._start(fields)
+        first = self._outputs(begin) @ self.U
+        if offsets is not None:
+            v += offsets @ gains.T
+            first += offsets[:, 0]
+        b = constants[:, 0] if self.constants == 1 else np.zeros(len(theta))
+        return np.hstack([begin, first[:, :n_p]]), v, K, b, self._disturbances(fields)
+
+    def _slopes(
+        self, states: Array, actions: Array, fields: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """J of rows (M,), and its derivatives by [z; p] and a of each step, and by the last [z; p]."""
+        n_z, T = self.model.n_z, self.horizon
+        z, cost = states[:, :-1, :n_z], self._stage
+        on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
+        if self.cost is None:
+            unforeseen = self._unforeseen(fields)
+            outputs = self._outputs(z) if unforeseen is None else self._outputs(z) + unforeseen
+            J, on_outputs, on_actions = cost.along(outputs, actions, 0)
+            on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
+        else:
+            J, on_z, on_actions = cost.along(z, actions, 0)
+            of_end, at_end = cost.at_end(states[:, -1, :n_z])
+            J, on_states[..., :n_z], eta[:, :n_z] = J + of_end, on_z / T, at_end / T
+        return J / T, on_states, on_actions / T, eta
+
+    def _features(self, states: Array, offsets: Array | None) -> Array:
+        """[s; p] of each step, (M, T, n_s + n_p)."""
+        n_z = self.model.n_z
+        s = self._outputs(states[:, :-1, :n_z]) @ self.U
+        return np.concatenate([s if offsets is None else s + offsets, states[:, :-1, n_z:]], axis=2)
 
     def unsaturated(self, theta: Array, fields: Array, weights: Array) -> Array:
         """The law with less excess where an action is at a bound from all fields, nearly the same one.
@@ -304,35 +315,40 @@ class ClosedLoop(ClosedLoopProblem):
         """The model's state at the beginning; replayed rollouts have innovations after it."""
         return fields[:, : len(self.U)]
 
-    def _outputs(self, k: int, z: Array, fields: Array) -> Array:
-        """What U^T is applied to, and the target is of."""
+    def _disturbances(self, fields: Array) -> Array | None:
+        """What is added to the states after each step, (F, T, n_z); None: nothing is."""
+        n_z = len(self.U)
+        return fields[:, n_z:].reshape(len(fields), -1, n_z) if fields.shape[1] > n_z else None
+
+    def _outputs(self, z: Array) -> Array:
+        """What U^T is applied to, and the target is of, for states (..., n_z)."""
         return z
+
+    def _unforeseen(self, fields: Array) -> Array | None:
+        """What is added to the outputs, (F, T, n_y); None: nothing is."""
+        return None
 
     def _pull_outputs(self, by_outputs: Array) -> Array:
         """The derivative by z of that by the outputs."""
         return by_outputs
 
-    def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
-        after, n_z = self.model.step(z, a), len(self.U)
-        if fields.shape[1] > n_z:
-            after = after + fields[:, n_z * (k + 1) : n_z * (k + 2)]
-        return after
+    def _offsets(self, fields: Array) -> Array | None:
+        """What is added to s, (F, T, n_s); None: nothing is."""
+        unforeseen = self._unforeseen(fields)
+        found = None if unforeseen is None else unforeseen @ self.U
+        if self.noise:
+            size = self.horizon, len(fields), self.U.shape[1]
+            drawn = self._noise(np.random.default_rng(0).standard_normal(size)).swapaxes(0, 1)
+            found = drawn if found is None else found + drawn
+        return found
 
-    def _add_stage(self, costs: Array, z: Array, outputs: Array, a: Array, k: int) -> None:
-        """Add the stage costs of step k, which are of z, or of the outputs that have a target."""
-        if self.cost is not None:
-            self.cost.add(costs, z, a, k)
-            return
-        error = outputs - self.target
-        costs += self.state_weight * np.einsum("fi,fi->f", error, error)
-        costs += self.action_weight * np.einsum("fi,fi->f", a, a)
+    def _noise(self, drawn: Array) -> Array:
+        """The noise on U^T z, whose columns are orthonormal, of numbers of N(0, 1)."""
+        return self.noise * drawn
 
-    def _noise_of(self, count: int) -> Array:
-        """The noise added to U^T z, whose columns are orthonormal, (T, count, n_s) or (T, 1, 1)."""
-        if not self.noise:
-            return np.zeros((self.horizon, 1, 1))
-        size = self.horizon, count, self.U.shape[1]
-        return self.noise * np.random.default_rng(0).standard_normal(size)
+
+def _of(rows: Array | None, some: Any) -> Array | None:
+    return None if rows is None else rows[some]
 
 
 @dataclass(frozen=True, eq=False)

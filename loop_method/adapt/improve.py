@@ -23,7 +23,7 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.closed_loop import ClosedLoop, Simulation
+from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.settings import ImprovementSettings
 from loop_method.design.finite_horizon import action_curvature
 
@@ -142,7 +142,6 @@ def improve(
         settings,
         gain,
         trust,
-        simulation if finite.all() else None,
     )
 
 
@@ -155,12 +154,11 @@ def _descend(
     settings: ImprovementSettings,
     least_gain: float,
     trust: float,
-    simulation: Simulation | None,
 ) -> Improvement:
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
 
-    before, by_theta = loop.gradient(theta, fields, weights, simulation)
+    before, by_theta = loop.gradient(theta, fields, weights)
     # Of a quadratic cost the step -g/2 leads to its minimum. L-BFGS begins with one of unit length.
     unit = 0.5 * float(np.linalg.norm(coordinates.gradient(by_theta)))
     if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):

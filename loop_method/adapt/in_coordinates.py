@@ -196,11 +196,11 @@ class CostInCoordinates(Cost):
     def add_terminal(self, totals: Array, states: Array) -> None:
         self._present.add_terminal(totals, states)
 
-    def slopes(self, states: Array, actions: Array, k: int) -> tuple[Array, Array]:
-        return self._present.slopes(states, actions, k)
+    def along(self, states: Array, actions: Array, first: int) -> tuple[Array, Array, Array]:
+        return self._present.along(states, actions, first)
 
-    def terminal_slope(self, states: Array) -> Array:
-        return self._present.terminal_slope(states)
+    def at_end(self, states: Array) -> tuple[Array, Array]:
+        return self._present.at_end(states)
 
 
 def is_large(context: Context) -> bool:

@@ -68,10 +68,7 @@ class ObservedLoop(ClosedLoop):
         moved[np.diag_indices(len(moved))] += ROUND * (size or 1.0)
         return np.asarray(linalg.block_diag(own, moved), dtype=np.float64)
 
-    def _noise_of(self, count: int) -> Array:
+    def _noise(self, drawn: Array) -> Array:
         """Effect of the noise on U^T z, where the columns of U need not be orthonormal."""
-        drawn = super()._noise_of(count)
-        if not self.noise:
-            return drawn
         R = linalg.qr(self.U, mode="r")[0][: min(self.U.shape)]
-        return np.asarray(drawn[..., : len(R)] @ R, dtype=np.float64)
+        return np.asarray(super()._noise(drawn)[..., : len(R)] @ R, dtype=np.float64)

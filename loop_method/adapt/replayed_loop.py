@@ -62,19 +62,18 @@ class ReplayedLoop(ObservedLoop):
     def _start(self, fields: Array) -> Array:
         return fields[:, : self.model.n_z]
 
-    def _innovations(self, k: int, fields: Array) -> Array:
-        r = len(self._readings.C)
-        begin = self.model.n_z + k * r
-        return fields[:, begin : begin + r]
+    def _unforeseen(self, fields: Array) -> Array:
+        """e of each step."""
+        return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self._readings.C))
 
-    def _outputs(self, k: int, z: Array, fields: Array) -> Array:
-        v: Array = z @ self._readings.C.T + self._innovations(k, fields)
+    def _disturbances(self, fields: Array) -> Array:
+        moved: Array = self._unforeseen(fields) @ self._readings.G.T
+        return moved
+
+    def _outputs(self, z: Array) -> Array:
+        v: Array = z @ self._readings.C.T
         return v
 
     def _pull_outputs(self, by_outputs: Array) -> Array:
         by_z: Array = by_outputs @ self._readings.C
         return by_z
-
-    def _step(self, k: int, z: Array, a: Array, fields: Array) -> Array:
-        moved: Array = self._innovations(k, fields) @ self._readings.G.T
-        return self.model.step(z, a) + moved

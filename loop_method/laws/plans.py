@@ -28,10 +28,8 @@ Nocedal, Wright, "Numerical Optimization", 2nd ed., algorithm 7.4 (L-BFGS). Grie
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +40,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_method.design.finite_horizon import cost_to_go
 from loop_method.models.base import FieldModel
-from loop_method.models.spectral import SpectralModel
-from spectral_solver.polynomial_sweep import PolynomialSweep
+from loop_method.models.sweep import Sweep, rolled, sweep_of
 
 MEMORY = 10
 """Pairs of L-BFGS."""
@@ -165,23 +162,18 @@ class Planner:
         """The plan (M, H, n_a) that ends as the affine law acts."""
         if self.around:
             return plan
-        found = plan.copy()
+        found, states = plan.copy(), self._rolled(z, plan)[0]
         with np.errstate(all="ignore"):
-            for rows in self._sweep.batches(len(z)):
-                states, _, _ = self._sweep.roll(z[rows], plan[rows], *self._feedback)
-                found[rows, -1] = self.action_set.project(self._affine(states[:, -2]))
+            found[:, -1] = self.action_set.project(self._affine(states[:, -2]))
         return found
 
     def costs(self, v: Array, z: Array, k: int) -> Array:
         """J (M,) of plans v (M, H, n_a) from states z (M, n_z) at step k; infinite if not finite."""
-        found = np.empty(len(z))
+        states, actions = self._rolled(z, v)
         with np.errstate(all="ignore"):
-            for rows in self._sweep.batches(len(z)):
-                states, _, actions = self._sweep.roll(z[rows], v[rows], *self._feedback)
-                J, _, _ = self.cost.along(states[:, :-1], actions, k)
-                found[rows] = J + self._at_end(states[:, -1], k + v.shape[1])[0]
-        found[~np.isfinite(found)] = np.inf
-        return found
+            J, _, _ = self.cost.along(states[:, :-1], actions, k)
+            J = J + self._at_end(states[:, -1], k + v.shape[1])[0]
+        return np.where(np.isfinite(J), J, np.inf)
 
     def gradient(self, v: Array, z: Array, k: int) -> tuple[Array, Array, Array]:
         """J (M,), its gradient (M, H, n_a), and the plans such that no action has to be projected.
@@ -191,17 +183,21 @@ class Planner:
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
         K, b = self._feedback
-        with np.errstate(all="ignore"):
-            for rows in self._sweep.batches(len(z)):
-                states, requested, actions = self._sweep.roll(z[rows], v[rows], K, b)
+        self._to_go  # noqa: B018 - known before several threads ask
+
+        def work(sweep: Sweep, rows: slice) -> None:
+            with np.errstate(all="ignore"):
+                states, requested, actions = sweep.roll(z[rows], v[rows], K, b)
                 costs, on_states, on_actions = self.cost.along(states[:, :-1], actions, k)
                 of_end, eta = self._at_end(states[:, -1], k + v.shape[1])
                 J[rows] = costs + of_end
                 kept[rows] = v[rows] + (actions - requested)
                 close = np.abs(requested - actions) <= _CLOSE * (1.0 + np.abs(actions))
                 seen = np.where(close, actions, requested)
-                own = self._sweep.roll_back(seen, on_states, on_actions, K, eta)
+                own = sweep.roll_back(seen, on_states, on_actions, K, eta)
                 g[rows] = np.where(self._leaves(actions, own), 0.0, own)
+
+        self._sweep.each(len(z), work)
         lost = ~(
             np.isfinite(J) & np.isfinite(g).all(axis=(1, 2)) & np.isfinite(kept).all(axis=(1, 2))
         )
@@ -280,24 +276,21 @@ class Planner:
 
     def actions_of(self, v: Array, z: Array) -> Array:
         """The actions (M, H, n_a) of plans on the model, zero where they are not finite."""
-        parts = []
-        with np.errstate(all="ignore"):
-            for rows in self._sweep.batches(len(z)):
-                parts.append(self._sweep.roll(z[rows], v[rows], *self._feedback)[2])
-        return np.nan_to_num(np.concatenate(parts), nan=0.0, posinf=0.0, neginf=0.0)
+        return np.nan_to_num(self._rolled(z, v)[1], nan=0.0, posinf=0.0, neginf=0.0)
 
     def _affine_plan(self, z: Array, H: int) -> Array:
         """The plans (M, H, n_a) with which the affine law acts on the model."""
         none = np.zeros((len(z), H, len(self.b)))
         if self.around:
             return none
-        parts = []
-        with np.errstate(all="ignore"):
-            for rows in self._sweep.batches(len(z)):
-                parts.append(self._sweep.roll(z[rows], none[rows], self.K, self.b)[2])
-        found = np.concatenate(parts)
+        found = rolled(self._sweep, len(self.b), z, none, self.K, self.b)[2]
         found[~np.isfinite(found).all(axis=(1, 2))] = 0.0
         return found
+
+    def _rolled(self, z: Array, v: Array) -> tuple[Array, Array]:
+        """States (M, H + 1, n_z) and applied actions of plans."""
+        states, _, actions = rolled(self._sweep, len(self.b), z, v, *self._feedback)
+        return states, actions
 
     def _affine(self, z: Array) -> Array:
         a: Array = np.einsum("mi,ji->mj", z, self.K) + self.b
@@ -311,12 +304,7 @@ class Planner:
 
     @cached_property
     def _sweep(self) -> Sweep:
-        steps = min(self.steps, self.cost.horizon)
-        model = self.model
-        separate = not self.action_set.zero_mean
-        if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
-            return SpectralSweep(model, self.action_set, max(steps, 1))
-        return ModelSweep(model, self.action_set)
+        return sweep_of(self.model, self.action_set, min(self.steps, self.cost.horizon))
 
     @cached_property
     def _to_go(self) -> Array | None:
@@ -352,77 +340,3 @@ class Planner:
         e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
         on_e = np.einsum("mi,ij->mj", e, self._to_go)
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
-
-
-class Sweep(Protocol):
-    """A model over many steps under a feedback, and the adjoint of the last time."""
-
-    def batches(self, count: int) -> Iterator[slice]:
-        """The rows that go together."""
-
-    def roll(self, z: Array, v: Array, K: Array, b: Array) -> tuple[Array, Array, Array]:
-        """States (M, H + 1, n_z), requested and applied actions (M, H, n_a)."""
-
-    def roll_back(
-        self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
-    ) -> Array:
-        """Derivatives (M, H, n_a) by v; eta (M, n_z): those by z_H."""
-
-
-class ModelSweep:
-    """Of any model, step by step, all rows together."""
-
-    def __init__(self, model: FieldModel, actions: ActionSet) -> None:
-        self._model, self._set = model, actions
-        self._states = self._actions = np.empty((0, 0, 0))
-
-    def batches(self, count: int) -> Iterator[slice]:
-        yield slice(0, count)
-
-    def roll(self, z: Array, v: Array, K: Array, b: Array) -> tuple[Array, Array, Array]:
-        M, H, n_a = v.shape
-        states, requested = np.empty((M, H + 1, z.shape[1])), np.empty((M, H, n_a))
-        actions = np.empty((M, H, n_a))
-        states[:, 0] = z
-        for i in range(H):
-            own = np.einsum("mi,ji->mj", states[:, i], K) + b + v[:, i]
-            requested[:, i], actions[:, i] = own, self._set.project(own)
-            states[:, i + 1] = self._model.step(states[:, i], actions[:, i])
-        self._states, self._actions = states, actions
-        return states, requested, actions
-
-    def roll_back(
-        self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
-    ) -> Array:
-        found = np.empty_like(on_actions)
-        for i in reversed(range(found.shape[1])):
-            eta, g = self._model.pull_back(self._states[:, i], self._actions[:, i], eta)
-            found[:, i] = self._set.pull_back(requested[:, i], g + on_actions[:, i])
-            eta = eta + on_states[:, i] + np.einsum("mj,ji->mi", found[:, i], K)
-        return found
-
-
-class SpectralSweep:
-    """Of a spectral model, compiled, row by row."""
-
-    def __init__(self, model: SpectralModel, actions: ActionSet, horizon: int) -> None:
-        self._compiled = PolynomialSweep(model.steps, model.fewer[:, 0], horizon)
-        self._set = actions
-        self._bounds = np.stack(
-            [np.broadcast_to(x, model.n_a) for x in (actions.low, actions.high)]
-        )
-
-    def batches(self, count: int) -> Iterator[slice]:
-        for m in range(count):
-            yield slice(m, m + 1)
-
-    def roll(self, z: Array, v: Array, K: Array, b: Array) -> tuple[Array, Array, Array]:
-        states, requested, actions = self._compiled.roll(z[0], v[0], K, b, self._bounds)
-        return states[None], requested[None], actions[None]
-
-    def roll_back(
-        self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
-    ) -> Array:
-        free = ((requested >= self._bounds[0]) & (requested <= self._bounds[1])).astype(np.float64)
-        found = self._compiled.roll_back(free[0], on_states[0], on_actions[0], K, eta[0])
-        return found[None]

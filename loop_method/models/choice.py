@@ -5,7 +5,8 @@ Each kind is fitted to some of the rollouts and judged by the error E of its pre
 from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
 share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
 ten times its share of the states up to `reproduced_noisy`, is selected; if there is none, the one with
-the fewest unknowns that is not `better` times worse than the best. It is then fitted to all rollouts.
+the fewest unknowns that is not `better` times worse than the best. Squares alone are selected at a
+hundredth of that E, or if cubes as well are not `better`. It is then fitted to all rollouts.
 """
 
 from __future__ import annotations
@@ -153,12 +154,16 @@ def fit_field_model(
                 error, own[kind] = found
                 error = own[kind].simulated if by_scale else error
                 judged[kind] = error
-                if error <= settings.reproduced:
+                if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
                     break
         if not judged:
             return None
-        enough = max(settings.reproduced, settings.better * min(judged.values()))
-        good = [kind for kind, error in judged.items() if error <= enough]
+        near = settings.better * min(judged.values())
+        good = [
+            kind
+            for kind, error in judged.items()
+            if error <= max(settings.reproduced * kind.enough, near)
+        ]
         for kind in sorted(good, key=lambda kind: kind.unknowns):
             model = _fitted(kind, rollouts, noise)
             if model is not None:

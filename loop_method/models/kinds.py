@@ -33,9 +33,9 @@ _CONVOLUTION_RIDGE = 1e-9
 """Ridge of convolution models."""
 
 FORMS = (
+    Form(name="poly2", degree=2),
     Form(name="poly3", degree=3),
     Form(name="front2", degree=2, linear_order=2, shares=(8,)),
-    Form(name="poly2", degree=2),
     Form(name="poly7", degree=7),
     Form(name="nonlocal2", degree=2, hilbert=True),
     Form(name="nonlocal3", degree=3, hilbert=True),
@@ -49,6 +49,8 @@ NEAR_RIDGES = {"near-shared": None, "near1e-9": 1e-9}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
 SPARSE = {"sparse-map": True, "sparse": False}
 LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
+SQUARES_ENOUGH = 0.01
+"""`enough` of an equation with squares alone, as cubes may be small where it was measured."""
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
 
@@ -69,6 +71,8 @@ class Kind:
         it, `fit` is given the denoised states.
     needed : float
         It is tried only where the best E so far is larger.
+    enough : float
+        Share of `reproduced` at which it is selected before others are tried.
     """
 
     name: str
@@ -76,6 +80,7 @@ class Kind:
     unknowns: tuple[float, int]
     fit_noisy: Callable[[Sequence[Measured], float], FieldModel | None] | None = None
     needed: float = 0.0
+    enough: float = 1.0
 
 
 def kinds_of(
@@ -124,13 +129,14 @@ def kinds_of(
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
     fit = partial(fit_spectral, form=form, settings=settings)
+    enough = SQUARES_ENOUGH if form is FORMS[0] else 1.0
     if form.free != "none":
         return Kind(form.name, fit, form.unknowns)
 
     def noisy(rollouts: Sequence[Measured], noise: float) -> FieldModel | None:
         return fit_noisy(rollouts, form, settings, noise)
 
-    return Kind(form.name, fit, form.unknowns, noisy)
+    return Kind(form.name, fit, form.unknowns, noisy, enough=enough)
 
 
 def _linear(n_z: int, settings: FieldModelSettings) -> list[Kind]:

@@ -63,13 +63,12 @@ def test_burgers_is_recovered_with_its_coefficients():
     equation = BurgersModes(viscosity=1e-2)
     rollouts, target = explored(equation, 0.05, 20, 3)
     fitted = fit_field_model(rollouts[:2], target)
-    assert fitted.error < 1e-5 and [kind for kind, _ in fitted.candidates] == ["poly3"]
+    assert fitted.error < 1e-5 and [kind for kind, _ in fitted.candidates] == ["poly2"]
     k = 2 * np.pi * WAVES
     low = slice(1, 8)
-    linear, squares, cubes = fitted.model.symbols
+    linear, squares = fitted.model.symbols
     np.testing.assert_allclose(linear[low], -0.05 * 1e-2 * k[low] ** 2, rtol=1e-3)
     np.testing.assert_allclose(squares[low], -0.05 * 0.5j * k[low], rtol=1e-3)
-    assert np.abs(cubes[low]).max() < 1e-3 * np.abs(squares[low]).max()
     assert errors(fitted.model, rollouts[2:], target, 2.0)[0] < 1e-5
     # The rate of u u_x is in proportion to u: half of the field needs half of the steps.
     whole = fitted.model.substeps
@@ -83,7 +82,7 @@ def test_burgers_is_recovered_with_its_coefficients():
     "equation, sample_time, steps, kind, error",
     [
         (AllenCahnModes(), 0.01, 1, "poly3", 1e-6),
-        (KortewegDeVriesModes(), 0.01, 10, "poly3", 1e-4),
+        (KortewegDeVriesModes(), 0.01, 10, "poly2", 1e-4),
         (equations.BenjaminOno(), 0.05, 5, "nonlocal2", 1e-3),
         (equations.BenjaminBonaMahony(), 0.1, 2, "free2", 1e-5),
         (equations.SineReaction(), 0.02, 1, "poly7", 2e-3),
