@@ -21,7 +21,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.colour_scale import field_range
 from pde_sim_node.plant import Plant
 from pdeloop.report import planes
-from pdeloop.report.places import beside, mark_places
+from pdeloop.report.places import beside, mark_places, moving_target
 from pdeloop.report.style import FIELD_MAP, image
 
 DOTS = 100
@@ -64,7 +64,7 @@ class Frames:
         fields: Array | None = None,
         largest: float = 0.0,
     ) -> None:
-        self._plant, self._fields = plant, fields
+        self._plant, self._fields, self._moving = plant, fields, moving_target(plant)
         grid, count = plant.grid, len(titles)
         self._flat = len(grid.axes) > 1
         kept = 0 if fields is None else 1
@@ -97,7 +97,7 @@ class Frames:
                     own = axes[i * rows // len(grid.components) :, c].tolist()
                     self._shows[c].append(self._begin(own, c, i, colour))
                 axes[0, c].set_title(title, fontsize=9)
-                self._bars.append(_actions(axes[-1, c], plant.n_a, colour, largest))
+                self._bars.append(_actions(axes[-1, c], plant, colour, largest))
             if self._flat:
                 self._targets(axes[:, -1].tolist())
             for ax in axes[:, 1:count].ravel() if count > 1 else ():
@@ -146,16 +146,19 @@ class Frames:
         grid, target = self._plant.grid, self._target(component)
         axis = grid.line
         mark_places(ax, self._plant, component)
-        ax.plot(axis.points, target, "--", color="0.45", lw=1)
+        own, moving = grid.part(component), self._moving
+        (dashes,) = ax.plot(axis.points, target, "--", color="0.45", lw=1)
         (line,) = ax.plot(axis.points, target, color=colour, lw=1.5)
         ax.set(ylabel=grid.components[component], xlabel=axis.label, xlim=(0, axis.length))
-        ax.set_ylim(_around(target))
+        ax.set_ylim(_around(target if moving is None else moving[:, own]))
         if self._fields is not None:
             with np.errstate(invalid="ignore"):
-                _grow(ax, self._fields[..., grid.part(component)])
+                _grow(ax, self._fields[..., own])
 
         def show(k: int, values: Array) -> None:
             line.set_ydata(values)
+            if moving is not None:
+                dashes.set_ydata(moving[min(k, len(moving) - 1), own])
             _grow(ax, values)
 
         return show
@@ -166,7 +169,8 @@ class Frames:
         own = self._plant.grid.part(component)
         whole = self._fields[column, :, own].T
         axis, end = self._plant.grid.line, self._plant.sample_time * (whole.shape[1] - 1)
-        low, high = field_range(self._fields[..., own], self._target(component))
+        target = self._target(component) if self._moving is None else self._moving[:, own]
+        low, high = field_range(self._fields[..., own], target)
         so_far = np.full_like(whole, np.nan)
         extent = (0.0, end, 0.0, axis.length)
         drawn = image(ax, so_far, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
@@ -177,7 +181,7 @@ class Frames:
             so_far[:, : k + 1], so_far[:, k + 1 :] = whole[:, : k + 1], np.nan
             drawn.set_data(so_far)
 
-        if column == len(self._fields) - 1:
+        if column == len(self._fields) - 1 and self._moving is None:
             beside(ax, self._target(component), (low, high), axis.length)
         return show
 
@@ -220,12 +224,20 @@ class Frames:
         return self._plant.field_target[self._plant.grid.part(component)]
 
 
-def _actions(ax: Axes, n_a: int, colour: str, largest: float) -> tuple[Any, Axes]:
-    """A bar for each actuator."""
-    bars = ax.bar(np.arange(1, n_a + 1), np.zeros(n_a), color=colour)
+def _actions(ax: Axes, plant: Plant, colour: str, largest: float) -> tuple[Any, Axes]:
+    """A bar for each actuator, and its bounds where they are not far away."""
+    numbers, allowed = np.arange(1, plant.n_a + 1), plant.action_set
+    bars = ax.bar(numbers, np.zeros(plant.n_a), color=colour)
     ax.axhline(0.0, color="0.5", lw=0.7)
-    most = 1.05 * largest or 0.1
-    ax.set(xlabel="actuator", ylabel="action", ylim=(-most, most))
+    low, high = -1.05 * largest or -0.1, 1.05 * largest or 0.1
+    for bound in (np.broadcast_to(b, plant.n_a) for b in (allowed.low, allowed.high)):
+        bound = np.where(np.isfinite(bound), bound, np.nan)
+        ax.hlines(bound, numbers - 0.45, numbers + 0.45, color="0.35", ls=":", lw=1.1)
+    if allowed.low.min() >= 0.0:  # the half that no action reaches
+        low = 0.1 * low
+    if allowed.high.max() <= 0.0:
+        high = 0.1 * high
+    ax.set(xlabel="actuator", ylabel="action", ylim=(low, high))
     ax.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     return bars, ax
 

@@ -23,6 +23,7 @@ from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.environments import environment_id
 from pdeloop.environments.picture import Picture
+from pdeloop.frames import Frames
 
 BURGERS = "pdeloop/Burgers-v0"
 GRID: dict[str, Any] = {"n_z": 32, "horizon": 4}
@@ -157,3 +158,33 @@ def test_what_is_drawn_is_not_part_of_the_episode() -> None:
     for _ in range(GRID["horizon"]):
         env.render()
         assert np.array_equal(env.step(np.ones(6))[0], plant.step(np.ones((1, 6)))[0])
+
+
+class Tracks(pdeloop.Dynamics):
+    """Eight cells whose target moves, with two heaters of 0 to 2."""
+
+    n_z, n_a, horizon, sample_time = 8, 2, 6, 1.0
+    state_weight, action_weight = 1.0, 1.0
+    action_low, action_high = 0.0, 2.0
+
+    def __init__(self) -> None:
+        self.target = np.outer(np.arange(7.0), np.ones(8))
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.normal(size=8)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return 0.5 * z + a.sum()
+
+
+def test_a_picture_has_the_target_of_its_step_and_the_bounds_of_its_actuators() -> None:
+    frames = Frames(as_plant(Tracks()), largest=1.0)
+    field, actions = frames._canvas.figure.axes
+    for step in (0, 4, 6):
+        frames.draw(np.zeros((1, 8)), np.zeros((1, 2)), step)
+        dashed = next(line for line in field.lines if line.get_linestyle() == "--")
+        np.testing.assert_array_equal(dashed.get_ydata(), np.full(8, float(step)))
+    drawn = {
+        float(y) for lines in actions.collections for _, y in np.concatenate(lines.get_segments())
+    }
+    assert drawn == {0.0, 2.0}
