@@ -296,8 +296,9 @@ def identify_data(
     delays = study_delays(found.trajectories, used)
     if input_delay is None:
         used = delays.best
-    elif better := delays.text(found.channels, found.sample_time):
-        found = replace(found, remarks=(*found.remarks, better))
+    if input_delay is not None or delays.alike:
+        better = delays.text(found.channels, found.sample_time)
+        found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     return _identified(
         found.trajectories,
         found.target,

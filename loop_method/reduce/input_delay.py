@@ -62,12 +62,14 @@ class DelayStudy:
     """The delay of each input that fits the data best.
 
     best: 0 of each where no other one is better beyond chance; error: of single steps with `best`,
-    relative to that with the delays in use, the root of the mean square over channels.
+    relative to that with the delays in use, the root of the mean square over channels; alike: other
+    delays that the data do not tell apart from `best`, each with a likelihood within EVIDENCE of it.
     """
 
     best: Delays
     used: Delays
     gain: float = 1.0
+    alike: tuple[Delays, ...] = ()
 
     def text(self, channels: Channels = NUMBERED, sample_time: float | None = None) -> str:
         """One sentence on what is better than the delays in use; empty if nothing is."""
@@ -87,11 +89,20 @@ class DelayStudy:
             why.append(f"the plant has a dead time{times}, or the log is ahead of it")
         if min(self.best) < 0:
             why.append("a row has the input that led to its state, logged late")
-        value = ",".join(map(str, self.best[:1] if len({*self.best}) == 1 else self.best))
-        return (
-            f"the data fit {self.gain:.3g} times better with {' and '.join(parts)}, so "
-            f"{' and '.join(why)}: give --input-delay={value}"
-        )
+        fit = f"the data fit {self.gain:.3g} times better with {' and '.join(parts)}, so "
+        if self.alike:
+            others = " or ".join(map(_value, self.alike[:3]))
+            return (
+                f"{fit}{' and '.join(why)}; how many rows is not clear, as the data do not tell "
+                f"{_value(self.best)} and {others} apart: log more steps or less noise, or give the "
+                f"number that is known, as --input-delay={_value(self.best)}"
+            )
+        return f"{fit}{' and '.join(why)}: give --input-delay={_value(self.best)}"
+
+
+def _value(delays: Delays) -> str:
+    """Delays as --input-delay takes them."""
+    return ",".join(map(str, delays[:1] if len({*delays}) == 1 else delays))
 
 
 def _rows(count: int) -> str:
@@ -164,7 +175,13 @@ def study_delays(
             best = better
         if not data.is_better(best, used):  # both steps together, of which each was
             best = used
-        return DelayStudy(best, used, data.gain(best, used))
+        near = data.likelihood(best) - EVIDENCE
+        alike = (
+            ()
+            if best == used
+            else tuple(other for other in others if other != best and data.likelihood(other) > near)
+        )
+        return DelayStudy(best, used, data.gain(best, used), alike)
 
 
 @dataclass(frozen=True, eq=False)

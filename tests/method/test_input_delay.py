@@ -129,3 +129,21 @@ def test_shifts_need_rows() -> None:
     z, a = logged((0, 0), steps=5)
     with pytest.raises(ValueError, match="no trajectory has more steps"):
         shifted([(z, a)], (5, 0))
+
+
+@pytest.mark.parametrize(("noise", "held"), [(3.0, 1), (3.0, 5), (1.0, 12), (3.0, 12)])
+def test_a_delay_that_the_data_do_not_tell_from_others_is_not_clear(
+    noise: float, held: int
+) -> None:
+    found = [study_delays([logged((3, 3), noise=noise, held=held, seed=s)]) for s in range(10)]
+    sure = [study.best for study in found if any(study.best) and not study.alike]
+    assert set(sure) <= {(3, 3)}
+    for study in found:
+        assert ("not clear" in study.text()) == bool(study.alike)
+        assert study.best not in study.alike
+    if held > 1:  # neighbouring delays have nearly the same inputs
+        assert any(study.alike for study in found)
+
+
+def test_a_delay_with_little_noise_is_clear() -> None:
+    assert study_delays([logged((3, 3))]).alike == ()
