@@ -79,7 +79,7 @@ def _for_loop(file: ParameterFile, namespace: str) -> dict[str, Any]:
             if of_ros(name) or letter not in takers.get(name, next(free, letter)):
                 continue
             other, known = found.setdefault(name, (node, value))
-            if known != value:
+            if known is not value and known != value:  # nan differs from itself
                 raise ParameterError(
                     f"{file.path} has '{name}' as {shown(known)} for {other} and as {shown(value)} for "
                     f"{node}; expected one value"

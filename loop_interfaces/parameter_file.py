@@ -201,7 +201,7 @@ def _add(block: Block, body: yaml.MappingNode, group: str) -> None:
                 block.misread = f"has lists within the list '{name}' in line {_line(node)}"
         else:
             value = _value(name, node)
-        if name in values and _type(values[name]) != _type(value):
+        if name in values and (_type(values[name]), values[name]) != (_type(value), value):
             block.misread = (
                 f"has '{name}' as {shown(values[name])} and as {shown(value)} in line "
                 f"{_line(node)}; remove one of them"

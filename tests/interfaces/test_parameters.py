@@ -258,6 +258,11 @@ def test_a_file_for_a_whole_system_is_read_as_the_nodes_read_it(tmp_path, text):
         ),
         ("/**: {ros__parameters: {a: 1}, camera: {ros__parameters: {b: 2}}}", "put them before it"),
         ("/**: {ros__parameters: {horizon: 3, horizon: 3.5}}", "'horizon' as 3 and as 3.5"),
+        (
+            "/**: {ros__parameters: {horizon: 20, horizon: 30}}",
+            "'horizon' as 20 and as 30 in line 1",
+        ),
+        ("/**: {ros__parameters: {a: {b: 1}, a.b: 2}}", "'a.b' as 1 and as 2 in line 1"),
         ("/**: {ros__parameters: {pairs: [[a]]}}", "has lists within the list 'pairs'"),
         ("/**: {ros__parameters: {pairs: [a, 1]}}", "several types"),
         ("/**: {ros__parameters: {physical: {}}}", "empty group 'physical'"),
@@ -372,3 +377,10 @@ def test_other_nodes_read_the_ranges_of_all_parameters():
             assert found.from_value == (found.from_value if spec.minimum is None else spec.minimum)
             assert found.to_value == (found.to_value if spec.maximum is None else spec.maximum)
             assert found.from_value <= spec.default <= found.to_value, spec
+
+
+def test_a_number_that_differs_from_itself_is_refused_as_what_it_is(tmp_path):
+    path = tmp_path / "nan.yaml"
+    path.write_text("/**: {ros__parameters: {equation: burgers, state_weight: .nan}}\n")
+    with pytest.raises(Refused, match="'state_weight' is nan; expected a number above 0"):
+        load_parameters(str(path), {})
