@@ -25,7 +25,7 @@ class Logistic:
     """z' = r z (1 - z) at every point, chaotic at r = 3.9 and at rest in 1 - 1/r at r = 2.5."""
 
     r: float
-    n_a = 1
+    n_z, n_a = N_Z, 1
 
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         return self.r * states * (1.0 - states)
@@ -62,7 +62,7 @@ def test_fields_from_which_the_plant_diverges_say_nothing() -> None:
 class Falling:
     """z' = 1.1 z + z^3: small changes grow, as of a chaotic plant, and from far it falls for good."""
 
-    n_a = 1
+    n_z, n_a = N_Z, 1
 
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         return 1.1 * states + states**3
