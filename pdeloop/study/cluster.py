@@ -84,6 +84,8 @@ class Cluster(Workers):
     def submit(
         self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
     ) -> None:
+        from distributed.protocol import pickle
+
         dataset = f"pdeloop/{self._study}/{identity}/{name}"
         only = [at for at, own in self._kinds.items() if own == kind]
         self._only[name] = only if len(self.environments) > 1 else []
@@ -96,8 +98,7 @@ class Cluster(Workers):
                     on_worker,
                     self._topic,
                     name,
-                    task,
-                    *arguments,
+                    pickle.dumps((task, arguments)),  # Dask looks into every argument for its own
                     key=f"pdeloop-{name}-{uuid4().hex}",
                     retries=0,
                     workers=self._only[name] or None,
@@ -120,7 +121,7 @@ class Cluster(Workers):
             event = self._events.popleft()
             worker, name = event.get("worker", ""), event.get("name", "")
             match event["action"]:
-                case "began":
+                case "began" if name in self._at:  # and has not ended since
                     self._running[worker].add(name)
                     self._progress[name] = deque(maxlen=LINES)
                 case "row" if name in self._progress:
@@ -225,9 +226,13 @@ class Cluster(Workers):
                 own.set_result(found)
 
 
-def on_worker(topic: str, name: str, task: Callable[..., Ended], *arguments: Any) -> Ended:
-    """Carry out a task on a worker, which tells the driver how far it is."""
+def on_worker(topic: str, name: str, pickled: bytes) -> Ended:
+    """Carry out a task on a worker, which tells the driver how far it is.
+
+    pickled: the task and its arguments.
+    """
     from distributed import get_worker
+    from distributed.protocol import pickle
 
     worker = get_worker()
     told_at = float("-inf")
@@ -247,7 +252,8 @@ def on_worker(topic: str, name: str, task: Callable[..., Ended], *arguments: Any
     training.work_in(worker.local_directory)
     try:
         with training.listening(hear):
-            return task(*arguments)
+            task, arguments = pickle.loads(pickled)
+            return task(*arguments)  # type: ignore[no-any-return]
     finally:
         tell("ended")
 
