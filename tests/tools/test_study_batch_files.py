@@ -92,8 +92,8 @@ def test_a_slurm_job_that_loses_workers_and_its_time_is_submitted_again(
         until(lambda: status(out)["finished"] > 0, LIMIT, "result")
     finally:
         end(job)
-    known = status(out)
-    assert known["workers_lost"] > 0 and not known["running"]
+    until(lambda: not status(out)["running"], LIMIT, "end of the driver")
+    assert status(out)["workers_lost"] > 0
     job = submitted()
     try:
         assert job.wait(LIMIT) == 0, (tmp_path / "log").read_text()
