@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 .SHELLFLAGS := -o pipefail -c
-# Python must not import from this folder by chance (loop_interfaces/module_path.py).
+# Python must not import from this folder by chance (pdeloop/process/module_path.py).
 export PYTHONSAFEPATH := 1
 # What hundreds of processes import is compiled once, also where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE

@@ -19,10 +19,10 @@ from collections.abc import Callable, Sequence
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from loop_interfaces.module_path import PROJECT
-from loop_interfaces.start import begin
 from pdeloop.cli import run
 from pdeloop.output import print_json
+from pdeloop.process.module_path import PROJECT
+from pdeloop.process.start import begin
 
 PROGRAMS = {
     "first_run": "where the first `make run` in a fresh clone spends its time",

@@ -18,11 +18,11 @@ from stable_baselines3 import PPO, SAC
 
 import pdeloop
 from benchmarks.processes import markdown, shown
-from loop_interfaces.arrays import Array
 from pde_sim_node.build import build_plant
 from pdeloop.environments import warm_start
 from pdeloop.environments.stable_baselines import VecEnvironment
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.arrays import Array
 
 ALGORITHMS = {"ppo": PPO, "sac": SAC}
 STARTS = ("cold", "path", "frozen", "cloned")

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants.boundary import BoundaryControlled
+from pdeloop.messages.arrays import Array
 
 
 def transport_gain(beta: Array) -> Array:

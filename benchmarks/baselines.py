@@ -28,13 +28,13 @@ import scipy
 
 from benchmarks.limits import find
 from benchmarks.methods import LIBRARIES, METHODS, measure
-from loop_interfaces.arrays import Array
-from loop_interfaces.controllers import CONTROLLERS
-from loop_interfaces.parameters import table as parameters
-from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import read_document
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import interval
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.controllers import CONTROLLERS
+from pdeloop.messages.parameters import table as parameters
+from pdeloop.messages.problem import load_parameters
+from pdeloop.messages.spec import read_document
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import local_workers as pool

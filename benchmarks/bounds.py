@@ -5,8 +5,8 @@ Both are those of a training's closed loop with the plant itself in place of its
 limits and measurement noise count, and with exact derivatives:
 
 - the law a = K_a U^T z + b of least mean cost over many initial fields, with U as a training begins
-  with it, by the descent of the trainings (`loop_method.adapt.improve`), repeated with new coordinates
-  until it gains nothing more, from the first law or from zero, whichever leads further,
+  with it, by the descent of the trainings (`pdeloop.method.adapt.improve`), repeated with new
+  coordinates until it gains nothing more, from the first law or from zero, whichever leads further,
 - the inputs of least cost for known initial fields, without noise, as a_k = K_a U^T z_k + b + v_k
   around that law, by L-BFGS on all v_k: where the plant is unstable, the cost is a gentler function of
   v than of a. No controller can do better, up to local optima.
@@ -25,18 +25,18 @@ from benchmarks.descent import Descent, descend
 from benchmarks.families.cases import Case
 from benchmarks.true_model import TrueModel
 from benchmarks.warm_start import warm_start
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.one_thread import one_thread
-from loop_interfaces.parameters import INSTRUMENTS
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import cheapest, curvature_of, improve
-from loop_method.adapt.settings import ImprovementSettings
-from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.parameters import INSTRUMENTS
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.improve import cheapest, curvature_of, improve
+from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.seeds import Purpose, derive
+from pdeloop.process.one_thread import one_thread
 
 __all__ = [
     "TRAINING_SEED",

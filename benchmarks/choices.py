@@ -29,16 +29,16 @@ from numpy.typing import NDArray
 import pdeloop
 from benchmarks.bounds import evaluation_seeds
 from benchmarks.families.cases import CASES, Case
-from loop_interfaces.arrays import Array
-from loop_interfaces.files import make_folder, write_atomically
-from loop_method.adapt.belief import Belief
-from loop_method.adapt.estimate import mean_of
-from loop_method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
-from loop_method.models import affine_law
-from loop_method.models.base import saturated
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.files import make_folder, write_atomically
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.estimate import mean_of
+from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
+from pdeloop.method.models import affine_law
+from pdeloop.method.models.base import saturated
 from pdeloop.study.executors import processes
 from tuner_node.build import build_training
 from tuner_node.optimizer_context import context_of

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
 
 __all__ = ["Descent", "descend"]
 

@@ -51,14 +51,14 @@ from benchmarks.bounds import (
     loop_of,
 )
 from benchmarks.families.cases import case_of
-from loop_interfaces.arrays import Array
-from loop_interfaces.one_thread import one_thread
-from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.settings import ModelBasedSettings
 from pde_sim_node.build import build_plant
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import Law, rollout
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.improve import curvature_of, improve
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.process.one_thread import one_thread
 
 __all__ = ["run", "text"]
 

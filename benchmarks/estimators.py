@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_method.design.lqt import Gains
-from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants import SpectralPlant
 from pdeloop.episode import Law
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.method.design.lqt import Gains
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 
 class Experiment(NamedTuple):

@@ -19,12 +19,12 @@ from scipy import linalg
 import pdeloop
 from benchmarks.families import plants
 from benchmarks.families.cases import CASES, Case
-from loop_interfaces.action_set import ANY_ACTION
-from loop_interfaces.arrays import Array
-from loop_method.design.finite_horizon import finite_horizon
-from loop_method.models import FittedModel, Measured, affine_law, fit_field_model
-from loop_method.models.base import Law, saturated
-from loop_method.models.prediction import errors
+from pdeloop.messages.action_set import ANY_ACTION
+from pdeloop.messages.arrays import Array
+from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.models import FittedModel, Measured, affine_law, fit_field_model
+from pdeloop.method.models.base import Law, saturated
+from pdeloop.method.models.prediction import errors
 
 __all__ = ["run", "text"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.processes import BenchError, machine, markdown
-from loop_interfaces.module_path import PROJECT
+from pdeloop.process.module_path import PROJECT
 
 PARTS = {"start (": "compile", "identify": "start-up", "adapt": "first law"}
 """The phases, in order, each by the beginning of the line that is printed at its end."""

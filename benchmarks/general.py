@@ -31,7 +31,7 @@ from benchmarks.families import process
 from benchmarks.families.cases import CASES, PROCESS_CASES, Case
 from benchmarks.families.references import reference_costs
 from benchmarks.kept import kept_row, rows_of
-from loop_interfaces.files import read_json
+from pdeloop.messages.files import read_json
 from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from loop_interfaces.files import make_folder, read_json, write_atomically
+from pdeloop.messages.files import make_folder, read_json, write_atomically
 from pdeloop.study.executors import processes
 
 Row = dict[str, Any]

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.module_path import safe_environment
 from pde_sim_node.equations import EQUATIONS, Equation
 from pde_sim_node.supports import indicator_supports
-from spectral_solver.reference import ReferenceStep
+from pdeloop.process.module_path import safe_environment
+from pdeloop.solver.reference import ReferenceStep
 
 BATCHES = (1, 2, 12, 64)
 SECONDS = 0.25

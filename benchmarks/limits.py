@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.files import read_json
-from loop_interfaces.parameters import PROBLEM
-from loop_interfaces.spec import Spec
 from pde_sim_node.build import build_equation, build_plant
 from pdeloop.episode import mean_field_cost
+from pdeloop.messages.files import read_json
+from pdeloop.messages.parameters import PROBLEM
+from pdeloop.messages.spec import Spec
 
 __all__ = ["FOLDER", "content", "find"]
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.problem import load_parameters
-from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pdeloop.episode import Law, rollout
+from pdeloop.messages.problem import load_parameters
+from pdeloop.method.seeds import Purpose, derive
 from pdeloop.unstable_modes import linearisation
 
 FIELDS = 10

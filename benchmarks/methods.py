@@ -20,17 +20,17 @@ from benchmarks.estimators import Experiment, Identified, KalmanLaw, LikeliestFi
 from benchmarks.warm_start import warm_start
 from controller_node.identification import identify
 from controller_node.policy import excitation
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import unpack
-from loop_interfaces.one_thread import one_thread
-from loop_method.design import lqt
-from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, projected_law, rollout
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import unpack
+from pdeloop.method.design import lqt
+from pdeloop.method.seeds import Purpose, derive
+from pdeloop.process.one_thread import one_thread
 from pdeloop.study.training import environment
 from tuner_node.build import build_training
 

@@ -38,11 +38,11 @@ from benchmarks.bounds import (
 )
 from benchmarks.descent import WINDOW, Descent
 from benchmarks.limits import content
-from loop_interfaces.arrays import Array
-from loop_interfaces.files import make_folder
-from loop_interfaces.one_thread import one_thread
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.files import make_folder
+from pdeloop.messages.problem import load_parameters
+from pdeloop.process.one_thread import one_thread
 from pdeloop.reproduction import PAPER
 from pdeloop.study.executors import processes
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.processes import Bench, BenchProcess, bench, program, progress
-from loop_interfaces.affinity import usable_cores
 from pdeloop.pairs import pair_cores, pair_nodes
+from pdeloop.process.affinity import usable_cores
 from pdeloop.supervisor import keep_on
 
 READER = "benchmarks.reader"

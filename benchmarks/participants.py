@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.processes import BenchError, BenchProcess, bench, ended_well, machine, table
-from loop_interfaces.problem import config_folder
+from pdeloop.messages.problem import config_folder
 from pdeloop.pairs import PAIR, namespaces, ros_value
 
 SERVER = "fast-discovery-server"

@@ -16,11 +16,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.isolation import loopback_environment
-from loop_interfaces.module_path import PROJECT, safe_environment
-from loop_interfaces.problem import find_problem
-from loop_interfaces.start import die_with
 from pdeloop.domain import given_domain, own_domain
+from pdeloop.messages.problem import find_problem
+from pdeloop.process.isolation import loopback_environment
+from pdeloop.process.module_path import PROJECT, safe_environment
+from pdeloop.process.start import die_with
 from pdeloop.supervisor import START, node_arguments
 
 ANSWER = 300.0

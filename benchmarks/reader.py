@@ -21,8 +21,8 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from visualization_msgs.msg import Marker
 
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.topics import VIEW_NUMBERS
+from pdeloop.messages.topics import VIEW_NUMBERS
+from pdeloop.process.isolation import keep_on_this_machine
 
 
 @functools.cache

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.processes import BenchError, bench, machine, table
-from loop_interfaces.affinity import least_busy_cores
-from loop_interfaces.problem import load_parameters
+from pdeloop.messages.problem import load_parameters
+from pdeloop.process.affinity import least_busy_cores
 
 PROBLEM = "burgers"
 RATES = (20.0, 1000.0)

@@ -30,13 +30,13 @@ from torch import set_num_threads
 
 from benchmarks.methods import training_field
 from benchmarks.warm_start import warm_start
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import unpack
 from pde_sim_node.build import build_plant
 from pdeloop.environments.signals import mean_field_error
 from pdeloop.environments.stable_baselines import VecEnvironment
 from pdeloop.episode import Law
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import unpack
 
 PENALTY = 100.0
 """The cost of a diverged episode, in stage costs of the mean initial field."""

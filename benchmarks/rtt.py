@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.processes import Bench, BenchProcess, bench, machine, table
-from loop_interfaces.affinity import least_busy_cores
-from loop_interfaces.problem import load_parameters
+from pdeloop.messages.problem import load_parameters
 from pdeloop.pairs import pair_cores, pair_nodes
+from pdeloop.process.affinity import least_busy_cores
 
 PROBLEM = "allen-cahn"
 """P2: of the paper's problems the one whose step is shortest."""

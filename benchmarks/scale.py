@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import pdeloop
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import STATE
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import STATE
 
 __all__ = ["run", "text"]
 

@@ -29,7 +29,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.processes import markdown
-from loop_interfaces.affinity import usable_cores
+from pdeloop.process.affinity import usable_cores
+from pdeloop.solver.workers import use_cores
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import local_workers
@@ -37,7 +38,6 @@ from pdeloop.study.results import Ended, reading
 from pdeloop.study.run import Pool, ended_well
 from pdeloop.study.status import status
 from pdeloop.study.training import train_one
-from spectral_solver.workers import use_cores
 
 SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 20}
 DRIVER_KILLS = 2

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_method.models.base import linearised
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.base import linearised
 
 __all__ = ["TrueModel"]
 
 
 class TrueModel:
-    """A plant that has exact derivatives as a `loop_method.models.FieldModel`.
+    """A plant that has exact derivatives as a `pdeloop.method.models.FieldModel`.
 
     The steps and derivatives of a `Dynamics` must take batches.
     """

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from loop_interfaces.spec import OPTIMIZER_SETTINGS
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.spec import OPTIMIZER_SETTINGS
 from tuner_node.build import build_training
 from tuner_node.training import Training
 

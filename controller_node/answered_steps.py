@@ -8,8 +8,8 @@ two alone is none: a second controller may have answered the others, or a second
 
 from typing import TypeAlias
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import VOID
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import VOID
 
 Ids: TypeAlias = tuple[int, int, int]
 """Run, plant and episode."""

@@ -2,8 +2,8 @@
 """Controller status for /diagnostics. Pure."""
 
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
-from loop_interfaces.episodes import episode_name
+from pdeloop.messages.diagnostics import ConditionTimer, Level, Rate, Status
+from pdeloop.messages.episodes import episode_name
 
 SILENT = 5.0
 """Seconds without a state, within an episode, after which the plant counts as silent."""

@@ -7,11 +7,11 @@ import numpy as np
 
 from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitations
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import KEPT_ARRAY, Frame
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.signature import design_digest, digest_of, signature
-from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import KEPT_ARRAY, Frame
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.signature import design_digest, digest_of, signature
+from pdeloop.messages.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
 
 
 class Exploration:

@@ -13,13 +13,13 @@ from controller_node import law
 from controller_node.law import LAW, act
 from controller_node.policy import ProjectedLaw
 from controller_node.responder import Responder
-from fast_path import channel
-from fast_path.handler import FastPath, fast_handler, plan_type
-from fast_path.messages import FIRST, STEP, TIME, write_answer
-from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
-from loop_interfaces.jit.cache import jit_in_closure
-from loop_interfaces.jit.simd import load_unaligned
-from loop_interfaces.topics import ACTION
+from pdeloop.fast_path import channel
+from pdeloop.fast_path.handler import FastPath, fast_handler, plan_type
+from pdeloop.fast_path.messages import FIRST, STEP, TIME, write_answer
+from pdeloop.jit.cache import jit_in_closure
+from pdeloop.jit.simd import load_unaligned
+from pdeloop.messages.frames import MAX_ID, ArrayCodec, Frame
+from pdeloop.messages.topics import ACTION
 
 PLAN = plan_type(
     ("law", LAW),

@@ -12,30 +12,30 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import axes_of
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.one_thread import one_thread
-from loop_interfaces.parameters import model_order
-from loop_interfaces.signature import CONSTANTS
-from loop_interfaces.spec import IDENTIFICATION_SETTINGS
-from loop_method.design import lqg, lqt
-from loop_method.design.dead_time import with_dead_time
-from loop_method.design.field_law import FieldLaw, field_law
-from loop_method.design.lqt import DesignError
-from loop_method.laws.registry import law_kind
-from loop_method.method_settings import field_model_settings
-from loop_method.models import FieldModelSettings
-from loop_method.reduce import dmdc, regression
-from loop_method.reduce.channels import NUMBERED, Channels
-from loop_method.reduce.identifiability import Identifiability, examine
-from loop_method.reduce.input_delay import shifted, study_delays
-from loop_method.reduce.order import study_orders
-from loop_method.reduce.reduced_model import ReducedModel
-from loop_method.reduce.settings import DEFAULTS, IdentificationSettings
-from loop_method.reduce.subspace import InnovationModel, subspace_model
-from loop_method.settings import settings_from
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import axes_of
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.parameters import model_order
+from pdeloop.messages.signature import CONSTANTS
+from pdeloop.messages.spec import IDENTIFICATION_SETTINGS
+from pdeloop.method.design import lqg, lqt
+from pdeloop.method.design.dead_time import with_dead_time
+from pdeloop.method.design.field_law import FieldLaw, field_law
+from pdeloop.method.design.lqt import DesignError
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.method_settings import field_model_settings
+from pdeloop.method.models import FieldModelSettings
+from pdeloop.method.reduce import dmdc, regression
+from pdeloop.method.reduce.channels import NUMBERED, Channels
+from pdeloop.method.reduce.identifiability import Identifiability, examine
+from pdeloop.method.reduce.input_delay import shifted, study_delays
+from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.reduced_model import ReducedModel
+from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
+from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
+from pdeloop.method.settings import settings_from
+from pdeloop.process.one_thread import one_thread
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class DesignSettings:
     measurement_noise : float
         Standard deviation of the noise on every number of the states, for "field"; 0: none.
     cost : sequence of str
-        The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it.
+        The whole cost (`pdeloop.messages.cost.Cost.texts`) where the weights do not say it.
     identification : {"field", "regression", "subspace", "dmdc"}
         "field": the regression, or a law from a model of the whole field (`field_law`) that is better;
         "subspace": a model in innovation form, for a law with a filter gain.
@@ -66,13 +66,13 @@ class DesignSettings:
     horizon : int
         Steps of an episode, for a law that has parameters for each of them.
     input_delay : sequence of int
-        Steps after which each input acts (`loop_method.reduce.input_delay`); empty: none. A dead time
-        needs a law with a filter, in whose state the last inputs are.
+        Steps after which each input acts (`pdeloop.method.reduce.input_delay`); empty: none. A dead
+        time needs a law with a filter, in whose state the last inputs are.
     grid : str
-        Axes and components of the state (`loop_interfaces.grid.Grid.parse`), for "field"; empty: one
+        Axes and components of the state (`pdeloop.messages.grid.Grid.parse`), for "field"; empty: one
         axis.
     constants : dict
-        Parameters of `loop_interfaces.signature.CONSTANTS` as given; others have their
+        Parameters of `pdeloop.messages.signature.CONSTANTS` as given; others have their
         defaults.
     """
 

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import read_only
-from loop_interfaces.jit import cache, simd
-from loop_interfaces.jit.cache import cached_njit, jit
-from loop_interfaces.jit.simd import (
+from pdeloop.jit import cache, simd
+from pdeloop.jit.cache import cached_njit, jit
+from pdeloop.jit.simd import (
     fma,
     load,
     load_unaligned,
@@ -27,6 +26,7 @@ from loop_interfaces.jit.simd import (
     whole_lanes,
     write,
 )
+from pdeloop.messages.arrays import read_only
 
 LAW = np.dtype(
     [

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller_node.policy import ProjectedLaw, checked_index
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import digest
-from loop_method.laws.base import Law, Parts
-from loop_method.laws.calls import action, arithmetic_of_laws, updated
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import digest
+from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.calls import action, arithmetic_of_laws, updated
 
 
 class MemoryUnknownError(Exception):

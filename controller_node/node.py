@@ -21,22 +21,22 @@ from controller_node.diagnostics import ControllerDiagnostics
 from controller_node.identification import DesignSettings
 from controller_node.law import load_compiled
 from controller_node.responder import Responder
-from loop_interfaces import topics
-from loop_interfaces.affinity import pin_process
-from loop_interfaces.diagnostics import Status
-from loop_interfaces.frames import Frame
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import model_order, taken_by
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.ros.endpoints import writer_qos
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros.parameters import declare, given_parameters
-from loop_interfaces.topics import Topic
-from loop_method.method_settings import shared_methods
-from loop_method.settings import parameters_of, with_defaults
+from pdeloop.messages import topics
+from pdeloop.messages.diagnostics import Status
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import model_order, taken_by
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.topics import Topic
+from pdeloop.method.method_settings import shared_methods
+from pdeloop.method.settings import parameters_of, with_defaults
+from pdeloop.process.affinity import pin_process
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.endpoints import writer_qos
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros.parameters import declare, given_parameters
 
-FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path") else None
+FAST_PATH = import_module("controller_node.fast_path") if find_spec("pdeloop.fast_path") else None
 """Answers states in compiled code, where that can be had; without it the responder answers all."""
 
 Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array, read_only
-from loop_interfaces.jit.simd import whole_lanes
-from loop_interfaces.topics import StartColumn
+from pdeloop.jit.simd import whole_lanes
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array, read_only
+from pdeloop.messages.topics import StartColumn
 
 IndexArray = NDArray[np.int64]
 

@@ -29,12 +29,12 @@ from controller_node.run_state import (
     digest_of_start,
     forget,
 )
-from loop_interfaces import model_rows
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
-from loop_interfaces.topics import (
+from pdeloop.messages import model_rows
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.frames import KEPT_ARRAY, Frame, FrameError
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.signature import NOT_SIGNED, digest_of, signature
+from pdeloop.messages.topics import (
     ACTION,
     COMPLETED,
     MAX_GAIN,
@@ -42,8 +42,8 @@ from loop_interfaces.topics import (
     StartColumn,
     start_rows,
 )
-from loop_method.laws.calls import laws_of
-from loop_method.laws.registry import law_kind
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import law_kind
 
 MAX_BYTES = 2**29
 """Bytes that are kept of all runs together, and half as many of targets. Less recently used ones are

@@ -10,10 +10,10 @@ import numpy as np
 
 from controller_node.exploration import Exploration
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import Frame
-from loop_interfaces.signature import digest_of
-from loop_method.laws.base import Law
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.signature import digest_of
+from pdeloop.method.laws.base import Law
 
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
@@ -27,7 +27,7 @@ class Answering:
     """The law in use in an episode of a plant, made at its first state.
 
     law: None where the controller explores; signature: what the actions carry, see
-    loop_interfaces.signature.
+    pdeloop.messages.signature.
     """
 
     plant: int
@@ -124,7 +124,7 @@ class RunState:
 
 
 def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_set: ActionSet) -> int:
-    """D of an episode, see loop_interfaces.signature. inputs: None where it explores."""
+    """D of an episode, see pdeloop.messages.signature. inputs: None where it explores."""
     published: list[Any] = [start.values, action_set.signed]
     if inputs is not None:
         policy, models = inputs

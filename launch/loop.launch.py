@@ -19,15 +19,15 @@ from launch.event_handlers import OnProcessExit
 from launch.events.process import ProcessExited
 from launch_ros.actions import Node
 
-from loop_interfaces.isolation import NETWORK
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.parameters import OF_THE_PLANT, flags
-from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
-from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.build import complete
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.parameters import OF_THE_PLANT, flags
+from pdeloop.messages.problem import find_problem, load_parameters, shipped_problems
+from pdeloop.method.laws.registry import OWN_LAWS
 from pdeloop.pairs import PAIRS, pair_cores, pair_nodes
+from pdeloop.process.isolation import NETWORK
 from pdeloop.supervisor import REFUSED
 
 PLANT_FLAGS = [spec for spec in flags() if "P" in spec.nodes]

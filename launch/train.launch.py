@@ -23,13 +23,13 @@ from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node
 
-from loop_interfaces.parameters import LAW, flags
-from loop_interfaces.protocol import STOPPED
-from loop_interfaces.spec import ParameterError, assignment
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
+from pdeloop.messages.parameters import LAW, flags
+from pdeloop.messages.protocol import STOPPED
+from pdeloop.messages.spec import ParameterError, assignment
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.laws.registry import OWN_LAWS
 from pdeloop.pairs import PAIR, PAIRS, RECORD_EVERY, Transport
 from pdeloop.supervisor import RECORDER_GRACE
 from pdeloop.training_run import begin, reopen, unused

@@ -9,8 +9,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from loop_interfaces.arrays import Array, float_array
 from pde_sim_node.equations import Equation, LinearEquation
+from pdeloop.messages.arrays import Array, float_array
 
 MAX_INTERNAL_STEPS = 10**7
 """Most internal steps of one sampling time; more would be a mistake in a unit and take for ever."""

@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.actuators import extents
-from loop_interfaces.cost import Cost
-from loop_interfaces.parameters import INSTRUMENTS
-from loop_interfaces.spec import ParameterError
 from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Instruments, Plant
@@ -18,6 +14,10 @@ from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.plants.dynamics_plant import SETTABLE
 from pde_sim_node.plants.loading import PHYSICAL, Made, make, physical_of
 from pde_sim_node.plants.stateful_plant import plant_of
+from pdeloop.messages.actuators import extents
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.parameters import INSTRUMENTS
+from pdeloop.messages.spec import ParameterError
 
 _GRID = (
     "n_z",

@@ -10,14 +10,14 @@ import numpy as np
 from numba import types
 from numba.core.errors import NumbaError
 
-from loop_interfaces.own_code import in_one_line, located
 from pde_sim_node.equations import Equation, Field, LinearEquation, Spectrum
 from pde_sim_node.equations.base import result_of
-from spectral_solver.exact import exact_step
-from spectral_solver.kernel import etdrk4_step
-from spectral_solver.memory import StepSettings
-from spectral_solver.pointwise import NotCompiledError
-from spectral_solver.workers import ParallelStep
+from pdeloop.messages.own_code import in_one_line, located
+from pdeloop.solver.exact import exact_step
+from pdeloop.solver.kernel import etdrk4_step
+from pdeloop.solver.memory import StepSettings
+from pdeloop.solver.pointwise import NotCompiledError
+from pdeloop.solver.workers import ParallelStep
 
 
 def compiled_step(equation: Equation, k: Field, **settings: Any) -> ParallelStep:

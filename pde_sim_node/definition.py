@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.frames import MAX_ID
+from pdeloop.messages.frames import MAX_ID
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,10 @@
 
 import numpy as np
 
-from loop_interfaces.diagnostics import Level, Rate, Status
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.topics import VOID, CostColumn
 from pde_sim_node.lockstep import Lockstep
+from pdeloop.messages.diagnostics import Level, Rate, Status
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.topics import VOID, CostColumn
 
 
 class PlantDiagnostics:

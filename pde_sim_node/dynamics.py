@@ -28,9 +28,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 SPELT_ALIKE = 0.83
 """Similarity of names, of difflib, from which one is taken for a misspelt other one."""

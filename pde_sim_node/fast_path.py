@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fast_path import channel
-from fast_path.handler import FastPath, fast_handler, plan_type
-from fast_path.messages import (
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.plants.batch import BatchPlant
+from pdeloop.fast_path import channel
+from pdeloop.fast_path.handler import FastPath, fast_handler, plan_type
+from pdeloop.fast_path.messages import (
     FIRST,
     SAMPLE_BATCH,
     STEP,
@@ -21,18 +23,16 @@ from fast_path.messages import (
     full,
     write_answer,
 )
-from loop_interfaces.frames import ArrayCodec, digest
-from loop_interfaces.jit.cache import jit, jit_in_closure
-from loop_interfaces.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
-from loop_interfaces.jit.simd import load_unaligned, write
-from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
-from loop_interfaces.signature import NOT_SIGNED
-from loop_interfaces.topics import STATE
-from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.plants.batch import BatchPlant
+from pdeloop.jit.cache import jit, jit_in_closure
+from pdeloop.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
+from pdeloop.jit.simd import load_unaligned, write
+from pdeloop.messages.frames import ArrayCodec, digest
+from pdeloop.messages.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
+from pdeloop.messages.signature import NOT_SIGNED
+from pdeloop.messages.topics import STATE
 
 if TYPE_CHECKING:
-    from loop_interfaces.ros.endpoints import SampleBatcher
+    from pdeloop.ros.endpoints import SampleBatcher
 
 PLAN = plan_type(
     # Addresses of the plant's compiled step, and of what it is called with.

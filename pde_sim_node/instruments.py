@@ -4,7 +4,7 @@
     y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
     z_{k+1} = f(z_k, P(a_k)) + w_k,         w_k ~ N(0, process_noise^2 dt / dx I)
 
-with P(a) the nearest action within action_limit and action_bounds (`loop_interfaces.action_set`). C
+with P(a) the nearest action within action_limit and action_bounds (`pdeloop.messages.action_set`). C
 picks the grid points of the n_y sensors, or all. The stage cost is that of the true z_k and of P(a_k),
 which a real plant could only estimate.
 
@@ -42,10 +42,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
 from pde_sim_node.definition import Definition
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
 
 
 class Noise(IntEnum):

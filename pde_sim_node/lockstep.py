@@ -32,14 +32,14 @@ from enum import Enum, auto
 
 import numpy as np
 
-from loop_interfaces import topics
-from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
-from loop_interfaces.protocol import Publication
-from loop_interfaces.signature import signature
-from loop_interfaces.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer, Timing
 from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_starts
+from pdeloop.messages import topics
+from pdeloop.messages.frames import MAX_VALUES, Frame, FrameError, digest
+from pdeloop.messages.protocol import Publication
+from pdeloop.messages.signature import signature
+from pdeloop.messages.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""

@@ -18,21 +18,6 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from loop_interfaces.affinity import pin_process
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.files import FileError
-from loop_interfaces.frames import Frame
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import PLANT, taken_by
-from loop_interfaces.places import boxes_of, text_of
-from loop_interfaces.problem import own_values
-from loop_interfaces.protocol import Publication
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.samples import ACTION_KIND, clock_message
-from loop_interfaces.spec import Spec, check
-from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import complete
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
@@ -41,8 +26,23 @@ from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import PHYSICAL, physical_of
 from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.files import FileError
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import PLANT, taken_by
+from pdeloop.messages.places import boxes_of, text_of
+from pdeloop.messages.problem import own_values
+from pdeloop.messages.protocol import Publication
+from pdeloop.messages.samples import ACTION_KIND, clock_message
+from pdeloop.messages.spec import Spec, check
+from pdeloop.messages.topics import ACTION, COST, PAUSED, START, STATE, TARGET
+from pdeloop.process.affinity import pin_process
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros.parameters import declare, given_parameters, on_change
 
-FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("fast_path") else None
+FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("pdeloop.fast_path") else None
 """Answers actions in compiled code, where that can be had; without it the lock-step answers all."""
 
 

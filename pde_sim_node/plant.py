@@ -13,13 +13,13 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Grid
-from loop_interfaces.topics import COMPLETED
 from pde_sim_node.definition import Definition
-from spectral_solver.workers import ParallelStep
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.topics import COMPLETED
+from pdeloop.solver.workers import ParallelStep
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -62,7 +62,7 @@ class EpisodeCosts:
 class Instruments:
     """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
 
-    See loop_interfaces.parameters.INSTRUMENTS; 0 means none.
+    See pdeloop.messages.parameters.INSTRUMENTS; 0 means none.
     """
 
     measurement_noise: float = 0.0

@@ -17,7 +17,7 @@ REMEMBERED = 10_000
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of messages, never their content; see loop_interfaces.parameters.PLANT."""
+    """Times of messages, never their content; see pdeloop.messages.parameters.PLANT."""
 
     action_timeout: float
     max_repeats: int

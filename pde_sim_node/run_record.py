@@ -10,7 +10,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from loop_interfaces.files import is_private, open_ordinary, private_folder, write_atomically
+from pdeloop.messages.files import is_private, open_ordinary, private_folder, write_atomically
 
 FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-plants-{os.getuid()}"
 

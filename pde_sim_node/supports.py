@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.actuators import indicators, placed_indicators
+from pdeloop.messages.actuators import indicators, placed_indicators
 
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:

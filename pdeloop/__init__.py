@@ -19,21 +19,6 @@ import importlib
 # Not from `typing`: `python -m pdeloop` is here before its working directory is off the module path.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from loop_interfaces.grid import Axis as Axis
-    from loop_interfaces.grid import Grid as Grid
-    from loop_method.adapt.base import Optimizer as Optimizer
-    from loop_method.adapt.base import Rollout as Rollout
-    from loop_method.adapt.base import RolloutResult as RolloutResult
-    from loop_method.adapt.step_optimizer import StepOptimizer as StepOptimizer
-    from loop_method.design.lqt import track as track
-    from loop_method.design.tracking import track_horizon as track_horizon
-    from loop_method.laws.base import Law as Law
-    from loop_method.reduce.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
-    from loop_method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
-    from loop_method.reduce.order import study_orders as study_orders
-    from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
-    from loop_method.settings import Settings as Settings
-    from loop_method.settings import setting as setting
     from pde_sim_node.dynamics import Dynamics as Dynamics
     from pde_sim_node.plant import Plant as Plant
     from pde_sim_node.plants.fmu import from_fmu as from_fmu
@@ -49,6 +34,23 @@ if TYPE_CHECKING:
     from pdeloop.finished_run import FinishedRun as FinishedRun
     from pdeloop.finished_run import load_run as load_run
     from pdeloop.gradients import Gradients as Gradients
+    from pdeloop.messages.grid import Axis as Axis
+    from pdeloop.messages.grid import Grid as Grid
+    from pdeloop.method.adapt.base import Optimizer as Optimizer
+    from pdeloop.method.adapt.base import Rollout as Rollout
+    from pdeloop.method.adapt.base import RolloutResult as RolloutResult
+    from pdeloop.method.adapt.step_optimizer import StepOptimizer as StepOptimizer
+    from pdeloop.method.design.lqt import track as track
+    from pdeloop.method.design.tracking import track_horizon as track_horizon
+    from pdeloop.method.laws.base import Law as Law
+    from pdeloop.method.reduce.identifiability import (
+        IdentifiabilityWarning as IdentifiabilityWarning,
+    )
+    from pdeloop.method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
+    from pdeloop.method.reduce.order import study_orders as study_orders
+    from pdeloop.method.reduce.reduced_model import ReducedModel as ReducedModel
+    from pdeloop.method.settings import Settings as Settings
+    from pdeloop.method.settings import setting as setting
     from pdeloop.plots import plot_behaviour as plot_behaviour
     from pdeloop.plots import plot_costs as plot_costs
     from pdeloop.plots import plot_episode as plot_episode
@@ -58,15 +60,15 @@ if TYPE_CHECKING:
     from pdeloop.training_warning import TrainingWarning as TrainingWarning
 
 _NAMES = {
-    "loop_method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
-    "loop_method.adapt": ("Optimizer", "Rollout", "RolloutResult", "StepOptimizer"),
-    "loop_method.design.lqt": ("track",),
-    "loop_method.design.tracking": ("track_horizon",),
-    "loop_method.laws.base": ("Law",),
-    "loop_method.reduce.order": ("study_orders",),
-    "loop_method.reduce.reduced_model": ("ReducedModel",),
-    "loop_method.settings": ("Settings", "setting"),
-    "loop_interfaces.grid": ("Axis", "Grid"),
+    "pdeloop.method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
+    "pdeloop.method.adapt": ("Optimizer", "Rollout", "RolloutResult", "StepOptimizer"),
+    "pdeloop.method.design.lqt": ("track",),
+    "pdeloop.method.design.tracking": ("track_horizon",),
+    "pdeloop.method.laws.base": ("Law",),
+    "pdeloop.method.reduce.order": ("study_orders",),
+    "pdeloop.method.reduce.reduced_model": ("ReducedModel",),
+    "pdeloop.method.settings": ("Settings", "setting"),
+    "pdeloop.messages.grid": ("Axis", "Grid"),
     "pde_sim_node.dynamics": ("Dynamics",),
     "pde_sim_node.plant": ("Plant",),
     "pde_sim_node.plants.fmu": ("from_fmu",),

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.files import write_atomically
-from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import build_plant
 from pdeloop.evaluation import another_loop
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.files import write_atomically
+from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from pdeloop.report.data import ProblemData, behaviours
 from pdeloop.report.style import COLOURS, NAMES
 from tuner_node.run_folder import RunFolderError

@@ -18,17 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller_node import identification
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_interfaces.own_code import refuse_while_executed
-from loop_interfaces.parameters import table
-from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import FREE, flatten
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.laws.base import Law
-from loop_method.laws.registry import OWN_LAWS
-from loop_method.reduce.identifiability import IdentifiabilityWarning
-from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.equations import OWN_EQUATIONS, configured_equation
@@ -38,6 +27,17 @@ from pdeloop.display import Display
 from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.own_code import refuse_while_executed
+from pdeloop.messages.parameters import table
+from pdeloop.messages.problem import load_parameters
+from pdeloop.messages.spec import FREE, flatten
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.laws.base import Law
+from pdeloop.method.laws.registry import OWN_LAWS
+from pdeloop.method.reduce.identifiability import IdentifiabilityWarning
+from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.pairs import Transport
 from pdeloop.problem_values import problem_values
 from pdeloop.training_run import begin, carry_out, continuing
@@ -154,7 +154,7 @@ def problem(
         The parameters of the equation, like {"viscosity": 1e-3}, or of the named plant.
     cost
         The cost for an equation, where `state_weight`, `action_weight` and the equation's own target
-        do not suffice: arguments of `loop_interfaces.cost.Cost` by name, like
+        do not suffice: arguments of `pdeloop.messages.cost.Cost` by name, like
         {"output": C, "target": y_r}.
     parameters
         Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Your

@@ -14,9 +14,9 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
-from loop_interfaces.start import STOPPED_BY_SIGNAL, begin, what_to_install
 from pdeloop.interruption import Interruption
 from pdeloop.output import complain, drop_unwritable
+from pdeloop.process.start import STOPPED_BY_SIGNAL, begin, what_to_install
 
 DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, STOPPED_BY_SIGNAL, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import MAX_ARRAY_BYTES
-from loop_interfaces.arrays import Array
-from loop_interfaces.files import FileError, open_ordinary
-from loop_method.reduce.channels import Channels
 from pdeloop.data_table import Columns, places_of
 from pdeloop.log import Log, in_seconds
+from pdeloop.messages.array_files import MAX_ARRAY_BYTES
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.files import FileError, open_ordinary
+from pdeloop.method.reduce.channels import Channels
 
 __all__ = ["read_mat", "read_parquet"]
 

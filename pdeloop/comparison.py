@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.parameters import EVALUATION
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun, field_means, interval
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.parameters import EVALUATION
 from pdeloop.output import aligned
 
 SHOWN = 30

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pdeloop.messages.arrays import Array
 
 LITTLE = 0.02
 """Share of the cost without control; a law that changes it by less does next to nothing."""

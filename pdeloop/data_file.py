@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.array_files import MAX_ARRAY_BYTES, read_arrays
-from loop_interfaces.arrays import Array, float_array
-from loop_interfaces.files import FileError, read_bounded
-from loop_method.reduce.channels import NUMBERED, Channels, listed
 from pdeloop.column_files import read_mat, read_parquet
 from pdeloop.data_table import Columns, read_table
 from pdeloop.log import Log, Remedies, in_seconds, trajectories_of
+from pdeloop.messages.array_files import MAX_ARRAY_BYTES, read_arrays
+from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.files import FileError, read_bounded
+from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
 
 __all__ = ["Measurements", "read_measurements"]
 

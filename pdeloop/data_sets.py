@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
-from loop_interfaces.spec import ParameterError
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.spec import ParameterError
 
 
 @dataclass(frozen=True, eq=False)

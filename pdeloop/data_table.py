@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_method.reduce.channels import Channels, listed
 from pdeloop.log import Log, in_seconds
+from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce.channels import Channels, listed
 
 __all__ = ["Columns", "places_of", "read_table"]
 

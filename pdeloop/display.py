@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 from rich.console import Console
 
-from loop_interfaces.documents import parse_json
+from pdeloop.messages.documents import parse_json
 from pdeloop.output import complain, drop_unwritable
 from pdeloop.progress import Progress
 from tuner_node.narration import Narration

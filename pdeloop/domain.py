@@ -12,8 +12,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from loop_interfaces.files import FileError, open_own, private_folder, try_lock
 from pde_sim_node.run_record import forget
+from pdeloop.messages.files import FileError, open_own, private_folder, try_lock
 
 DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""

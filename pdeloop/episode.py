@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.arrays import Array, float_array
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
+from pdeloop.messages.arrays import Array, float_array
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
 

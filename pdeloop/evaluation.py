@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import pack
-from loop_interfaces.parameters import EVALUATION, noisy
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import CostColumn
-from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import SUPPLIED, build_plant, complete
 from pde_sim_node.plant import DIVERGED_COST
 from pde_sim_node.plants.dynamics_plant import SETTABLE
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import pack
+from pdeloop.messages.parameters import EVALUATION, noisy
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import CostColumn
+from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from pdeloop.output import aligned
 from tuner_node.batch import Batch
 from tuner_node.rollouts import EVALUATED

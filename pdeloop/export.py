@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.spec import ParameterError
-from loop_method.laws import Law
-from loop_method.laws.extended_kalman import ExtendedKalman
-from loop_method.laws.feedforward import FeedForward
-from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.laws import Law
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.observer import Observer
 
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
 """Columns of a curve."""

@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.parameters import noisy
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import COMPLETED
-from loop_method.laws import Law
-from loop_method.laws.calls import laws_of
-from loop_method.laws.registry import law_kind
-from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
 from pdeloop.episode import Law as ActingLaw
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.parameters import noisy
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import COMPLETED
+from pdeloop.method.laws import Law
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, model_of
 

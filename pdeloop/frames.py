@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import field_range
 from pde_sim_node.plant import Plant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import field_range
 from pdeloop.report import planes
 from pdeloop.report.places import beside, mark_places, moving_target
 from pdeloop.report.style import FIELD_MAP, image

@@ -13,14 +13,14 @@ import numpy as np
 
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.array_files import read_arrays
-from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.spec import ParameterError
-from loop_method.design import lqt
-from loop_method.laws.registry import law_kind
-from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.plant import Plant
+from pdeloop.messages.array_files import read_arrays
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.design import lqt
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 __all__ = ["file_of_gains", "with_gains"]
 

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loop_interfaces.arrays import Array
-from loop_method.laws.base import Law, differentiable
-from loop_method.laws.calls import action, arithmetic_of_laws, updated
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.episode import EpisodeRecord, finite_array, finite_basis, rollout
 from pdeloop.episode import Law as Actions
+from pdeloop.messages.arrays import Array
+from pdeloop.method.laws.base import Law, differentiable
+from pdeloop.method.laws.calls import action, arithmetic_of_laws, updated
 
 __all__ = ["CostGradient", "Gradients", "features"]
 

@@ -17,28 +17,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from controller_node.identification import DesignSettings, designed, examined, identify
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.files import write_atomically
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.one_thread import one_thread
-from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import COMPLETED, CostColumn
-from loop_method.reduce import dmdc, regression
-from loop_method.reduce.channels import NUMBERED, SHOWN, Channels
-from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError
-from loop_method.reduce.input_delay import Delays, shifted, study_delays
-from loop_method.reduce.order import OrderStudy, study_orders
-from loop_method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
-from loop_method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.files import write_atomically
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.parameters import as_recorded, model_order, recorded_values, table
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import COMPLETED, CostColumn
+from pdeloop.method.reduce import dmdc, regression
+from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels
+from pdeloop.method.reduce.identifiability import Identifiability, NotIdentifiableError
+from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
+from pdeloop.method.reduce.order import OrderStudy, study_orders
+from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
+from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.model_checks import Residuals, fit_percent, largest_pole, residuals, stability
+from pdeloop.process.one_thread import one_thread
 
 if TYPE_CHECKING:
-    from loop_method.design.field_law import FieldLaw
     from pdeloop.bags.episodes import RecordedEpisode
+    from pdeloop.method.design.field_law import FieldLaw
 
 FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
 
 SETTLED = 0.05
 """Share of the way from the first to the last state within which the loop counts as settled."""

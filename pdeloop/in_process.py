@@ -15,14 +15,14 @@ import numpy as np
 from controller_node.identification import DesignSettings, design_each
 from controller_node.law_batch import LawBatch
 from controller_node.policy import excitations
-from loop_interfaces import model_rows
-from loop_interfaces.arrays import Array
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
-from loop_method.laws.calls import laws_of
-from loop_method.laws.registry import law_kind
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
+from pdeloop.messages import model_rows
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import law_kind
 from tuner_node.batch import Batch, BatchResult, most_environments
 from tuner_node.errors import NoModelError
 from tuner_node.training import Training

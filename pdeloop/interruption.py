@@ -7,8 +7,8 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from loop_interfaces.start import on_signals
 from pdeloop.output import complain
+from pdeloop.process.start import on_signals
 
 
 class Interruption(BaseException):

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.spec import ParameterError
-from loop_method.laws.extended_kalman import ExtendedKalman
-from loop_method.laws.observer import Observer
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.observer import Observer
 
 
 @dataclass(frozen=True, eq=False)

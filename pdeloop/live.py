@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from loop_interfaces.documents import parse_json
-from loop_interfaces.files import (
+from pdeloop.domain import DOMAINS_FOLDER
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.files import (
     FileError,
     is_private,
     open_new,
@@ -26,7 +27,6 @@ from loop_interfaces.files import (
     private_folder,
     try_lock,
 )
-from pdeloop.domain import DOMAINS_FOLDER
 
 _PREFIX = "live-"
 _MAX_TEXT = 10_000

@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_method.reduce.channels import Channels, listed
 from pdeloop.log_findings import Finding, Flags, findings, sentinels
+from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce.channels import Channels, listed
 
 __all__ = ["Log", "Remedies", "Table", "in_seconds", "trajectories_of"]
 

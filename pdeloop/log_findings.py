@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_method.reduce.channels import SHOWN, Channels, listed
+from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce.channels import SHOWN, Channels, listed
 
 __all__ = ["Finding", "findings", "sentinels"]
 

@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, special
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.one_thread import one_thread
-from loop_method.reduce.channels import Channels, listed
-from loop_method.reduce.reduced_model import ReducedModel, Trajectory
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.reduce.channels import Channels, listed
+from pdeloop.method.reduce.reduced_model import ReducedModel, Trajectory
+from pdeloop.process.one_thread import one_thread
 
 PARTS = 10
 """Parts of the data of which each is left out once."""

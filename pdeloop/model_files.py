@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.spec import ParameterError
 from pdeloop.law_form import LawForm
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.spec import ParameterError
 
 _TEMPLATE = Path(__file__).parent / "commands" / "template" / "fmu.c.txt"
 _OPSET, _IR = 17, 9

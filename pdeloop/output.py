@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from loop_interfaces.text import printable
+from pdeloop.messages.text import printable
 
 LONGEST = 4000
 """Characters of a complaint; a longer one repeats what a file says."""

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.affinity import least_busy_cores, usable_cores
-from loop_interfaces.isolation import NETWORK, PROFILE
-from loop_interfaces.parameters import taken_by
-from loop_interfaces.ros_environment import prepared, with_servers_there
-from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
 from pdeloop.domain import given_domain
+from pdeloop.messages.parameters import taken_by
+from pdeloop.messages.spec import ParameterError, Spec
+from pdeloop.process.affinity import least_busy_cores, usable_cores
+from pdeloop.process.isolation import NETWORK, PROFILE
+from pdeloop.process.ros_environment import prepared, with_servers_there
 from pdeloop.supervisor import NodeError
 from tuner_node.run_folder import RunFolder
 

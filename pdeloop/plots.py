@@ -10,11 +10,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from loop_interfaces.colour_scale import field_range
-from loop_method.laws import Affine
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.colour_scale import field_range
+from pdeloop.method.laws import Affine
 from pdeloop.report import figures, learning, planes
 from pdeloop.report.data import ProblemData, of_run
 from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text

@@ -18,17 +18,17 @@ from scipy import linalg
 
 from controller_node.identification import DesignSettings, designed
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.parameters import INSTRUMENTS
-from loop_method.laws.calls import laws_of
-from loop_method.laws.registry import law_kind
-from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, rollout
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.parameters import INSTRUMENTS
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.reduce.order import study_orders
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
 from tuner_node.build import build_training, few_sensors, remarks_on
 from tuner_node.optimizer_parameters import kind_of

@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.problem import find_problem
-from loop_interfaces.spec import flatten
-from loop_method.method_settings import field_model_settings
 from pde_sim_node.build import complete
 from pde_sim_node.plant import Plant
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import find_problem
+from pdeloop.messages.spec import flatten
+from pdeloop.method.method_settings import field_model_settings
 from tuner_node.build import few_sensors
 from tuner_node.optimizer_parameters import training_parameters
 

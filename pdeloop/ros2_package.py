@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces import action_set
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.files import write_atomically
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.text import shown
 from pdeloop.finished_run import FinishedRun
 from pdeloop.law_form import law_form
+from pdeloop.messages import action_set
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.files import write_atomically
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.text import shown
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TEMPLATES = Path(__file__).parent / "commands" / "template"

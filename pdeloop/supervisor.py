@@ -14,10 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from loop_interfaces.files import open_own
-from loop_interfaces.module_path import safe_environment
-from loop_interfaces.protocol import NO_CONTROLLER, STOPPED
-from loop_interfaces.start import PARENT
+from pdeloop.messages.files import open_own
+from pdeloop.messages.protocol import NO_CONTROLLER, STOPPED
+from pdeloop.process.module_path import safe_environment
+from pdeloop.process.start import PARENT
 
 STOP_GRACE = 2.0
 """Seconds between SIGINT and SIGKILL when the run ends."""
@@ -29,10 +29,10 @@ STEADY = 30.0
 """Seconds of life after which earlier deaths of a node no longer count."""
 REFUSED, CRASHED = 1, 70
 """Exit codes of a node that was asked for something it cannot do, so that restarting would not help,
-and of one with a bug (loop_interfaces.ros.node_main)."""
+and of one with a bug (pdeloop.ros.node_main)."""
 FULL_MEMORY_DISK = "as happens where /dev/shm, which ROS's tracing library maps, or a disk is full"
 """The cause of a SIGBUS."""
-START = "loop_interfaces.start"
+START = "pdeloop.process.start"
 """The module that runs a node."""
 _WARNING = re.compile(r"\[WARN\] \[([\d.]+)\] (\[.*)")
 """A warning in a node's log."""
@@ -100,7 +100,7 @@ class Supervisor:
     log_folder: Path
     tell: Callable[[str], None]
     environment: Mapping[str, str]
-    """Environment variables of the nodes (loop_interfaces.ros_environment)."""
+    """Environment variables of the nodes (pdeloop.process.ros_environment)."""
     stopped: bool = False
     """True if the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)

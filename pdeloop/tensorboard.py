@@ -10,8 +10,8 @@ from pathlib import Path
 
 from tensorboardX import SummaryWriter
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.spec import ParameterError
 
 _IDS = ("event", "seed", "rollouts")
 """Entries that identify a row of the history."""

@@ -20,11 +20,6 @@ from typing import Any
 
 import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
-from loop_interfaces.files import FileError, make_own_folder, write_atomically
-from loop_interfaces.frames import MAX_VALUES
-from loop_interfaces.own_code import OwnCodeError
-from loop_interfaces.parameters import model_order
-from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
@@ -34,12 +29,17 @@ from pdeloop.given_model import file_of_gains, with_gains
 from pdeloop.in_process import LocalPair, train
 from pdeloop.interruption import Interruption, interruptible
 from pdeloop.live import announced
+from pdeloop.messages.files import FileError, make_own_folder, write_atomically
+from pdeloop.messages.frames import MAX_VALUES
+from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.messages.parameters import model_order
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
 from pdeloop.problem_values import problem_values
+from pdeloop.solver import polynomial_step
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from pdeloop.unused import refuse_unused
-from spectral_solver import polynomial_step
 from tuner_node import narration
 from tuner_node.build import build_training, remarks_on
 from tuner_node.errors import NoModelError
@@ -97,7 +97,7 @@ def load_compiled(values: Mapping[str, Any], *, fits: bool = False) -> None:
         if fits and _fits_circles(values, plant):
             polynomial_step.load_compiled()
         controller_node.law.load_compiled()
-        if importlib.util.find_spec("fast_path"):
+        if importlib.util.find_spec("pdeloop.fast_path"):
             compiled = ["pde_sim_node"] * (plant.parallel is not None)
             for node in ("controller_node", *compiled):
                 importlib.import_module(f"{node}.fast_path").load_compiled()

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
 from pde_sim_node.plant import Plant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 GROWS = 1e-8
 """A mode is unstable whose eigenvalue is further outside of the unit circle than this."""

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, RECORDER, VIEWER
-from loop_interfaces.spec import ParameterError
+from pdeloop.messages.parameters import EXECUTION, PLANT, PROBLEM, RECORDER, VIEWER
+from pdeloop.messages.spec import ParameterError
 
 OF_A_METHOD = {
     "learning_rate": ("optimizer", "two_point"),

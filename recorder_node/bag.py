@@ -18,7 +18,7 @@ import yaml
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from loop_interfaces.files import write_atomically
+from pdeloop.messages.files import write_atomically
 
 FILE, METADATA = "bag.mcap", "metadata.yaml"
 VERSION = 9

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from loop_interfaces.parameters import table
-from loop_interfaces.ros.peers import Peers
-from loop_interfaces.spec import FREE
+from pdeloop.messages.parameters import table
+from pdeloop.messages.spec import FREE
+from pdeloop.ros.peers import Peers
 
 PATIENCE = 10.0
 """Seconds in which the graph is expected to show a node's name and its parameter services."""

@@ -18,20 +18,20 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from loop_interfaces.affinity import lower_priority
-from loop_interfaces.diagnostics import Level, Rate, Status
-from loop_interfaces.frames import FrameError
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import taken_by
-from loop_interfaces.ros.endpoints import raw_subscription, scoped
-from loop_interfaces.ros.message_types import message_class
-from loop_interfaces.ros.node_main import ConfigurationError, node_main
-from loop_interfaces.ros.observer import Observer
-from loop_interfaces.ros.parameters import declare, given_parameters
-from loop_interfaces.ros.peers import Peers
-from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
-from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
-from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
+from pdeloop.messages.diagnostics import Level, Rate, Status
+from pdeloop.messages.frames import FrameError
+from pdeloop.messages.parameters import taken_by
+from pdeloop.messages.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
+from pdeloop.messages.topics import ACTION, RECORDER_STATUS, START, STATE
+from pdeloop.process.affinity import lower_priority
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.endpoints import raw_subscription, scoped
+from pdeloop.ros.message_types import message_class
+from pdeloop.ros.node_main import ConfigurationError, node_main
+from pdeloop.ros.observer import Observer
+from pdeloop.ros.parameters import declare, given_parameters
+from pdeloop.ros.peers import Peers
+from pdeloop.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from recorder_node.bag import BagError
 from recorder_node.matching import Matching
 from recorder_node.recording import Recording, large_bag

@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.frames import FrameError
-from loop_interfaces.topics import START, STATE
+from pdeloop.messages.frames import FrameError
+from pdeloop.messages.topics import START, STATE
 from recorder_node.bag import BagError, BagWriter
 from recorder_node.sources import NOTES, PARAMETERS_TOPIC, Source
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.topics import ARRAYS, MODEL_FAILED, Topic
+from pdeloop.messages.frames import ArrayCodec
+from pdeloop.messages.topics import ARRAYS, MODEL_FAILED, Topic
 from recorder_node.bag import Channel
 
 ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
@@ -17,7 +17,7 @@ _NAMES = sorted([*(topic.name for topic in ARRAYS), MODEL_FAILED], key=len, reve
 
 @dataclass(frozen=True)
 class Source:
-    """A topic that is recorded: what it is in the bag, and its entry in loop_interfaces.topics.
+    """A topic that is recorded: what it is in the bag, and its entry in pdeloop.messages.topics.
 
     array: None for a topic without arrays; namespace: that of its pair, '' for what belongs to no
     pair.

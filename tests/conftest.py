@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 from threadpoolctl import threadpool_limits
 
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations.loading import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.laws.registry import OWN_LAWS
 from tests.support import leftovers
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.compiled import COMPILED

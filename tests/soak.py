@@ -27,8 +27,8 @@ from pathlib import Path
 
 import numpy as np
 
-from loop_interfaces.start import die_with
 from pdeloop.in_process import LocalPair, train
+from pdeloop.process.start import die_with
 from pdeloop.training_run import resolve
 from tests.support.interpreter import ROOT
 from tests.support.relay.train import FAULTS

@@ -9,12 +9,12 @@ from itertools import repeat
 
 import numpy as np
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
-from loop_method.adapt import Rollout, RolloutResult, Trajectory
-from loop_method.laws import Affine, Law
-from loop_method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
+from pdeloop.method.adapt import Rollout, RolloutResult, Trajectory
+from pdeloop.method.laws import Affine, Law
+from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
@@ -110,7 +110,7 @@ class BatchResult:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """The definition of a training apart from the problem; see loop_interfaces.parameters.TUNER."""
+    """The definition of a training apart from the problem; see pdeloop.messages.parameters.TUNER."""
 
     n_a: int
     seed: int
@@ -143,7 +143,7 @@ class TrainingSettings:
     actuator_widths: Sequence[float] = ()
     """Width of each as a share of the domain; none: not declared."""
     cost: Sequence[str] = ()
-    """The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it."""
+    """The whole cost (`pdeloop.messages.cost.Cost.texts`) where the weights do not say it."""
     periodic: bool = True
     """True if the states are fields on one periodic axis."""
     line: bool = True

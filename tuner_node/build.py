@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.actuators import indicators, placed_indicators
-from loop_interfaces.array_files import read_arrays
-from loop_interfaces.grid import Grid, axes_of
-from loop_interfaces.model_rows import completed, unpack
-from loop_interfaces.parameters import measured_size, model_order, noisy
-from loop_interfaces.signature import design_digest
-from loop_interfaces.spec import ParameterError
-from loop_method.adapt import Context, Optimizer
-from loop_method.adapt.in_coordinates import InCoordinates, is_large
-from loop_method.laws import Affine, Law
-from loop_method.laws.predictive import Predictive
-from loop_method.laws.registry import law_kind
-from loop_method.method_settings import field_model_settings
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.actuators import indicators, placed_indicators
+from pdeloop.messages.array_files import read_arrays
+from pdeloop.messages.grid import Grid, axes_of
+from pdeloop.messages.model_rows import completed, unpack
+from pdeloop.messages.parameters import measured_size, model_order, noisy
+from pdeloop.messages.signature import design_digest
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt import Context, Optimizer
+from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
+from pdeloop.method.laws import Affine, Law
+from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.method_settings import field_model_settings
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance

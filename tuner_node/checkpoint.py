@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import Arrays, unpack_arrays
-from loop_interfaces.files import FileError, open_ordinary, sync_folder, write_part
+from pdeloop.messages.array_files import Arrays, unpack_arrays
+from pdeloop.messages.files import FileError, open_ordinary, sync_folder, write_part
 
 MAGIC = b"pdeloop-checkpoint 1 "
 

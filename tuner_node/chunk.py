@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loop_interfaces import topics
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import Publication
-from loop_interfaces.signature import digest_of
-from loop_interfaces.topics import COMPLETED, CostColumn
-from loop_method.adapt import Trajectory
+from pdeloop.messages import topics
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import Publication
+from pdeloop.messages.signature import digest_of
+from pdeloop.messages.topics import COMPLETED, CostColumn
+from pdeloop.method.adapt import Trajectory
 from tuner_node.batch import Batch, BatchResult
 
 

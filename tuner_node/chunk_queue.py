@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
+from pdeloop.messages.arrays import Array
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.chunk import Chunk, gathered
 from tuner_node.errors import DispatchError

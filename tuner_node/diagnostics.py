@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
+from pdeloop.messages.diagnostics import ConditionTimer, Level, Rate, Status
 from tuner_node.session import Session
 
 FOUND = 1.0

@@ -25,14 +25,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loop_interfaces import topics
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import EPISODES_PER_START, episode_name
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.signature import digest_of
-from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
+from pdeloop.messages import topics
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.signature import digest_of
+from pdeloop.messages.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, less_often, most_environments
 from tuner_node.chunk import messages_of
 from tuner_node.chunk_queue import ChunkQueue
@@ -52,10 +52,10 @@ class Dispatcher:
     """Serves one batch at a time. `now` is any monotonic time in s.
 
     run, incarnation: id of the run, in every message, and starts of its tuner so far; pairs: how
-    many; max_batch, episode_timeout, max_attempts: see loop_interfaces.parameters.TUNER, they may
+    many; max_batch, episode_timeout, max_attempts: see pdeloop.messages.parameters.TUNER, they may
     be set later; state_size, horizon: of an episode, 0: not known; plant: fingerprint of the one
     that this run is about, that of the first cost if not known; design: digest of how the run's
-    models are identified, see loop_interfaces.signature, 0: not known.
+    models are identified, see pdeloop.messages.signature, 0: not known.
     """
 
     def __init__(

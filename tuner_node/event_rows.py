@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.topics import COMPLETED, CostColumn
-from loop_method.adapt import RolloutResult
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.topics import COMPLETED, CostColumn
+from pdeloop.method.adapt import RolloutResult
 from tuner_node.batch import TrainingSettings
 from tuner_node.rollouts import EVALUATED
 from tuner_node.void_exploration import variance

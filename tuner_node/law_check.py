@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.topics import MAX_GAIN
-from loop_method.adapt import Rollout, Trajectory
-from loop_method.laws import Law
-from loop_method.laws.calls import along
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.topics import MAX_GAIN
+from pdeloop.method.adapt import Rollout, Trajectory
+from pdeloop.method.laws import Law
+from pdeloop.method.laws.calls import along
 
 TOLERANCE = 1e-6
 """Relative difference of actions that rounding may explain."""

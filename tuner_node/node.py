@@ -20,19 +20,19 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from loop_interfaces import topics
-from loop_interfaces.frames import Frame
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import TUNER, taken_by, with_budget
-from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
-from loop_interfaces.ros.endpoints import Sender, reader_qos, samples_qos, scoped
-from loop_interfaces.ros.introspection import full_name, matched_processes, process_of
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.node_main import ConfigurationError, node_main
-from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.ros.suspend_watchdog import sleep_for
-from loop_interfaces.ros_environment import steering
-from loop_interfaces.spec import FREE
+from pdeloop.messages import topics
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import TUNER, taken_by, with_budget
+from pdeloop.messages.protocol import NO_CONTROLLER, STOPPED, ModelFailure
+from pdeloop.messages.spec import FREE
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.process.ros_environment import steering
+from pdeloop.ros.endpoints import Sender, reader_qos, samples_qos, scoped
+from pdeloop.ros.introspection import full_name, matched_processes, process_of
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.node_main import ConfigurationError, node_main
+from pdeloop.ros.parameters import declare, given_parameters, on_change
+from pdeloop.ros.suspend_watchdog import sleep_for
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training, remarks_on
 from tuner_node.diagnostics import TunerDiagnostics

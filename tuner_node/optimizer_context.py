@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_method.adapt import Context, Record, Trajectory
-from loop_method.laws import Law
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt import Context, Record, Trajectory
+from pdeloop.method.laws import Law
 from tuner_node.batch import TrainingSettings
 
 

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from loop_interfaces.cost import Cost
-from loop_interfaces.parameters import LAW, OPTIMIZER, POINTS
-from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
-from loop_method.adapt import Optimizer
-from loop_method.adapt.registry import optimizer_kind
-from loop_method.method_settings import Method, law_of, shared_methods
-from loop_method.settings import parameters_of, with_defaults
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.parameters import LAW, OPTIMIZER, POINTS
+from pdeloop.messages.problem import load_parameters
+from pdeloop.messages.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
+from pdeloop.method.adapt import Optimizer
+from pdeloop.method.adapt.registry import optimizer_kind
+from pdeloop.method.method_settings import Method, law_of, shared_methods
+from pdeloop.method.settings import parameters_of, with_defaults
 
 
 def kind_of(values: Mapping[str, Any]) -> type[Optimizer]:

@@ -4,7 +4,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from loop_interfaces.diagnostics import ConditionTimer
+from pdeloop.messages.diagnostics import ConditionTimer
 from tuner_node.errors import DispatchError
 from tuner_node.pair import PairPublication
 from tuner_node.session import Session

@@ -3,10 +3,10 @@
 
 from typing import Any
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_method.adapt import Trajectory
-from loop_method.reduce.identifiability import examine_excitation
-from loop_method.reduce.input_delay import study_delays
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.method.adapt import Trajectory
+from pdeloop.method.reduce.identifiability import examine_excitation
+from pdeloop.method.reduce.input_delay import study_delays
 from tuner_node.batch import BatchResult
 from tuner_node.errors import ContradictionError
 

@@ -10,8 +10,8 @@ import numpy as np
 import scipy  # whose special functions, a tenth of a start, load when they are used
 from numpy.typing import NDArray
 
-from loop_interfaces.topics import COMPLETED
-from loop_method.laws import Affine
+from pdeloop.messages.topics import COMPLETED
+from pdeloop.method.laws import Affine
 from tuner_node.batch import stacked
 from tuner_node.budget import PURPOSES
 from tuner_node.readings import found_noise, seeming_noise

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.topics import StartColumn
-from loop_method.adapt import Rollout
-from loop_method.seeds import Purpose, derive, evaluation_noise
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.topics import StartColumn
+from pdeloop.method.adapt import Rollout
+from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.batch import TrainingSettings
 from tuner_node.void_exploration import variance
 

@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces import model_rows
-from loop_interfaces.array_files import checked_array, read_arrays
-from loop_interfaces.files import (
+from pdeloop.messages import model_rows
+from pdeloop.messages.array_files import checked_array, read_arrays
+from pdeloop.messages.files import (
     FileError,
     make_folder,
     open_own,
@@ -40,10 +40,10 @@ from loop_interfaces.files import (
     try_lock,
     write_atomically,
 )
-from loop_interfaces.frames import MAX_ID
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.parameter_file import yaml_text
-from loop_interfaces.parameters import (
+from pdeloop.messages.frames import MAX_ID
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.parameter_file import yaml_text
+from pdeloop.messages.parameters import (
     EXECUTION,
     PLANT,
     RECORDER,
@@ -53,9 +53,9 @@ from loop_interfaces.parameters import (
     recorded_values,
     table,
 )
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.text import shown
-from loop_method.laws.registry import OWN_LAWS
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.text import shown
+from pdeloop.method.laws.registry import OWN_LAWS
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 

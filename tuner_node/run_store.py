@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import checked_array
-from loop_interfaces.files import FileError
-from loop_interfaces.frames import MAX_ID
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.files import FileError
+from pdeloop.messages.frames import MAX_ID
 from tuner_node import checkpoint, training_state
 from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training

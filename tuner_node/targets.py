@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame, FrameError
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame, FrameError
 from tuner_node.errors import ContradictionError
 
 MAX_TARGETS, MAX_TARGET_BYTES = 64, 2**28

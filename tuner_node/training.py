@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces import model_rows
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import digest
-from loop_interfaces.topics import CostColumn, StartColumn
-from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
-from loop_method.laws import Law
-from loop_method.laws.calls import laws_of
+from pdeloop.messages import model_rows
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import digest
+from pdeloop.messages.topics import CostColumn, StartColumn
+from pdeloop.method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
+from pdeloop.method.laws import Law
+from pdeloop.method.laws.calls import laws_of
 from tuner_node import event_rows, rollouts, void_exploration
 from tuner_node.batch import (
     UNKNOWN_PLANT,

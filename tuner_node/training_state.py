@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces import model_rows
-from loop_interfaces.array_files import checked_array
-from loop_interfaces.documents import parse_json
-from loop_interfaces.frames import MAX_ID
-from loop_interfaces.text import shown
-from loop_method.adapt import Rollout, calls
-from loop_method.adapt.trajectories import (
+from pdeloop.messages import model_rows
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.frames import MAX_ID
+from pdeloop.messages.text import shown
+from pdeloop.method.adapt import Rollout, calls
+from pdeloop.method.adapt.trajectories import (
     is_kept,
     record_arrays,
     taken_record,

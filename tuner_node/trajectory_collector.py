@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
-from loop_interfaces.topics import COMPLETED
-from loop_method.adapt import Trajectory
-from loop_method.adapt.trajectories import kept
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.frames import KEPT_ARRAY, Frame, FrameError
+from pdeloop.messages.topics import COMPLETED
+from pdeloop.method.adapt import Trajectory
+from pdeloop.method.adapt.trajectories import kept
 
 MAX_BYTES = 2**30
 """Most bytes kept of the samples of one episode."""

@@ -9,7 +9,7 @@ from those of a law, and models that predict both are worse for the law.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from loop_interfaces.topics import COMPLETED, CostColumn
+from pdeloop.messages.topics import COMPLETED, CostColumn
 from tuner_node.batch import BatchResult, TrainingSettings
 
 WEAKER = 0.25

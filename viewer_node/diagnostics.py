@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from loop_interfaces.diagnostics import Level, Rate, Status
-from loop_interfaces.episodes import episode_name
+from pdeloop.messages.diagnostics import Level, Rate, Status
+from pdeloop.messages.episodes import episode_name
 from viewer_node.loop_view import SILENT, LoopView
 
 

@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.grid import Grid
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.grid import Grid
 
 Array = NDArray[np.float32]
 COLUMNS = 512
@@ -63,7 +63,7 @@ def plane_of(grid: Grid) -> tuple[NDArray[np.intp], tuple[int, int]]:
 
     Examples
     --------
-    >>> from loop_interfaces.grid import Axis
+    >>> from pdeloop.messages.grid import Axis
     >>> points, shape = plane_of(Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))))
     >>> points.tolist(), shape
     ([0, 1, 2, 3, 4, 5], (2, 3))

@@ -15,11 +15,11 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
-from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
-from loop_interfaces.samples import ACTION_KIND, STATE_KIND
-from loop_interfaces.topics import ACTION, COST, MODEL, PAUSED, POLICY, START, STATE, TARGET, Topic
+from pdeloop.messages.frames import ArrayCodec, Frame
+from pdeloop.messages.samples import ACTION_KIND, STATE_KIND
+from pdeloop.messages.topics import ACTION, COST, MODEL, PAUSED, POLICY, START, STATE, TARGET, Topic
+from pdeloop.ros.endpoints import raw_subscription, reader_qos, scoped
+from pdeloop.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from viewer_node.loop_view import LoopView
 
 PERIOD = 0.03

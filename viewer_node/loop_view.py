@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import field_range
-from loop_interfaces.frames import Frame
-from loop_interfaces.grid import Grid
-from loop_interfaces.topics import VOID, CostColumn
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.topics import VOID, CostColumn
 from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import LoopNodes
@@ -30,7 +30,7 @@ SILENT = 5.0
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
 COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
-"""The number with the cost of each controller (loop_interfaces.controllers)."""
+"""The number with the cost of each controller (pdeloop.messages.controllers)."""
 
 
 class LoopView:

@@ -20,15 +20,15 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
-from loop_interfaces.affinity import lower_priority
-from loop_interfaces.grid import Grid
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import VIEWER, taken_by
-from loop_interfaces.ros.message_types import message_class
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros.observer import Observer
-from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.topics import VIEWS
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.parameters import VIEWER, taken_by
+from pdeloop.messages.topics import VIEWS
+from pdeloop.process.affinity import lower_priority
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.message_types import message_class
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros.observer import Observer
+from pdeloop.ros.parameters import declare, given_parameters, on_change
 from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import MAX_COMPONENTS
 from viewer_node.loop_reader import PERIOD, LoopReader

@@ -9,14 +9,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import colours
-from loop_interfaces.grid import Grid
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import colours
+from pdeloop.messages.grid import Grid
 
 UNSEEN = (128, 128, 128)
 """Colour of steps that were not seen."""
 Range: TypeAlias = tuple[float, float]
-"""Lowest and highest value of the colours; see `loop_interfaces.colour_scale.field_range`."""
+"""Lowest and highest value of the colours; see `pdeloop.messages.colour_scale.field_range`."""
 
 
 def diverging(fields: NDArray[np.floating], limits: Range) -> NDArray[np.uint8]:

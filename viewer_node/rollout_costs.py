@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces import model_rows
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
+from pdeloop.messages import model_rows
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 
 Key = TypeVar("Key")
 MAX_KEPT = 100
@@ -28,7 +28,7 @@ class Rollouts:
     """The rollouts of a finished episode, one for each of its M environments.
 
     explores: whether it was an exploration; controllers (M,): 'none', 'lqt' or 'adapted', the keys
-    of loop_interfaces.controllers, empty for an exploration, if the policy is not known, and in a
+    of pdeloop.messages.controllers, empty for an exploration, if the policy is not known, and in a
     comparison with no control for a rollout from a field that no control did not have; mean
     (M,): stage costs; completed (M,): whether they did not diverge; models (M,): indices of the
     reduced models; fields (M,): seeds of the initial fields.
@@ -111,7 +111,7 @@ class RolloutCosts:
         )
 
     def controller(self, run: int, episode: int, environment: int) -> str:
-        """The controller in an environment: a key of loop_interfaces.controllers, or 'exploration'.
+        """The controller in an environment: a key of pdeloop.messages.controllers, or 'exploration'.
 
         Empty if it is not known.
         """

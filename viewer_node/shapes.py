@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 from viewer_node.picture import Range, diverging, middle
 
 MOST_CELLS = 4096

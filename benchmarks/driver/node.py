@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 
-from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import PROBLEM
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.node_main import ConfigurationError, node_main
-from loop_interfaces.ros.parameters import declare
-from loop_interfaces.spec import Spec
-from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
 from pde_sim_node.build import build_plant
-from spectral_solver.workers import use_cores
+from pdeloop.messages import model_rows
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import PROBLEM
+from pdeloop.messages.spec import Spec
+from pdeloop.messages.topics import COST, MODEL, POLICY, START, CostColumn
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.node_main import ConfigurationError, node_main
+from pdeloop.ros.parameters import declare
+from pdeloop.solver.workers import use_cores
 
 PARAMETERS = (
     Spec("solver_pin", -1, -1, 4095).means("core to measure the solver on; -1: all cores"),

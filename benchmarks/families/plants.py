@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.families.rates import RatePlant
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Axis, Grid
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Axis, Grid
 
 
 def modes(rng: np.random.Generator, n: int, count: int, rms: float) -> Array:

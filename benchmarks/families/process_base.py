@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array
 
 
 class Process(Dynamics):

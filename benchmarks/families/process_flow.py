@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.families.process_base import Process, cells, cosines, humps, joined
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Axis, Grid
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Axis, Grid
 
 
 class Canal(Process):

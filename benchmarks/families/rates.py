@@ -15,8 +15,8 @@ from abc import abstractmethod
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array
 
 
 class RatePlant(Dynamics):

@@ -23,11 +23,11 @@ from scipy import sparse
 
 import pdeloop
 from benchmarks.families.process import Process
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_method.design.finite_horizon import cost_to_go, finite_horizon_of
 from pdeloop.episode import Law, rollout
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.design.finite_horizon import cost_to_go, finite_horizon_of
 
 STEPS = 20
 """Of a plan."""

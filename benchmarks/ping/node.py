@@ -18,15 +18,15 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.affinity import pin_process
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros.parameters import declare
-from loop_interfaces.spec import Spec
-from loop_interfaces.topics import ACTION, STATE, Topic
+from pdeloop.messages.frames import ArrayCodec, Frame
+from pdeloop.messages.spec import Spec
+from pdeloop.messages.topics import ACTION, STATE, Topic
+from pdeloop.process.affinity import pin_process
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros.parameters import declare
 
 PARAMETERS = (
     Spec("end", "ping", choices=("ping", "pong")).means("which end this is"),

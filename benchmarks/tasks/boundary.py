@@ -18,10 +18,10 @@ import numpy as np
 import pdeloop
 from benchmarks.backstepping import source_reaction_gain, source_transport_gain
 from benchmarks.tasks.common import Row, name_of, shown, trained
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.boundary import BoundaryControlled, ReactionDiffusionBoundary, Transport
 from pdeloop.episode import Law
+from pdeloop.messages.arrays import Array
 
 STARTS = np.arange(2000, 2050)
 """Seeds of the fifty constants from 1 to 10."""

@@ -10,10 +10,10 @@ import numpy as np
 
 import pdeloop
 from benchmarks.tasks.common import Row, name_of, shown, trained
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.convection import Convection
 from pdeloop.episode import EpisodeRecord, Law
+from pdeloop.messages.arrays import Array
 
 PROBES = 16
 """Of the convection, 4 x 4."""

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from benchmarks.tasks.common import Row, shown
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants.falling_film import FallingFilm
+from pdeloop.messages.arrays import Array
 
 STARTS = np.arange(2000, 2010)
 """Seeds of the ten initial films."""

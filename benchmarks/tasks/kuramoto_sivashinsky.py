@@ -14,10 +14,10 @@ import numpy as np
 import scipy.linalg
 
 from benchmarks.tasks.common import Row, shown, trainings
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
 from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
 from pdeloop.episode import Law
+from pdeloop.messages.arrays import Array
 
 STARTS = np.arange(2000, 2020)
 """Seeds of the twenty initial states."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.tasks.common import Row, shown, trainings
 from benchmarks.tasks.kuramoto_sivashinsky import told
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants.kuramoto_sivashinsky_four import KuramotoSivashinskyFour
 from pdeloop.episode import Law
+from pdeloop.messages.arrays import Array
 
 STARTS = np.arange(2000, 2050)
 """Seeds of the fifty initial states: a return varies by a third of itself from start to start."""

@@ -11,10 +11,10 @@ import numpy as np
 
 import pdeloop
 from benchmarks.tasks.common import Row, name_of, shown, trained
-from loop_interfaces.arrays import Array
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.cavity import Cavity
 from pdeloop.episode import Law
+from pdeloop.messages.arrays import Array
 
 ORDER = 8
 

@@ -22,9 +22,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.own_code import FAILURES, located
-from loop_interfaces.text import shown
 from pde_sim_node.supports import indicator_supports
+from pdeloop.messages.own_code import FAILURES, located
+from pdeloop.messages.text import shown
 
 Field = NDArray[np.float64]
 Spectrum = NDArray[np.inexact[Any]]

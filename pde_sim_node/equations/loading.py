@@ -1,17 +1,17 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Equations by name: one of the project, or one from elsewhere.
 
-Which code may be run: `loop_interfaces.own_code`.
+Which code may be run: `pdeloop.messages.own_code`.
 """
 
 import os
 from collections.abc import Mapping
 from typing import Any
 
-from loop_interfaces.own_code import OwnCode
-from loop_interfaces.text import shown
 from pde_sim_node.equations.base import Equation
 from pde_sim_node.equations.registry import EQUATIONS
+from pdeloop.messages.own_code import OwnCode
+from pdeloop.messages.text import shown
 
 OWN_EQUATIONS = OwnCode("equation", "PDELOOP_EQUATIONS", EQUATIONS)
 ALLOWED, allow = OWN_EQUATIONS.variable, OWN_EQUATIONS.allow

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
-from spectral_solver.pointwise import all_finite
-from spectral_solver.workers import ParallelStep
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Grid
+from pdeloop.solver.pointwise import all_finite
+from pdeloop.solver.workers import ParallelStep
 
 
 class BatchPlant(ABC):

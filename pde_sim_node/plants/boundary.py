@@ -19,10 +19,10 @@ from abc import abstractmethod
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 
 class BoundaryControlled(Dynamics):

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Axis, Grid
 from pde_sim_node.arguments import internal_steps, positive, whole
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Axis, Grid
 
 
 class Cavity(Dynamics):

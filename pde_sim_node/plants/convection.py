@@ -26,11 +26,11 @@ import math
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.jit.cache import cached_njit
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.dynamics import Dynamics, arguments_of
+from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Axis, Grid
 
 _STABLE = 0.8
 """Time step as a share of the limit dx^2 / 4 kappa of the explicit diffusion."""

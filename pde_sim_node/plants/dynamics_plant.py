@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array, float_array
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Grid
-from loop_interfaces.one_thread import one_thread
-from loop_interfaces.own_code import OwnCodeError, called
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
 from pde_sim_node.dynamics import Dynamics, refuse_misspelt
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.own_code import OwnCodeError, called
+from pdeloop.process.one_thread import one_thread
 
 SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
 """Attributes that a problem may override; weights only where they are numbers."""

@@ -28,10 +28,10 @@ import zlib
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.jit.cache import cached_njit
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.dynamics import Dynamics, arguments_of
+from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.arrays import Array
 
 FIRST, BETWEEN = 150.0, 10.0
 """Place of the first jet, and the distance from each to the next."""

@@ -16,8 +16,8 @@ from weakref import WeakValueDictionary, finalize
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.text import shown
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.text import shown
 
 FATAL = 4
 """fmi2Fatal and fmi3Fatal: no call may follow."""

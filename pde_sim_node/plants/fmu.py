@@ -14,11 +14,11 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loop_interfaces.arrays import Array, float_array
-from loop_interfaces.grid import Grid
-from loop_interfaces.text import shown
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plants.fmi import Signals, Unit, described, digest_of
+from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.text import shown
 
 Start: TypeAlias = Callable[[np.random.Generator], Mapping[str, float]]
 STATES = "states"

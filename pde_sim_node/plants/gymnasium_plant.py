@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Grid
-from loop_interfaces.long_calls import LONG_CALLS
-from loop_interfaces.own_code import OwnCodeError, called
-from loop_interfaces.text import shown
 from pde_sim_node.definition import Definition, described, source_of
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.batch import BatchPlant
 from pde_sim_node.plants.gymnasium_spaces import Boxes
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.long_calls import LONG_CALLS
+from pdeloop.messages.own_code import OwnCodeError, called
+from pdeloop.messages.text import shown
 
 if TYPE_CHECKING:
     from gymnasium import Env

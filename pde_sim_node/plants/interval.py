@@ -24,10 +24,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from loop_interfaces.arrays import Array, float_array
-from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
 from pde_sim_node.dynamics import Dynamics
+from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.grid import Grid
 
 Wall = Literal["dirichlet", "neumann", "robin"]
 Input = Literal["inside", "left", "right", "both"]

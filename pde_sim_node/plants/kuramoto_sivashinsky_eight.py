@@ -23,10 +23,10 @@ import math
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.dynamics import Dynamics, arguments_of
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 
 class KuramotoSivashinskyEight(Dynamics):

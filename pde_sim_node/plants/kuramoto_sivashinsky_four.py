@@ -24,11 +24,11 @@ import math
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
-from loop_interfaces.jit.cache import cached_njit
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.dynamics import Dynamics, arguments_of
+from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 _SIGMA = 0.4
 

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A plant of a user's own from a problem's parameters: by its name, or the object of a Python program.
 
-Which code may be run: `loop_interfaces.own_code`.
+Which code may be run: `pdeloop.messages.own_code`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loop_interfaces.own_code import FAILURES, FMU, PROCESS, OwnCode, located, name_of
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.text import shown
 from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
@@ -37,6 +34,9 @@ from pde_sim_node.plants.reactions import (
 )
 from pde_sim_node.plants.stateful_plant import plant_of
 from pde_sim_node.plants.vorticity import Kolmogorov
+from pdeloop.messages.own_code import FAILURES, FMU, PROCESS, OwnCode, located, name_of
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.text import shown
 
 PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
     {

@@ -26,11 +26,11 @@ from weakref import finalize
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.documents import parse_json
-from loop_interfaces.own_code import PROCESS, absolute_words
-from loop_interfaces.text import shown
 from pde_sim_node.dynamics import Dynamics, arguments_of
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.own_code import PROCESS, absolute_words
+from pdeloop.messages.text import shown
 
 START = 60.0
 """Seconds, at least, in which a program has to declare its plant."""

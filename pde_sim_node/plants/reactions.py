@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.arguments import Coefficient, positive, values_at
 from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion
 from pde_sim_node.plants.variable_diffusion import VariableDiffusion
+from pdeloop.messages.arrays import Array
 
 
 class Plate(ReactionDiffusion):

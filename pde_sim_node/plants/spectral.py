@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Grid
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.compiled_step import compiled_step, load
@@ -18,7 +15,10 @@ from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.equations.base import result_of
 from pde_sim_node.plant import MEAN_FIELD, Adjoint
 from pde_sim_node.plants.batch import BatchPlant
-from spectral_solver.workers import ParallelStep
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Grid
+from pdeloop.solver.workers import ParallelStep
 
 _NUMBERS = (
     "n_z",
@@ -64,7 +64,7 @@ class SpectralPlant(BatchPlant):
     horizon, state_weight, action_weight, divergence_bound
         See `pde_sim_node.plant.Plant`.
     cost
-        In place of that of the weights and the equation's target; see `loop_interfaces.cost.Cost`.
+        In place of that of the weights and the equation's target; see `pdeloop.messages.cost.Cost`.
     compiled
         Whether the step is compiled now; otherwise by `load`, or with the first step.
 
@@ -204,7 +204,7 @@ class SpectralPlant(BatchPlant):
             The equation's nonlinearity has no derivative that can be computed.
         """
         # Compiled code that only gradients need.
-        from spectral_solver import adjoint
+        from pdeloop.solver import adjoint
 
         self.load()
         if not isinstance(self.equation, LinearEquation):

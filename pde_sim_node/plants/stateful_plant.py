@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.dynamics import Dynamics, made_again
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.own_code import OwnCodeError
 
 
 class StatefulPlant(DynamicsPlant):

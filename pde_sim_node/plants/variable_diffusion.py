@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import Coefficient, values_at
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 
 
 class VariableDiffusion:

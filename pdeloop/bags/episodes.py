@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import (
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import (
     ACTION,
     COST,
     MODEL,

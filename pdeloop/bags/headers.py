@@ -5,7 +5,7 @@ With the sample time dt, states and costs have the times of docs/protocol.md:
 
     t_0 = max(the plant's time before, the start's time) + dt,    t_{k+1} = t_k + dt
 
-and a start has the newest time that its tuner knew. See loop_interfaces.signature for signatures.
+and a start has the newest time that its tuner knew. See pdeloop.messages.signature for signatures.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller_node.identification import DesignSettings
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import EPISODES_PER_START, episode_name
-from loop_interfaces.frames import Frame
-from loop_interfaces.samples import MAX_TIME
-from loop_interfaces.signature import design_digest, digest_of, signature
 from pde_sim_node.plant import Plant
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.report import Report
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.samples import MAX_TIME
+from pdeloop.messages.signature import design_digest, digest_of, signature
 
 NANOSECONDS = 1e9
 
@@ -213,7 +213,7 @@ class ClockTimes:
 
 
 def _nanoseconds(times: array[float]) -> np.ndarray:
-    """As loop_interfaces.samples.clock_message rounds them."""
+    """As pdeloop.messages.samples.clock_message rounds them."""
     values = np.unique(np.asarray(times, dtype=np.float64))
     values = values[(values >= 0.0) & (values < MAX_TIME)]
     return np.rint(values * NANOSECONDS).astype(np.int64)

@@ -35,8 +35,8 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from loop_interfaces.files import FileError, open_ordinary, read_bounded
-from loop_interfaces.text import shown
+from pdeloop.messages.files import FileError, open_ordinary, read_bounded
+from pdeloop.messages.text import shown
 from recorder_node.bag import METADATA, BagError
 
 RATIO, SLACK = 100, 64 * 2**20

@@ -9,10 +9,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.documents import parse_yaml
-from loop_interfaces.files import FileError, read_bounded
-from loop_interfaces.text import shown
 from pdeloop.bags.survey import FileSurvey, Survey
+from pdeloop.messages.documents import parse_yaml
+from pdeloop.messages.files import FileError, read_bounded
+from pdeloop.messages.text import shown
 from recorder_node.bag import METADATA, BagError
 
 MAX_BYTES, MAX_NODES = 20_000_000, 1_000_000

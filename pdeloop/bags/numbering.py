@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
 
-from loop_interfaces.episodes import EPISODES_PER_START, episode_name
+from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
 
 NAMED = 5
 """Gaps that are named; the others are only counted."""

@@ -13,13 +13,13 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.documents import parse_json
-from loop_interfaces.files import read_json
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import CONVERTED, Message, files, in_time, text_of
 from pdeloop.bags.metadata import Findings, check, read_metadata, repeated
 from pdeloop.bags.survey import Survey, by_run, survey
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.files import read_json
 from recorder_node.bag import METADATA, BagError
 from recorder_node.recording import EVERY, PARAMETERS
 from recorder_node.sources import source_of

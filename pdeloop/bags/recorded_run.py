@@ -10,12 +10,6 @@ from typing import Any
 import numpy as np
 
 from controller_node.identification import DesignSettings, design_each
-from loop_interfaces.arrays import Array
-from loop_interfaces.episodes import EPISODES_PER_START
-from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import PLANT, recorded_values, with_budget
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.headers import Headers
 from pdeloop.bags.numbering import gaps, gaps_text
@@ -23,6 +17,12 @@ from pdeloop.bags.report import Report
 from pdeloop.bags.run_claims import RunClaims, compare_parameters, compare_results
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.episodes import EPISODES_PER_START
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import PLANT, recorded_values, with_budget
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from tuner_node.batch import Batch
 from tuner_node.budget import PURPOSES
 from tuner_node.build import build_training

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
+from pdeloop.messages.arrays import Array
 
 SHOWN = 5
 """Differences that are described; the others are only counted."""

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.documents import parse_json
-from loop_interfaces.files import FileError, read_json
-from loop_interfaces.text import shown
 from pdeloop.bags.report import Report
 from pdeloop.display import ProgressFile
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.files import FileError, read_json
+from pdeloop.messages.text import shown
 from tuner_node.results import check_result, summarise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, RunFolderError

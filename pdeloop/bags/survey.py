@@ -13,10 +13,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.documents import parse_json
-from loop_interfaces.topics import TARGET
 from pdeloop.bags.mcap_messages import McapFile, Message, unreadable
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.topics import TARGET
 from recorder_node.bag import BagError
 from recorder_node.sources import CLOCK, PARAMETERS_TOPIC, source_of
 

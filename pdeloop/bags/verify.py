@@ -16,16 +16,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.documents import parse_json
-from loop_interfaces.files import FileError, read_bounded
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.spec import MAX_YAML_BYTES, ParameterError
 from pdeloop.bags.headers import ClockTimes
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.recorded_run import RecordedRun
 from pdeloop.bags.report import Report
 from pdeloop.bags.run_claims import RunClaims, claims_of
 from pdeloop.bags.survey import by_run
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.files import FileError, read_bounded
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.spec import MAX_YAML_BYTES, ParameterError
 from recorder_node.bag import BagError
 
 Parameters = Mapping[int, Mapping[str, Any]]

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -16,6 +15,7 @@ from pdeloop.commands.common import (
     command,
     refuse_other_code,
 )
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 

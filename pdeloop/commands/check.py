@@ -9,7 +9,6 @@ from dataclasses import asdict
 from math import nan
 from typing import TYPE_CHECKING
 
-from loop_interfaces.parameters import flags
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -21,6 +20,7 @@ from pdeloop.commands.common import (
     given_flags,
 )
 from pdeloop.commands.settings import add_set, joined, read_settings
+from pdeloop.messages.parameters import flags
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from loop_interfaces.own_code import identity
-from loop_interfaces.parameters import LAW, OPTIMIZER, PROBLEM, TUNER, flags
-from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError
+from pdeloop.messages.own_code import identity
+from pdeloop.messages.parameters import LAW, OPTIMIZER, PROBLEM, TUNER, flags
+from pdeloop.messages.problem import shipped_problems
+from pdeloop.messages.spec import ParameterError
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """The collection to which a command adds its parser."""
@@ -89,10 +89,10 @@ def add_own_code(
 
 def allow_own_code(options: argparse.Namespace) -> dict[str, str]:
     """Allow the code that --equation, --plant, --optimizer or --law names; the parameters given."""
-    from loop_method.adapt.registry import OWN_OPTIMIZERS
-    from loop_method.laws.registry import OWN_LAWS
     from pde_sim_node.equations import OWN_EQUATIONS
     from pde_sim_node.plants.loading import OWN_PLANTS
+    from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+    from pdeloop.method.laws.registry import OWN_LAWS
 
     given = {}
     for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS, OWN_LAWS):
@@ -137,7 +137,7 @@ def add_problem(
 
 
 def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
-    """The flags of a group of parameters (loop_interfaces.parameters)."""
+    """The flags of a group of parameters (pdeloop.messages.parameters)."""
     for spec in flags(group):
         own = "the problem's, or " if spec in PROBLEM else ""
         action = parser.add_argument(
@@ -155,14 +155,14 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
 
 def _optimizers(prefix: str, **_: object) -> list[str]:
     """The names of the optimisers, for the completion of the shells."""
-    from loop_method.adapt.registry import offered
+    from pdeloop.method.adapt.registry import offered
 
     return offered()
 
 
 def _laws(prefix: str, **_: object) -> list[str]:
     """The names of the laws, for the completion of the shells."""
-    from loop_method.laws.registry import offered
+    from pdeloop.method.laws.registry import offered
 
     return offered()
 

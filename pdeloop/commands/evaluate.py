@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import sys
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
@@ -18,6 +17,7 @@ from pdeloop.commands.common import (
     refuse_other_code,
 )
 from pdeloop.commands.settings import add_set, read_settings
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 

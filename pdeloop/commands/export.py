@@ -7,8 +7,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, command
+from pdeloop.messages.spec import ParameterError
 
 if TYPE_CHECKING:
     from pdeloop.finished_run import FinishedRun
@@ -79,9 +79,9 @@ def add(commands: Commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from loop_interfaces.files import write_atomically
     from pdeloop.export import curve_csv, law_of
     from pdeloop.finished_run import load_run
+    from pdeloop.messages.files import write_atomically
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
     files["--parquet"] = options.parquet, (".parquet",)

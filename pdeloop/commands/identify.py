@@ -8,8 +8,6 @@ import sys
 from functools import partial
 from math import isfinite
 
-from loop_interfaces.parameters import IDENTIFICATION
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -18,6 +16,8 @@ from pdeloop.commands.common import (
     allow_own_code,
     command,
 )
+from pdeloop.messages.parameters import IDENTIFICATION
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 OF_DATA = (
@@ -240,7 +240,7 @@ def _delays(text: str) -> tuple[int, ...] | str:
 
 
 def _episode(name: str | None) -> int | None:
-    from loop_interfaces.episodes import episode_number
+    from pdeloop.messages.episodes import episode_number
 
     try:
         return None if name is None else episode_number(name)

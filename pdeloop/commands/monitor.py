@@ -8,8 +8,8 @@ import os
 import shlex
 import webbrowser
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, command
+from pdeloop.messages.spec import ParameterError
 
 PORT = 8420
 
@@ -63,9 +63,9 @@ def add(commands: Commands) -> None:
 
 
 def _monitor(options: argparse.Namespace) -> int:
-    from loop_interfaces.affinity import lower_priority
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
+    from pdeloop.process.affinity import lower_priority
     from tuner_node.run_folder import RunFolder
     from viewer_node.web.page import Page
     from viewer_node.web.server import Server

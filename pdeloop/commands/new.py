@@ -12,10 +12,10 @@ from pathlib import Path
 from shutil import rmtree
 from string import Template
 
-from loop_interfaces.files import FileError, write_atomically
-from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, command
+from pdeloop.messages.files import FileError, write_atomically
+from pdeloop.messages.problem import shipped_problems
+from pdeloop.messages.spec import ParameterError
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 

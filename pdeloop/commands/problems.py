@@ -6,9 +6,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.problem import shipped_problems
 from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import shipped_problems
 from pdeloop.output import print_json
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 
-from loop_interfaces.text import printable
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -14,6 +13,7 @@ from pdeloop.commands.common import (
     command,
     refuse_other_code,
 )
+from pdeloop.messages.text import printable
 
 
 def add(commands: Commands) -> None:

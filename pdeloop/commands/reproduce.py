@@ -7,7 +7,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
@@ -18,6 +17,7 @@ from pdeloop.commands.common import (
 )
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.commands.study import add_execution, carry_out
+from pdeloop.messages.spec import ParameterError
 
 if TYPE_CHECKING:
     from pdeloop.study import Study

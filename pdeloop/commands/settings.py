@@ -8,9 +8,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from loop_interfaces.parameters import table
-from loop_interfaces.spec import SETTINGS, ParameterError, assignment, check_names
-from loop_interfaces.text import shown
+from pdeloop.messages.parameters import table
+from pdeloop.messages.spec import SETTINGS, ParameterError, assignment, check_names
+from pdeloop.messages.text import shown
 
 PHYSICAL = "physical."
 """Before the name of a parameter of the equation; `SETTINGS` are those of a method's."""

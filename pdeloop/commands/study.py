@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -24,6 +23,7 @@ from pdeloop.commands.common import (
     command,
 )
 from pdeloop.commands.settings import add_set, read_settings
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 TLS = {
@@ -119,9 +119,9 @@ def carry_out(
     name: of the command; study_in: the study for a folder; remarks: lines that follow the table,
     from its rows.
     """
-    from loop_interfaces.files import write_atomically
     from pdeloop.display import StreamConsole
     from pdeloop.interruption import interruptible
+    from pdeloop.messages.files import write_atomically
     from pdeloop.progress import Progress
     from pdeloop.study.executors import local_workers
     from pdeloop.study.results import reading
@@ -185,7 +185,7 @@ def carry_out(
 
 
 def _study(options: argparse.Namespace) -> int:
-    from loop_interfaces.spec import read_document
+    from pdeloop.messages.spec import read_document
     from pdeloop.study.description import Study
     from pdeloop.study.results import read_study
 

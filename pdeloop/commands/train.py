@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import argparse
 
-from loop_interfaces.problem import shipped_problems
-from loop_interfaces.quick_imports import quick_imports
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -22,6 +19,9 @@ from pdeloop.commands.common import (
     refuse_other_code,
 )
 from pdeloop.commands.settings import add_set, joined, read_settings
+from pdeloop.messages.problem import shipped_problems
+from pdeloop.messages.spec import ParameterError
+from pdeloop.process.quick_imports import quick_imports
 
 
 def add(commands: Commands) -> None:

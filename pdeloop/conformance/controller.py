@@ -11,21 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces import model_rows
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import (
-    ACTION,
-    COST,
-    MODEL,
-    MODEL_IDENTIFIED,
-    POLICY,
-    START,
-    STATE,
-    TARGET,
-    VOID,
-    Topic,
-)
 from pdeloop.conformance.linear_plant import Explored, LinearPlant
 from pdeloop.conformance.probing import (
     FAILED,
@@ -38,6 +23,21 @@ from pdeloop.conformance.probing import (
     ids,
     require,
     require_same,
+)
+from pdeloop.messages import model_rows
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import (
+    ACTION,
+    COST,
+    MODEL,
+    MODEL_IDENTIFIED,
+    POLICY,
+    START,
+    STATE,
+    TARGET,
+    VOID,
+    Topic,
 )
 
 N_Z, STEPS = 64, 300

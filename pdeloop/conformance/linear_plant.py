@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED
 
 
 class LinearPlant:

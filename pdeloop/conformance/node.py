@@ -14,20 +14,20 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.frames import MAX_ID
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped, writer_qos
-from loop_interfaces.ros.introspection import PERIOD, full_name, incompatible
-from loop_interfaces.ros.node_main import ros_node
-from loop_interfaces.ros.observer import WAIT, EventLoop
-from loop_interfaces.topics import ARRAYS, Topic
 from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
 from pdeloop.conformance.probing import FAILED, Check, Message
 from pdeloop.conformance.tuner import TunerCheck
 from pdeloop.interruption import Interruption
+from pdeloop.messages.frames import MAX_ID
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import ARRAYS, Topic
 from pdeloop.problem_check import Finding
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.endpoints import Sender, reader_qos, scoped, writer_qos
+from pdeloop.ros.introspection import PERIOD, full_name, incompatible
+from pdeloop.ros.node_main import ros_node
+from pdeloop.ros.observer import WAIT, EventLoop
 
 CHECKS: dict[str, type[Check]] = {
     "plant": PlantCheck,

@@ -11,9 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import ACTION, COMPLETED, COST, START, STATE, TARGET, VOID, Topic
 from pdeloop.conformance.probing import (
     Ask,
     Check,
@@ -24,6 +21,9 @@ from pdeloop.conformance.probing import (
     require,
     require_same,
 )
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import ACTION, COMPLETED, COST, START, STATE, TARGET, VOID, Topic
 
 SIZE, HUGE = 0.1, 1e6
 """Standard deviation of the actions, and what every actuator is told for a divergence."""

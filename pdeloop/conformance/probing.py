@@ -19,10 +19,10 @@ from typing import Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import COST, MODEL_FAILED, START, VOID, Topic
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import COST, MODEL_FAILED, START, VOID, Topic
 from pdeloop.problem_check import Finding
 
 ASK_AGAIN = 0.5

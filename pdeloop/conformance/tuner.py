@@ -11,11 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import (
+from pdeloop.conformance.probing import (
+    FAILED,
+    Check,
+    Message,
+    NoAnswerError,
+    NoteError,
+    UnexpectedError,
+    ids,
+    require,
+    require_same,
+)
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import (
     COMPLETED,
     COST,
     MAX_GAIN,
@@ -28,17 +39,6 @@ from loop_interfaces.topics import (
     StartColumn,
     Topic,
     start_rows,
-)
-from pdeloop.conformance.probing import (
-    FAILED,
-    Check,
-    Message,
-    NoAnswerError,
-    NoteError,
-    UnexpectedError,
-    ids,
-    require,
-    require_same,
 )
 
 PLANT, N_Z, STEPS = 31, 8, 100

@@ -26,11 +26,11 @@ from __future__ import annotations
 
 import gymnasium
 
-from loop_interfaces.problem import shipped_problems
 from pdeloop.environments.agents import warm_start
 from pdeloop.environments.residual import ResidualAction
 from pdeloop.environments.single import Environment
 from pdeloop.environments.vector import VectorEnvironment
+from pdeloop.messages.problem import shipped_problems
 
 __all__ = ["Environment", "ResidualAction", "VectorEnvironment", "environment_id", "warm_start"]
 

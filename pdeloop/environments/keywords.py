@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 import pdeloop
-from loop_interfaces.parameters import PROBLEM, table
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.api import Problem
+from pdeloop.messages.parameters import PROBLEM, table
 
 Source = str | Path | Problem | Plant | Dynamics
 """The source of an environment: a problem's name or file, or a Python object."""

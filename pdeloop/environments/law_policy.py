@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from loop_interfaces.arrays import Array
+from pdeloop.messages.arrays import Array
 
 LARGEST = 0.999
 """Largest magnitude of a squashed law, beyond which its tanh has hardly a gradient."""

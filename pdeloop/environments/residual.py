@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from loop_interfaces.arrays import Array
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.arrays import Array
 
 
 class ResidualAction(gymnasium.Wrapper[Array, Array, Array, Array]):

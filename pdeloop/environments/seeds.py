@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array, float_array
+from pdeloop.messages.arrays import Array, float_array
 
 
 def field_seed(generator: np.random.Generator) -> int:

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plant import MEAN_FIELD, Plant
+from pdeloop.messages.arrays import Array
 
 
 def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:

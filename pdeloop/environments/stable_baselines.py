@@ -18,11 +18,11 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments.keywords import Source
 from pdeloop.environments.signals import one
 from pdeloop.environments.vector import VectorEnvironment
+from pdeloop.messages.arrays import Array
 
 __all__ = ["VecEnvironment"]
 

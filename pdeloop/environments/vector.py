@@ -12,13 +12,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
 from pdeloop.environments.keywords import Source, Specified
 from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
 from pdeloop.environments.seeds import field_seed, first_fields, seed_of_each
 from pdeloop.environments.signals import masked, spaces, told
+from pdeloop.messages.arrays import Array
 
 Flags = NDArray[np.bool_]
 

@@ -7,8 +7,8 @@ import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
-from loop_interfaces.files import read_json
 from pdeloop.live import Live, is_locked, running
+from pdeloop.messages.files import read_json
 
 
 class Finder:

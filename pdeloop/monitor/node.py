@@ -22,16 +22,16 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from loop_interfaces.grid import Grid
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.node_main import ros_node
-from loop_interfaces.ros.observer import Observer
-from loop_interfaces.ros.peers import Peers
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
+from pdeloop.messages.grid import Grid
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.service_call import ServiceCall
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.node_main import ros_node
+from pdeloop.ros.observer import Observer
+from pdeloop.ros.peers import Peers
 from viewer_node.episode_samples import EpisodeSamples
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint

@@ -15,9 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import DARK
-from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import DARK
+from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.report.style import FIELD_MAP, GAIN_MAP
 
 BACK, INK = "#14171c", "#e8eaee"

@@ -13,20 +13,20 @@ import numpy as np
 
 from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.array_files import checked_array, unpack_arrays
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_method.laws import Affine
-from loop_method.laws.calls import laws_of
-from loop_method.laws.registry import law_kind
-from loop_method.reduce.order import OrderStudy, study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
 from pdeloop.evaluation import another_loop
 from pdeloop.finished_run import FinishedRun, field_means, load_run
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import checked_array, unpack_arrays
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.laws import Affine
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.reduce.order import OrderStudy, study_orders
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
 from pdeloop.study.results import MOST, STUDY_FILE, reading

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import field_range
-from loop_interfaces.model_rows import ModelRows
-from loop_method.reduce.order import OrderStudy
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.reduce.order import OrderStudy
 from pdeloop.report import planes
 from pdeloop.report.data import ProblemData
 from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
 from pdeloop.report.style import FIELD_MAP, image
 
 FEW = 6

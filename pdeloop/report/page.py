@@ -21,9 +21,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from loop_interfaces.files import make_own_folder, write_atomically
 from pdeloop.animation import pictures, write
 from pdeloop.finished_run import field_means
+from pdeloop.messages.files import make_own_folder, write_atomically
 from pdeloop.report import figures, learning
 from pdeloop.report.dark import darken
 from pdeloop.report.data import ProblemData, ReportData

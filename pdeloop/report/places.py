@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.grid import Grid
 from pde_sim_node.plant import Plant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.grid import Grid
 from pdeloop.report.style import FIELD_MAP, image
 
 HEIGHT = 0.06

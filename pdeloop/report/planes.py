@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import field_range
-from loop_interfaces.grid import Grid
 from pde_sim_node.plant import Plant
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.grid import Grid
 from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
 from pdeloop.report.places import mark_places, supports_of
 from pdeloop.report.style import FIELD_MAP, NAMES

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The common style of a report's figures. A controller's colour: loop_interfaces.controllers.
+"""The common style of a report's figures. A controller's colour: pdeloop.messages.controllers.
 
-Fields are drawn in the colours of loop_interfaces.colour_scale and gains with PuOr, which any colour
+Fields are drawn in the colours of pdeloop.messages.colour_scale and gains with PuOr, which any colour
 vision can read.
 """
 
@@ -15,9 +15,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import LIGHT
-from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.colour_scale import LIGHT
+from pdeloop.messages.controllers import CONTROLLERS
 
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}

@@ -15,7 +15,7 @@ from importlib import metadata
 from typing import Any
 from uuid import uuid4
 
-from loop_interfaces.module_path import SAFE_PATH
+from pdeloop.process.module_path import SAFE_PATH
 from pdeloop.study import training
 from pdeloop.study.deaths import LINES
 from pdeloop.study.description import StudyError

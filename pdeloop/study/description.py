@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.problem import code_from, find_problem
-from loop_interfaces.text import shown
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import code_from, find_problem
+from pdeloop.messages.text import shown
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 

@@ -20,12 +20,12 @@ from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from loop_interfaces.affinity import usable_cores
-from loop_interfaces.module_path import safe_children
-from loop_interfaces.start import die_with
+from pdeloop.process.affinity import usable_cores
+from pdeloop.process.module_path import safe_children
+from pdeloop.process.start import die_with
+from pdeloop.solver.workers import use_cores
 from pdeloop.study import training
 from pdeloop.study.results import Ended
-from spectral_solver.workers import use_cores
 
 AHEAD = 2
 """Trainings for each worker that an executor has at a time, the running ones among them."""

@@ -23,8 +23,8 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from loop_interfaces.documents import parse_json
-from loop_interfaces.files import (
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.files import (
     FileError,
     make_folder,
     open_own,

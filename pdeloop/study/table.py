@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.finished_run import CONFIDENCE, field_means, interval, reduction
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.output import aligned
 from pdeloop.study.description import Study
 from pdeloop.study.results import reading

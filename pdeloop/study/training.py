@@ -21,9 +21,9 @@ import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.files import make_folder, write_atomically
 from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.files import make_folder, write_atomically
 from pdeloop.training_run import built_in
 from tuner_node.build import build_training
 from tuner_node.results import versions

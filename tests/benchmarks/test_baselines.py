@@ -35,9 +35,6 @@ from benchmarks.methods import (
     evaluation_fields,
     measure,
 )
-from loop_method.adapt.registry import offered
-from loop_method.design import lqt
-from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
@@ -45,6 +42,9 @@ from pde_sim_node.plants.batch import BatchPlant
 from pdeloop import cli
 from pdeloop.episode import projected_law, rollout
 from pdeloop.finished_run import interval
+from pdeloop.method.adapt.registry import offered
+from pdeloop.method.design import lqt
+from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.study import Study, StudyError
 from pdeloop.study.results import Ended, read_study, reading, writing
 from pdeloop.study.training import train_one

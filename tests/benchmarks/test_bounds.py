@@ -14,9 +14,9 @@ from benchmarks.bounds import best_inputs, inputs_cost
 from benchmarks.families.cases import Case
 from benchmarks.families.plants import CoupledPendulums, RandomLinear
 from benchmarks.true_model import TrueModel
-from loop_interfaces.action_set import ActionSet
-from loop_method.adapt.closed_loop import ClosedLoop
 from pde_sim_node.plants.loading import as_plant
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.method.adapt.closed_loop import ClosedLoop
 from tests.support.small import SMALL
 
 

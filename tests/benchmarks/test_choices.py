@@ -12,8 +12,8 @@ import pytest
 
 from benchmarks import choices
 from benchmarks.choices import Table, interval, judge
-from loop_interfaces.arrays import Array
-from loop_method.adapt.verdict import ADAPTED, FIRST
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST
 
 COUNT, FRACTIONS = 60, 5
 

@@ -20,10 +20,10 @@ from benchmarks.bounds import (
 )
 from benchmarks.descent import descend
 from benchmarks.limits import FOLDER, find
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.cli import run
 from pdeloop.gradients import Gradients
+from pdeloop.messages.problem import load_parameters
 from tests.support.forked_workers import fork_workers
 from tests.support.made_once import made_once
 from tests.support.plants import Advection, plant_of

@@ -11,8 +11,8 @@ from benchmarks import general
 from benchmarks.families.cases import CASES, PROCESS_CASES
 from benchmarks.families.process import PLANTS, Process
 from benchmarks.families.references import clipped_law, linearisation, predictive_law
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
 
 
 def test_there_are_at_least_twenty_with_names_of_their_own() -> None:

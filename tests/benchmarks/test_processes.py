@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.processes import bench
-from loop_interfaces.module_path import PROJECT
+from pdeloop.process.module_path import PROJECT
 
 pytestmark = pytest.mark.topics
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from controller_node.answered_steps import AnsweredSteps
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, VOID
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED, VOID
 
 RUN, PLANT = 5, 9
 

@@ -10,10 +10,10 @@ import pytest
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
 from tests.support.responding import COSTS, RUN, SETTINGS, explore, models, plant, start, target
 from tests.support.small import same_bits
 

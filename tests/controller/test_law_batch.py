@@ -10,13 +10,13 @@ import pytest
 
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.own_code import OwnCodeError
-from loop_method.laws import Affine, FeedForward, Law, Observer
-from loop_method.laws.base import Parts
-from loop_method.laws.calls import along, laws_of
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.method.laws import Affine, FeedForward, Law, Observer
+from pdeloop.method.laws.base import Parts
+from pdeloop.method.laws.calls import along, laws_of
 from tests.support.small import same_bits
 
 N_Z, N_S, N_A, T = 24, 3, 2, 6

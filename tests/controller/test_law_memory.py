@@ -11,12 +11,12 @@ import pytest
 from controller_node import responder as responder_module
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.model_rows import unpack
-from loop_interfaces.protocol import ModelFailure
-from loop_method.laws import Observer
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.model_rows import unpack
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.method.laws import Observer
 from tests.support.responding import RUN, start, target
 from tests.support.responding import models as affine_models
 from tests.support.small import parameters, same_bits

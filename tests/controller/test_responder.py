@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from controller_node.responder import Responder
-from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.topics import ACTION
+from pdeloop.messages import model_rows
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.topics import ACTION
 from tests.support.responding import RUN, SETTINGS, models, plant, start, target
 from tests.support.small import same_bits
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from controller_node.run_state import MAX_RUNS, Models, RunState, forget
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import MODEL_IDENTIFIED
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import MODEL_IDENTIFIED
 from tests.support.responding import COSTS, RUN, explore, plant, start
 from tests.support.small import same_bits
 

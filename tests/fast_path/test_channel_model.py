@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The hand-over between the middleware's thread and the node's own, over all interleavings.
 
-A model of fast_path.channel: every line of the two programs there is one atomic step.
+A model of pdeloop.fast_path.channel: every line of the two programs there is one atomic step.
 All orders of the steps are explored, with messages that the handler answers and others that it leaves
 alone. The same exploration finds what is wrong with each of several broken protocols.
 """

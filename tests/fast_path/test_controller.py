@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
-from loop_interfaces.topics import ACTION, COMPLETED, VOID
+from pdeloop.messages.frames import HEADER, ArrayCodec, Frame, FrameError
+from pdeloop.messages.topics import ACTION, COMPLETED, VOID
 from tests.support.fast_path_pair import N_A, N_S, N_Z, Controller, armed, fast, with_number
 from tests.support.lockstep import PLANT, RUN
 

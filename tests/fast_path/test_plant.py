@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import HEADER, ArrayCodec, FrameError
-from loop_interfaces.signature import signature
-from loop_interfaces.topics import COST, STATE
+from pdeloop.messages.frames import HEADER, ArrayCodec, FrameError
+from pdeloop.messages.signature import signature
+from pdeloop.messages.topics import COST, STATE
 from tests.support.fast_path_pair import Plant, armed, fast, with_number
 from tests.support.lockstep import PLANT, RUN, is_void
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations.registry import EQUATIONS
 from pde_sim_node.plants.loading import PLANTS
 from pdeloop.cli import COMMANDS
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.laws.registry import OWN_LAWS
 from tests.house.test_house import KNOWS, imports, sources
 from tests.support.interpreter import ROOT
 
@@ -66,7 +66,7 @@ def test_nothing_but_the_registry_names_a_plant(name: str) -> None:
 
 
 def test_nothing_but_the_registry_and_model_based_name_a_law() -> None:
-    own = {f"loop_method/adapt/{name}.py" for name in KNOWING_FEED_FORWARD}
+    own = {f"pdeloop/method/adapt/{name}.py" for name in KNOWING_FEED_FORWARD}
     own |= {"pdeloop/export.py"}  # its form in C
     assert who_names(OWN_LAWS.shipped["feedforward"]) <= {*TABLE["a law"], *own}
 

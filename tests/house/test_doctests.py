@@ -10,15 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = (
-    "loop_interfaces",
-    "spectral_solver",
-    "loop_method",
-    "pde_sim_node",
-    "controller_node",
-    "tuner_node",
-    "pdeloop",
-)
+PACKAGES = ("pdeloop", "pde_sim_node", "controller_node", "tuner_node")
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for package in PACKAGES

@@ -21,12 +21,12 @@ from typing import Any
 import pytest
 import yaml
 
-from loop_interfaces.isolation import NETWORK
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.parameters import flags, table
 from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import ALLOWED
 from pdeloop import cli
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.parameters import flags, table
+from pdeloop.process.isolation import NETWORK
 from tests.house.test_house import imports
 from tests.support.colcon_workspace import ROOT, Workspace, build
 from tests.support.small import SMALL
@@ -57,7 +57,7 @@ def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
     for package in (*packages, "launch"):
         for path in (ROOT / package).rglob("*.py"):
             used |= {name.split(".")[0] for name in imports(path)}
-    needed = {name for name in used if ros.fullmatch(name)} - {"loop_interfaces"}
+    needed = {name for name in used if ros.fullmatch(name)}
     assert {"rclpy", "std_msgs", "launch_ros"} <= needed
     assert needed <= declared
 

@@ -84,7 +84,9 @@ def test_it_holds_the_packages_their_files_and_the_configuration(wheel: Path) ->
         if path.is_file():
             assert f"share/pdeloop/{path.relative_to(ROOT)}" in data, path
     code = {name for name in names if ".dist-info/" not in name and ".data/" not in name}
-    for package in {name.partition("/")[0] for name in code}:
+    packages = {name.partition("/")[0] for name in code}
+    assert {name for name in packages if not name.endswith("_node")} == {"pdeloop"}
+    for package in packages:
         for path in (ROOT / package).rglob("*"):
             if path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc"):
                 assert str(path.relative_to(ROOT)) in code, path

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_interfaces.spec import ParameterError
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.spec import ParameterError
 
 LOW, HIGH = -np.array([0.5, 1.0, 0.2, 3.0]), np.array([0.7, 0.1, 2.0, np.inf])
 SETS = {

@@ -18,7 +18,7 @@ BASES = {
 }
 LOADED = """
 import sys
-from loop_interfaces.own_code import OwnCode
+from pdeloop.messages.own_code import OwnCode
 kind = OwnCode(sys.argv[1], "ALLOWED", {}).load(sys.argv[2])
 print(kind.__mro__[1].__module__.partition(".")[0], kind.number)
 """
@@ -28,7 +28,7 @@ print(kind.__mro__[1].__module__.partition(".")[0], kind.number)
 def test_a_folder_that_holds_a_checkout_hides_no_installed_package(
     tmp_path: Path, word: str
 ) -> None:
-    """The first to import `pdeloop` is the user's file, as in a node."""
+    """Its empty folder `pdeloop` is beside the user's file, which imports `pdeloop`."""
     (tmp_path / "pdeloop").mkdir()
     (tmp_path / "beside.py").write_text("NUMBER = 7\n")
     own = tmp_path / "own.py"
@@ -42,4 +42,4 @@ def test_a_folder_that_holds_a_checkout_hides_no_installed_package(
     )
     assert ended.returncode == 0, ended.stderr
     package, number = ended.stdout.split()
-    assert package in ("loop_method", "pde_sim_node") and number == "7"
+    assert package in ("pdeloop", "pde_sim_node") and number == "7"

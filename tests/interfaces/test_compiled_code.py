@@ -10,8 +10,8 @@ import numba
 import pytest
 from numba.core import caching
 
-from loop_interfaces.files import is_private
-from loop_interfaces.jit.cache import cached_njit
+from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.files import is_private
 from tests.support.interpreter import python
 
 
@@ -37,10 +37,10 @@ def test_a_package_that_was_moved_with_what_it_has_compiled_is_compiled_anew(
     package.mkdir()
     (package / "__init__.py").touch()
     (package / "helper.py").write_text(
-        "from loop_interfaces.jit.cache import jit\n@jit\ndef double(x):\n    return 2 * x\n"
+        "from pdeloop.jit.cache import jit\n@jit\ndef double(x):\n    return 2 * x\n"
     )
     (package / "function.py").write_text(
-        "from loop_interfaces.jit.cache import cached_njit\nfrom .helper import double\n"
+        "from pdeloop.jit.cache import cached_njit\nfrom .helper import double\n"
         "@cached_njit()\ndef function(x):\n    return double(x) + 1\n"
     )
 

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.messages.controllers import CONTROLLERS
 from tuner_node.rollouts import EVALUATED
 
 VISION = {

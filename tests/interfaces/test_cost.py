@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.cost import Cost
+from pdeloop.messages.cost import Cost
 
 N_Z, N_A, T, N_Y = 5, 2, 4, 3
 RNG = np.random.default_rng(0)

@@ -10,8 +10,8 @@ from hashlib import blake2b
 import pytest
 
 from controller_node.identification import DesignSettings
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.signature import DESIGN, design_digest, digest_of
+from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.signature import DESIGN, design_digest, digest_of
 
 N_A, N_S = 4, 3
 

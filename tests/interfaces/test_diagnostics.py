@@ -16,16 +16,16 @@ import pde_sim_node.node
 from controller_node.diagnostics import ControllerDiagnostics
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import Level, Rate, Status
-from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import taken_by
-from loop_interfaces.ros import introspection
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.ros.introspection import Introspection
-from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.build import build_plant
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.real_time import Timing
+from pdeloop.messages.diagnostics import Level, Rate, Status
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.parameters import taken_by
+from pdeloop.messages.topics import COST, STATE, TARGET, VOID
+from pdeloop.ros import introspection
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.ros.introspection import Introspection
 from tests.support.lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.support.small import parameters
 from tests.tuner.test_session import ITERATIONS, Loop, values

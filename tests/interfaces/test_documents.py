@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces import documents, places
-from loop_interfaces.cost import Cost
-from loop_interfaces.documents import MAX_DEPTH, MAX_YAML_NODES, parse_json, parse_yaml
-from loop_interfaces.grid import Grid
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.spec import ParameterError, Spec
-from loop_interfaces.text import MAX_SHOWN, shown
 from pdeloop.cli import FAILED, main
+from pdeloop.messages import documents, places
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.documents import MAX_DEPTH, MAX_YAML_NODES, parse_json, parse_yaml
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.spec import ParameterError, Spec
+from pdeloop.messages.text import MAX_SHOWN, shown
 from tests.support.small import SMALL, parameters
 from tests.support.small_limits import limited
 from tuner_node.run_folder import RunFolder, RunFolderError
@@ -115,7 +115,7 @@ def test_no_command_hangs_on_a_kilobyte_of_yaml(tmp_path, monkeypatch, capsys, c
 def test_no_shipped_yaml_has_an_alias_and_all_of_it_is_read_as_a_library_reads_it():
     import yaml
 
-    root = Path(documents.__file__).parents[1]
+    root = Path(documents.__file__).parents[2]
     found = [p for d in ("config", "examples", "benchmarks") for p in (root / d).rglob("*.yaml")]
     assert len(found) > 10
     for path in found:

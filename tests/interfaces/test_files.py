@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces import array_files
-from loop_interfaces.files import FileError, make_folder, open_own, read_json, write_atomically
-from loop_interfaces.spec import ParameterError, read_document
 from pdeloop.cli import FAILED, main
 from pdeloop.commands import new
+from pdeloop.messages import array_files
+from pdeloop.messages.files import FileError, make_folder, open_own, read_json, write_atomically
+from pdeloop.messages.spec import ParameterError, read_document
 from tuner_node import checkpoint
 
 

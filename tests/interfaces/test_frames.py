@@ -10,8 +10,8 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame, FrameError
-from loop_interfaces.topics import ARRAYS
+from pdeloop.messages.frames import MAX_ID, ArrayCodec, Frame, FrameError
+from pdeloop.messages.topics import ARRAYS
 
 
 def message(labels: tuple[str, ...], frame: Frame) -> Float64MultiArray:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.grid import Axis, Grid
+from pdeloop.messages.grid import Axis, Grid
 
 
 def test_the_points_of_an_axis_are_on_a_circle_on_walls_or_in_cells() -> None:

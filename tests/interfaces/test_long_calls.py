@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from loop_interfaces import long_calls, own_code
-from loop_interfaces.own_code import OwnCodeError, called
+from pdeloop.messages import long_calls, own_code
+from pdeloop.messages.own_code import OwnCodeError, called
 from tests.support.loop_harness import until
 
 LIMIT = 60.0
@@ -26,7 +26,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     watch = long_calls.LongCalls()
     watch.tell = said.append  # type: ignore[method-assign]
     monkeypatch.setattr(long_calls, "PATIENCE", 0.1)
-    monkeypatch.setattr("loop_interfaces.own_code.LONG_CALLS", watch)
+    monkeypatch.setattr("pdeloop.messages.own_code.LONG_CALLS", watch)
     return said
 
 

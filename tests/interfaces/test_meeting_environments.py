@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.isolation import NETWORK
-from loop_interfaces.ros_environment import STEERING, steering, with_servers_there
-from loop_interfaces.start import BLAS_THREADS, OWN
+from pdeloop.process.isolation import NETWORK
+from pdeloop.process.ros_environment import STEERING, steering, with_servers_there
+from pdeloop.process.start import BLAS_THREADS, OWN
 from tests.support.interpreter import ROOT
 
 

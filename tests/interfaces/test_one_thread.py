@@ -9,8 +9,8 @@ from types import ModuleType
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_info, threadpool_limits
 
-from loop_interfaces import one_thread
-from loop_interfaces.start import BLAS_THREADS
+from pdeloop.process import one_thread
+from pdeloop.process.start import BLAS_THREADS
 from tests.support.interpreter import python
 
 
@@ -52,7 +52,7 @@ def test_libraries_are_looked_for_again_when_modules_were_imported(
 
 
 STARTED = """
-from loop_interfaces.start import begin
+from pdeloop.process.start import begin
 begin("a process")
 import scipy.linalg
 from threadpoolctl import threadpool_info

@@ -14,15 +14,15 @@ import pytest
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.serialization import deserialize_message, serialize_message
 
-from loop_interfaces.parameters import NODES, table, taken_by, with_names
-from loop_interfaces.problem import completed, find_problem, load_parameters, shipped_problems
-from loop_interfaces.ros.parameters import descriptor
-from loop_interfaces.spec import ParameterError as Refused
-from loop_interfaces.spec import Spec, check_names
-from loop_method.adapt.registry import offered
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import EQUATIONS, load_equation
 from pde_sim_node.node import physical_specs
+from pdeloop.messages.parameters import NODES, table, taken_by, with_names
+from pdeloop.messages.problem import completed, find_problem, load_parameters, shipped_problems
+from pdeloop.messages.spec import ParameterError as Refused
+from pdeloop.messages.spec import Spec, check_names
+from pdeloop.method.adapt.registry import offered
+from pdeloop.ros.parameters import descriptor
 from tests.support.small import parameters
 from tuner_node.optimizer_parameters import setting_specs
 
@@ -319,7 +319,7 @@ def test_a_plant_that_is_given_as_a_problem_is_told_how_to_be_given(name, tmp_pa
 
 
 def test_what_a_plant_tells_of_itself_is_not_taken_from_a_file_of_all_its_parameters() -> None:
-    from loop_interfaces.ros.parameters import given_parameters
+    from pdeloop.ros.parameters import given_parameters
 
     overrides = {"actuators": "[[0, [0.0, 0.5]]]", "n_a": 3}
     node: Any = SimpleNamespace(
@@ -334,8 +334,8 @@ def test_code_of_a_relative_file_is_the_same_for_a_command_and_a_node(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
 ) -> None:
     """It is next to the file that names it, wherever the command or the node is started."""
-    from loop_interfaces.parameter_file import read_parameter_file
-    from loop_interfaces.ros.parameters import given_parameters, require_parameters
+    from pdeloop.messages.parameter_file import read_parameter_file
+    from pdeloop.ros.parameters import given_parameters, require_parameters
 
     folder, elsewhere = tmp_path / "lab", tmp_path / "elsewhere"
     folder.mkdir(), elsewhere.mkdir()

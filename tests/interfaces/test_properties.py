@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loop_interfaces.frames import HEADER, MAX_ID, ArrayCodec, Frame, FrameError
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.parameter_file import yaml_text
-from loop_interfaces.parameters import table
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.samples import unpack
-from loop_interfaces.spec import ParameterError, Spec, check
+from pdeloop.messages.frames import HEADER, MAX_ID, ArrayCodec, Frame, FrameError
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.parameter_file import yaml_text
+from pdeloop.messages.parameters import table
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.samples import unpack
+from pdeloop.messages.spec import ParameterError, Spec, check
 from tests.support.small import parameters, same_bits
 from tuner_node import checkpoint
 from tuner_node.budget import PURPOSES, Budget

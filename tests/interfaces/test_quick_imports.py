@@ -7,7 +7,7 @@ from tests.support.interpreter import python
 
 PROGRAM = """
 import gc, inspect, sys
-from loop_interfaces.quick_imports import OF_NUMPY, REPORTER, quick_imports
+from pdeloop.process.quick_imports import OF_NUMPY, REPORTER, quick_imports
 with quick_imports():
     assert not gc.isenabled()
     import numba.core.compiler, scipy.linalg

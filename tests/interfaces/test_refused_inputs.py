@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.arrays import float_array
-from loop_interfaces.documents import parse_yaml
-from loop_interfaces.parameters import table
-from loop_interfaces.spec import ParameterError, Spec
+from pdeloop.messages.arrays import float_array
+from pdeloop.messages.documents import parse_yaml
+from pdeloop.messages.parameters import table
+from pdeloop.messages.spec import ParameterError, Spec
 
 NUMBERS = [spec for spec in table() if spec.type is float]
 

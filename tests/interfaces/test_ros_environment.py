@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces import ros_environment
-from loop_interfaces.isolation import NETWORK, PROFILE, loopback_profile
-from loop_interfaces.ros_environment import RosEnvironmentError, prepared, with_log_folder
+from pdeloop.process import ros_environment
+from pdeloop.process.isolation import NETWORK, PROFILE, loopback_profile
+from pdeloop.process.ros_environment import RosEnvironmentError, prepared, with_log_folder
 from pdeloop.supervisor import Child
 from pdeloop.training_run import Waiting
 

@@ -8,8 +8,8 @@ import struct
 
 import pytest
 
-from loop_interfaces.frames import FrameError
-from loop_interfaces.samples import (
+from pdeloop.messages.frames import FrameError
+from pdeloop.messages.samples import (
     ACTION_KIND,
     LIMIT,
     NO_TIME,

@@ -11,11 +11,11 @@ import pytest
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.signature import design_digest
-from loop_interfaces.topics import (
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.signature import design_digest
+from pdeloop.messages.topics import (
     COMPLETED,
     COST,
     MODEL,

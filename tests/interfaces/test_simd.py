@@ -14,7 +14,7 @@ from tests.support.interpreter import python
 PROGRAM = """
 import sys
 import numpy as np, numba
-from loop_interfaces.jit.simd import fma, load, minus_product, store
+from pdeloop.jit.simd import fma, load, minus_product, store
 
 @numba.njit
 def both(x, y, z, plus, minus):

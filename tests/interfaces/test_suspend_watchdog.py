@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import sys, time
-from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
+from pdeloop.ros.suspend_watchdog import SuspendWatchdog
 with SuspendWatchdog() as watchdog:
     print("ready", flush=True)
     end = time.monotonic() + float(sys.argv[1])

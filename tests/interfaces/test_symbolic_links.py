@@ -7,10 +7,10 @@ import os
 
 import pytest
 
-from loop_interfaces.files import FileError, private_folder
 from pde_sim_node import run_record
 from pdeloop import domain, live
 from pdeloop.cli import FAILED, main
+from pdeloop.messages.files import FileError, private_folder
 from pdeloop.training_run import unused
 
 SHOWN = ("behaviour", "gains", "orders", "spectrum")

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, Trajectory, belief, model_based, renewal
-from loop_method.adapt.base import Record
-from loop_method.adapt.belief import Belief, also_in_pieces
-from loop_method.adapt.estimate import Estimate
-from loop_method.adapt.renewal import Renewal, renew_from_states
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.models import FieldModel
-from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
-from loop_method.models.linear import LinearModel
+from pdeloop.method.adapt import Context, Trajectory, belief, model_based, renewal
+from pdeloop.method.adapt.base import Record
+from pdeloop.method.adapt.belief import Belief, also_in_pieces
+from pdeloop.method.adapt.estimate import Estimate
+from pdeloop.method.adapt.renewal import Renewal, renew_from_states
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.models import FieldModel
+from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
+from pdeloop.method.models.linear import LinearModel
 from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
 from tests.support.small import same_bits
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.arrays import Array
-from loop_method.adapt import Context, Trajectory
-from loop_method.models.sensed import Actuators
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt import Context, Trajectory
+from pdeloop.method.models.sensed import Actuators
 from tests.support.sensed import SENSORS
 from tuner_node.build import build_training, remarks_on
 

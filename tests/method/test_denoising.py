@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models.denoising import denoised
+from pdeloop.method.models.denoising import denoised
 
 SIGMA = 0.1
 

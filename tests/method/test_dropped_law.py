@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from loop_method.adapt import RolloutResult, Trajectory, model_based_sensed
+from pdeloop.method.adapt import RolloutResult, Trajectory, model_based_sensed
 from tests.support.sensed_optimiser import measured, optimiser, told
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, stdtr
 
-from loop_method.adapt.estimate import ZERO, Estimate, mean_change, mean_difference, mean_of
-from loop_method.adapt.verdict import (
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change, mean_difference, mean_of
+from pdeloop.method.adapt.verdict import (
     ADAPTED,
     ALL_AGREE,
     FIRST,

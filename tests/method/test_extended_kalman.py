@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ActionSet
-from loop_method.adapt import ModelBased
-from loop_method.adapt.estimated_loop import (
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.method.adapt import ModelBased
+from pdeloop.method.adapt.estimated_loop import (
     FILTER_INFLATION,
     FILTER_MODES,
     UNPREDICTED,
@@ -20,19 +20,19 @@ from loop_method.adapt.estimated_loop import (
     prior,
     root_mean_square,
 )
-from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.whole_field_law import whole_field_law
-from loop_method.laws import ExtendedKalman, Observer
-from loop_method.laws.base import differentiable
-from loop_method.laws.calls import MAX_NUMBER, action, along
-from loop_method.models.sensed import (
+from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.whole_field_law import whole_field_law
+from pdeloop.method.laws import ExtendedKalman, Observer
+from pdeloop.method.laws.base import differentiable
+from pdeloop.method.laws.calls import MAX_NUMBER, action, along
+from pdeloop.method.models.sensed import (
     WAVES,
     coefficients_of,
     field_of,
 )
-from loop_method.models.sensed_filter import SensedFilter
-from loop_method.models.settings import DEFAULTS
+from pdeloop.method.models.sensed_filter import SensedFilter
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.estimated import (
     CUBIC,
     LINEAR,

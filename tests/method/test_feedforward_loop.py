@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import Record
-from loop_method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
-from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.design.tracking import track_horizon
-from loop_method.laws.feedforward import FeedForward
-from loop_method.models.linear import LinearModel
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.adapt import Record
+from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
+from pdeloop.method.adapt.improve import curvature_of, improve
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.design.tracking import track_horizon
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.models.linear import LinearModel
 
 N, N_A, T = 4, 2, 15
 RNG = np.random.default_rng(7)

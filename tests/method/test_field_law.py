@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from controller_node.identification import DesignSettings, design_each, designed
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows, unpack
-from loop_method.design import lqt
-from loop_method.design.field_law import FieldLaw, field_law, linearisation_point, states_under
-from loop_method.design.finite_horizon import finite_horizon
-from loop_method.design.lqt import DesignError
-from loop_method.models import affine_law
-from loop_method.models.choice import Accuracy, FittedModel
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
-from loop_method.models.spectral import SpectralModel
-from loop_method.reduce.reduced_model import ReducedModel
-from loop_method.reduce.settings import IdentificationSettings
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows, unpack
+from pdeloop.method.design import lqt
+from pdeloop.method.design.field_law import FieldLaw, field_law, linearisation_point, states_under
+from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.design.lqt import DesignError
+from pdeloop.method.models import affine_law
+from pdeloop.method.models.choice import Accuracy, FittedModel
+from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.reduce.reduced_model import ReducedModel
+from pdeloop.method.reduce.settings import IdentificationSettings
 from tests.support.small import FEW_FITS
 
 Array = np.ndarray
@@ -139,7 +139,7 @@ def test_stands_alone_where_the_regression_has_no_stabilising_gains(
     def unsolved(*_: object, **__: object) -> None:
         raise DesignError("not stabilisable")
 
-    monkeypatch.setattr("loop_method.design.lqt.track", unsolved)
+    monkeypatch.setattr("pdeloop.method.design.lqt.track", unsolved)
     if noise:  # no model of the whole field either
         with pytest.raises(DesignError, match="not stabilisable"):
             designed([episode(true, noise)], target, settings("field", **FEW_FITS))

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.families import equations, plants
-from loop_interfaces.action_set import ActionSet
-from loop_method.models import FieldModelSettings, Measured, fit_field_model
-from loop_method.models.kinds import NEAR_RIDGES, kinds_of
-from loop_method.models.prediction import errors
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models.kinds import NEAR_RIDGES, kinds_of
+from pdeloop.method.models.prediction import errors
 from tests.support.plants import plant_of
 
 N_Z, N_A = 64, 4

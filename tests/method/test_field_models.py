@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loop_interfaces.arrays import read_only
-from loop_method.models import Measured, affine_law
-from loop_method.models.files import model_of
-from loop_method.models.finite_difference import (
+from pdeloop.messages.arrays import read_only
+from pdeloop.method.models import Measured, affine_law
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.finite_difference import (
     FiniteDifferenceModel,
     features_of,
     neighbour_features,
 )
-from loop_method.models.finite_difference_kernels import advance
-from loop_method.models.linear import LinearModel, add_products
-from loop_method.models.prediction import errors, pieces, predicted
-from loop_method.models.spectral import SpectralModel
+from pdeloop.method.models.finite_difference_kernels import advance
+from pdeloop.method.models.linear import LinearModel, add_products
+from pdeloop.method.models.prediction import errors, pieces, predicted
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.solver import polynomial as compiled
+from pdeloop.solver import polynomial_integrals, polynomial_step
 from pdeloop.training_run import load_compiled, resolve
-from spectral_solver import polynomial as compiled
-from spectral_solver import polynomial_integrals, polynomial_step
 from tests.support.small import SMALL
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from controller_node.identification import DesignSettings, design_each, identify
-from loop_interfaces.arrays import Array
-from loop_method.reduce import dmdc
-from loop_method.reduce.channels import Channels
-from loop_method.reduce.identifiability import CLOSE, NotIdentifiableError, examine
-from loop_method.reduce.order import study_orders
-from loop_method.reduce.regression import exact_regression
+from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce import dmdc
+from pdeloop.method.reduce.channels import Channels
+from pdeloop.method.reduce.identifiability import CLOSE, NotIdentifiableError, examine
+from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.regression import exact_regression
 
 N_Z, N_A, STEPS = 5, 3, 120
 A = np.diag([0.9, 0.8, 0.85, 0.95, 0.7]) + 0.1 * np.eye(N_Z, k=1) - 0.05 * np.eye(N_Z, k=-2)

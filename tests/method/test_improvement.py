@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ANY_ACTION, ActionSet
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import improve
-from loop_method.adapt.initial_fields import averaged_over_shifts, invariant_share, mixtures
-from loop_method.adapt.renewal import Renewal, is_overfitted, renew
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.design.lqt import track
-from loop_method.models.linear import LinearModel
-from loop_method.models.spectral import SpectralModel
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.improve import improve
+from pdeloop.method.adapt.initial_fields import averaged_over_shifts, invariant_share, mixtures
+from pdeloop.method.adapt.renewal import Renewal, is_overfitted, renew
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.design.lqt import track
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 N_Z, N_S, N_A, T = 16, 5, 2, 12
 

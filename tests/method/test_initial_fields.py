@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from loop_method.adapt.base import Record
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.initial_fields import (
+from pdeloop.method.adapt.base import Record
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.initial_fields import (
     any_state_serves,
     initial_fields,
     is_chaotic,

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.model_rows import ModelRows
-from loop_method.design.dead_time import with_dead_time
-from loop_method.design.lqt import track
-from loop_method.laws.observer import Observer
-from loop_method.reduce.input_delay import shifted, study_delays
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.design.dead_time import with_dead_time
+from pdeloop.method.design.lqt import track
+from pdeloop.method.laws.observer import Observer
+from pdeloop.method.reduce.input_delay import shifted, study_delays
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 A = np.array([[0.9, 0.05, 0, 0], [0.05, 0.85, 0.05, 0], [0, 0.05, 0.85, 0.05], [0, 0, 0.05, 0.9]])
 B = np.array([[0.1, 0.0], [0.02, 0.0], [0.0, 0.03], [0.0, 0.12]])

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.own_code import OwnCodeError
-from loop_method.laws import Affine, FeedForward, Law, Observer
-from loop_method.laws.base import differentiable
-from loop_method.laws.calls import MAX_NUMBER, action, along, laws_of, updated
-from loop_method.laws.registry import OWN_LAWS, law_kind, offered
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.method.laws import Affine, FeedForward, Law, Observer
+from pdeloop.method.laws.base import differentiable
+from pdeloop.method.laws.calls import MAX_NUMBER, action, along, laws_of, updated
+from pdeloop.method.laws.registry import OWN_LAWS, law_kind, offered
 
 N_Z, N_S, N_A, T = 7, 3, 2, 5
 SHIPPED = list(OWN_LAWS.shipped.values())
@@ -203,7 +203,7 @@ def test_the_registry_knows_ours_and_refuses_what_is_no_law(monkeypatch, tmp_pat
 
 
 def test_an_installed_package_offers_its_laws_by_name(monkeypatch, tmp_path) -> None:
-    source = "from loop_method.laws import Affine\nclass Tanh(Affine): name = 'tanh'\n"
+    source = "from pdeloop.method.laws import Affine\nclass Tanh(Affine): name = 'tanh'\n"
     (tmp_path / "packaged_law.py").write_text(source)
     about = tmp_path / "packaged-1.0.dist-info"
     about.mkdir()

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models import Measured, fit_field_model
-from loop_method.models.files import model_of
-from loop_method.models.low_rank import LowRankModel
+from pdeloop.method.models import Measured, fit_field_model
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.low_rank import LowRankModel
 
 N_Z, R, N_A = 3000, 5, 2
 RNG = np.random.default_rng(0)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.model_rows import ModelRows, completed, pack, unpack
-from loop_method.design.lqg import kalman_filter, noise_of, require_detectable, with_filter
-from loop_method.design.lqt import DesignError, track
-from loop_method.laws import Observer
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.messages.model_rows import ModelRows, completed, pack, unpack
+from pdeloop.method.design.lqg import kalman_filter, noise_of, require_detectable, with_filter
+from pdeloop.method.design.lqt import DesignError, track
+from pdeloop.method.laws import Observer
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 N, N_A, N_Y = 4, 2, 3
 RNG = np.random.default_rng(8)

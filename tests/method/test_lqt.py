@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_method.design.lqt import DesignError, _steady_state_map, track
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.method.design.lqt import DesignError, _steady_state_map, track
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 N_Z, N_S, N_A = 10, 4, 2
 Q_WEIGHT, R_WEIGHT = 1.5, 0.3

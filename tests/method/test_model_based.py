@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import (
+from pdeloop.method.adapt import (
     Context,
     ModelBased,
     Record,
@@ -20,13 +20,13 @@ from loop_method.adapt import (
     Trajectory,
     model_based,
 )
-from loop_method.adapt.belief import also_around, believe
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST
-from loop_method.design.lqt import track
-from loop_method.models.settings import FieldModelSettings
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.method.adapt.belief import also_around, believe
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST
+from pdeloop.method.design.lqt import track
+from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits
 
 N_Z, N_S, N_A, T = 7, 4, 2, 30

@@ -10,15 +10,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, Record, Rollout, Trajectory, model_based_sensed
-from loop_method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
-from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.model_based_sensed import ModelBasedSensed, gained
-from loop_method.adapt.progress import JUDGING
-from loop_method.adapt.sensed_loop import sensed_from
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.laws import ExtendedKalman, Observer
-from loop_method.models.sensed import SensedModel
+from pdeloop.method.adapt import (
+    Context,
+    ModelBased,
+    Record,
+    Rollout,
+    Trajectory,
+    model_based_sensed,
+)
+from pdeloop.method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
+from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed, gained
+from pdeloop.method.adapt.progress import JUDGING
+from pdeloop.method.adapt.sensed_loop import sensed_from
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.laws import ExtendedKalman, Observer
+from pdeloop.method.models.sensed import SensedModel
 from tests.support.sensed import SENSORS
 from tests.support.sensed_optimiser import N_A, measured, optimiser, small, told
 from tests.support.small import same_bits

@@ -6,22 +6,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models import FieldModel
-from loop_method.models.base import MAX_SUBSTEPS
-from loop_method.models.coarse import CoarseModel
-from loop_method.models.files import FORMS, model_of
-from loop_method.models.finite_difference import (
+from pdeloop.method.models import FieldModel
+from pdeloop.method.models.base import MAX_SUBSTEPS
+from pdeloop.method.models.coarse import CoarseModel
+from pdeloop.method.models.files import FORMS, model_of
+from pdeloop.method.models.finite_difference import (
     FiniteDifferenceModel,
     features_of,
     neighbour_features,
 )
-from loop_method.models.linear import LinearModel
-from loop_method.models.low_rank import LowRankModel
-from loop_method.models.polynomial import PolynomialModel
-from loop_method.models.readings import ReadingsModel
-from loop_method.models.sensed import Actuators, SensedModel, grid_points
-from loop_method.models.sensed_unknowns import EQUATION, FIRST, SHARED, TERMS, unknowns
-from loop_method.models.spectral import SpectralModel
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.polynomial import PolynomialModel
+from pdeloop.method.models.readings import ReadingsModel
+from pdeloop.method.models.sensed import Actuators, SensedModel, grid_points
+from pdeloop.method.models.sensed_unknowns import EQUATION, FIRST, SHARED, TERMS, unknowns
+from pdeloop.method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2
 RNG = np.random.default_rng(0)

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models import FieldModelSettings, fit_field_model
-from loop_method.models.base import Samples
-from loop_method.models.kinds import NEAR_NEEDED, NEAR_RIDGES, kinds_of
-from loop_method.models.neighbour_fit import fit_neighbours
-from loop_method.models.prediction import errors
+from pdeloop.method.models import FieldModelSettings, fit_field_model
+from pdeloop.method.models.base import Samples
+from pdeloop.method.models.kinds import NEAR_NEEDED, NEAR_RIDGES, kinds_of
+from pdeloop.method.models.neighbour_fit import fit_neighbours
+from pdeloop.method.models.prediction import errors
 from tests.support.ordinary import rolled_out
 
 N_X, DT = 12, 0.1

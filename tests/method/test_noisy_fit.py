@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.arrays import Array
-from loop_method.models.base import Measured, Samples
-from loop_method.models.choice import fit_field_model, with_clean
-from loop_method.models.denoising import smoothed
-from loop_method.models.filtering import filtered
-from loop_method.models.kinds import FORMS
-from loop_method.models.noisy_fit import fit_noisy, significant
-from loop_method.models.prediction import errors
-from loop_method.models.settings import FieldModelSettings
-from loop_method.models.spectral import SpectralModel
-from loop_method.models.spectral_fit import fit_spectral
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.base import Measured, Samples
+from pdeloop.method.models.choice import fit_field_model, with_clean
+from pdeloop.method.models.denoising import smoothed
+from pdeloop.method.models.filtering import filtered
+from pdeloop.method.models.kinds import FORMS
+from pdeloop.method.models.noisy_fit import fit_noisy, significant
+from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.models.spectral_fit import fit_spectral
 
 POINTS, ACTUATORS, STEPS, NOISE = 64, 4, 60, 0.2
 SETTINGS = FieldModelSettings()

@@ -8,19 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import curvature_of, improve
-from loop_method.adapt.observed_loop import ObservedLoop
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.design.lqt import track
-from loop_method.laws import Observer
-from loop_method.laws.calls import along
-from loop_method.models.linear import LinearModel
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.improve import curvature_of, improve
+from pdeloop.method.adapt.observed_loop import ObservedLoop
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.design.lqt import track
+from pdeloop.method.laws import Observer
+from pdeloop.method.laws.calls import along
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits
 
 N_Z, N, N_A, T, LIMIT = 6, 3, 2, 12, 0.4

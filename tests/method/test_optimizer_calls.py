@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.own_code import OwnCodeError
-from loop_method.adapt import Rollout, RolloutResult, StepOptimizer, calls
-from loop_method.adapt.two_point import TwoPoint, TwoPointSettings
+from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.method.adapt import Rollout, RolloutResult, StepOptimizer, calls
+from pdeloop.method.adapt.two_point import TwoPoint, TwoPointSettings
 
 POLICY = np.zeros((2, 3))
 SIZE = POLICY.size

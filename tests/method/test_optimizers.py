@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Optimizer, RolloutResult, TwoPoint
-from loop_method.adapt.two_point import TwoPointSettings, direction
-from loop_method.seeds import field_seed
+from pdeloop.method.adapt import Optimizer, RolloutResult, TwoPoint
+from pdeloop.method.adapt.two_point import TwoPointSettings, direction
+from pdeloop.method.seeds import field_seed
 
 SHAPE = (2, 6)
 N_A, N_S = 2, 3

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.arrays import Array
-from loop_interfaces.cost import Cost
-from loop_method.laws.plans import Planner
-from loop_method.models.base import FieldModel
-from loop_method.models.finite_difference import Feature, FiniteDifferenceModel
-from loop_method.models.linear import LinearModel
-from loop_method.models.spectral import SpectralModel
-from loop_method.models.sweep import ModelSweep, SpectralSweep
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.laws.plans import Planner
+from pdeloop.method.models.base import FieldModel
+from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.models.sweep import ModelSweep, SpectralSweep
 
 N_Z, N_A, T = 16, 2, 30
 

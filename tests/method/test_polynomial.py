@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.models import Measured, fit_field_model
-from loop_method.models.base import Samples
-from loop_method.models.files import model_of
-from loop_method.models.polynomial import PolynomialModel, fit_polynomial
+from pdeloop.method.models import Measured, fit_field_model
+from pdeloop.method.models.base import Samples
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.polynomial import PolynomialModel, fit_polynomial
 
 N_Z, N_A, T = 5, 2, 60
 

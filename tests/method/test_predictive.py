@@ -10,19 +10,19 @@ import pytest
 
 import pdeloop
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.spec import ParameterError
-from loop_method.adapt.base import Context, Rollout, RolloutResult, Trajectory
-from loop_method.adapt.model_based import ModelBased
-from loop_method.adapt.model_based_predictive import ModelBasedPredictive
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.laws import Affine, Predictive
-from loop_method.laws.calls import action, updated
-from loop_method.laws.plans import Planner
-from loop_method.models.files import LARGEST, packed, unpacked
-from loop_method.models.settings import FieldModelSettings
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.laws import Affine, Predictive
+from pdeloop.method.laws.calls import action, updated
+from pdeloop.method.laws.plans import Planner
+from pdeloop.method.models.files import LARGEST, packed, unpacked
+from pdeloop.method.models.settings import FieldModelSettings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
 
 RNG = np.random.default_rng(1)

@@ -12,8 +12,8 @@ import pytest
 import scipy  # whose signal module loads when it is used
 from scipy import linalg
 
-from loop_method.design.lqt import track
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.method.design.lqt import track
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 RNG = np.random.default_rng(1)
 A = np.diag([0.9, 0.7, 0.5]) + 0.1 * RNG.standard_normal((3, 3))

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError
-from loop_method.adapt import ModelBased, Optimizer, TwoPoint
-from loop_method.adapt.registry import offered, optimizer_kind
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.settings import Settings, setting
+from pdeloop.messages.problem import shipped_problems
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt import ModelBased, Optimizer, TwoPoint
+from pdeloop.method.adapt.registry import offered, optimizer_kind
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.settings import Settings, setting
 from pdeloop.problem_values import problem_values
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import settings_of, training_parameters
 
 FOREIGN = """
-from loop_method.adapt.two_point import TwoPoint
+from pdeloop.method.adapt.two_point import TwoPoint
 
 class Halved(TwoPoint):
     name = "halved"

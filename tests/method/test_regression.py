@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from loop_method.reduce import dmdc
-from loop_method.reduce.regression import exact_regression
+from pdeloop.method.reduce import dmdc
+from pdeloop.method.reduce.regression import exact_regression
 from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
 from tuner_node.exploration import least_variance
 

@@ -8,19 +8,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
-from loop_method.adapt.belief import believe
-from loop_method.adapt.estimate import ZERO, Estimate, mean_of
-from loop_method.adapt.model_based_readings import ModelBasedReadings
-from loop_method.adapt.replay import best_measured, step
-from loop_method.adapt.replayed_loop import ReplayedLoop
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import ADAPTED, FIRST, evidence_of
-from loop_method.design.lqg import law_of_innovations
-from loop_method.laws import Observer
-from loop_method.models.files import model_of
-from loop_method.models.readings import ReadingsModel
-from loop_method.reduce.subspace import subspace_model
+from pdeloop.method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
+from pdeloop.method.adapt.belief import believe
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
+from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.replay import best_measured, step
+from pdeloop.method.adapt.replayed_loop import ReplayedLoop
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of
+from pdeloop.method.design.lqg import law_of_innovations
+from pdeloop.method.laws import Observer
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.readings import ReadingsModel
+from pdeloop.method.reduce.subspace import subspace_model
 
 N, N_Y, N_A, T, SIGMA, ORDER = 5, 2, 2, 40, 0.1, 5
 RNG = np.random.default_rng(11)

@@ -12,8 +12,9 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import pdeloop
-from loop_method.models import sensed_fit
-from loop_method.models.sensed import (
+from pdeloop.episode import rollout
+from pdeloop.method.models import sensed_fit
+from pdeloop.method.models.sensed import (
     Actuators,
     SensedEquation,
     coefficients_of,
@@ -21,18 +22,17 @@ from loop_method.models.sensed import (
     interpolated,
     sensed_model,
 )
-from loop_method.models.sensed_fit import fit_sensed, part_by_part
-from loop_method.models.sensed_growth import Found
-from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import COEFFICIENTS, SHARED, TERMS, unknowns
-from loop_method.models.settings import (
+from pdeloop.method.models.sensed_fit import fit_sensed, part_by_part
+from pdeloop.method.models.sensed_growth import Found
+from pdeloop.method.models.sensed_problem import SensedProblem
+from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, SHARED, TERMS, unknowns
+from pdeloop.method.models.settings import (
     DEFAULTS,
     SENSED_HELD_RIDGE,
     SENSED_HOPELESS,
     SENSED_REPRODUCED,
 )
-from loop_method.models.spectral import SpectralModel
-from pdeloop.episode import rollout
+from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 from tests.support.small import same_bits
 

@@ -10,12 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.arrays import Array
-from loop_method.models.files import model_of
-from loop_method.models.sensed import SensedModel, sensed_model
-from loop_method.models.sensed_fit import with_coefficients_of_x
-from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import (
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.sensed import SensedModel, sensed_model
+from pdeloop.method.models.sensed_fit import with_coefficients_of_x
+from pdeloop.method.models.sensed_problem import SensedProblem
+from pdeloop.method.models.sensed_unknowns import (
     COEFFICIENTS,
     EQUATION,
     TERMS,
@@ -23,7 +23,7 @@ from loop_method.models.sensed_unknowns import (
     unknowns,
     well_posed,
 )
-from loop_method.models.settings import DEFAULTS
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 from tests.support.small import same_bits
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from loop_method.models.sensed import SensedEquation, grid_points, interpolated, sensed_model
-from loop_method.models.sensed_fit import fit_sensed
-from loop_method.models.sensed_flow import SensedFlow
-from loop_method.models.sensed_unknowns import (
+from pdeloop.method.models.sensed import SensedEquation, grid_points, interpolated, sensed_model
+from pdeloop.method.models.sensed_fit import fit_sensed
+from pdeloop.method.models.sensed_flow import SensedFlow
+from pdeloop.method.models.sensed_unknowns import (
     COEFFICIENTS,
     EQUATION,
     FIRST,
@@ -17,8 +17,8 @@ from loop_method.models.sensed_unknowns import (
     TERMS,
     unknowns,
 )
-from loop_method.models.settings import DEFAULTS
-from loop_method.models.spectral import SpectralModel
+from pdeloop.method.models.settings import DEFAULTS
+from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import SENSORS, equally_spaced, readings_of
 
 Array = np.ndarray

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from loop_interfaces.arrays import Array
-from loop_method.models import sensed_growth
-from loop_method.models.sensed import SensedEquation, grid_points, sensed_model
-from loop_method.models.sensed_growth import Found, further_terms, start_with
-from loop_method.models.sensed_problem import SensedProblem
-from loop_method.models.sensed_unknowns import COEFFICIENTS, FIRST, TERMS, unknowns, well_posed
-from loop_method.models.settings import DEFAULTS
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models import sensed_growth
+from pdeloop.method.models.sensed import SensedEquation, grid_points, sensed_model
+from pdeloop.method.models.sensed_growth import Found, further_terms, start_with
+from pdeloop.method.models.sensed_problem import SensedProblem
+from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, FIRST, TERMS, unknowns, well_posed
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 from tests.support.small import same_bits
 

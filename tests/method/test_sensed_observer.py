@@ -6,19 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.adapt import Context, Record, Trajectory
-from loop_method.adapt.belief import Belief
-from loop_method.adapt.model_based_sensed import cheapest, weighted
-from loop_method.adapt.observer_design import compensators, law_theta
-from loop_method.adapt.sensed_loop import SensedLoop, sensed_loop
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
-from loop_method.laws import Observer
-from loop_method.models.files import model_of
-from loop_method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
-from loop_method.models.sensed_fit import fit_sensed
-from loop_method.models.sensed_smoothing import Smoothing
-from loop_method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
+from pdeloop.method.adapt import Context, Record, Trajectory
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.model_based_sensed import cheapest, weighted
+from pdeloop.method.adapt.observer_design import compensators, law_theta
+from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_loop
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
+from pdeloop.method.laws import Observer
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
+from pdeloop.method.models.sensed_fit import fit_sensed
+from pdeloop.method.models.sensed_smoothing import Smoothing
+from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
 from tests.support.sensed import SENSORS
 from tests.support.sensed_optimiser import FEW_ITERATIONS, N_A, rows_of
 from tests.support.small import same_bits

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from loop_method.models.sensed import sensed_model
-from loop_method.models.sensed_fit import few_rollouts, fit_sensed
-from loop_method.models.sensed_unknowns import TERMS, unknowns
-from loop_method.models.settings import DEFAULTS
+from pdeloop.method.models.sensed import sensed_model
+from pdeloop.method.models.sensed_fit import few_rollouts, fit_sensed
+from pdeloop.method.models.sensed_unknowns import TERMS, unknowns
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 
 STEPS, N_A = 30, 3

@@ -9,13 +9,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import pdeloop
-from loop_interfaces.actuators import extents
-from loop_method.adapt import Context, Record, Trajectory
-from loop_method.adapt.sensed_loop import differ, sensed_from
-from loop_method.models.sensed import SensedModel
-from loop_method.models.sensed_unknowns import COEFFICIENTS, SHARED
-from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
+from pdeloop.messages.actuators import extents
+from pdeloop.method.adapt import Context, Record, Trajectory
+from pdeloop.method.adapt.sensed_loop import differ, sensed_from
+from pdeloop.method.models.sensed import SensedModel
+from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, SHARED
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import SENSORS
 
 FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=5, sensed_last_iterations=8)

@@ -10,23 +10,23 @@ import pytest
 
 import pdeloop
 from controller_node.identification import DesignSettings
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.spec import (
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.spec import (
     FIELD_MODEL_SETTINGS,
     IDENTIFICATION_SETTINGS,
     OPTIMIZER_SETTINGS,
     ParameterError,
 )
-from loop_method.adapt import Context, ModelBased, TwoPoint
-from loop_method.adapt.base import Record
-from loop_method.adapt.belief import believe
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.design.lqg import noise_of
-from loop_method.laws.registry import OWN_LAWS, law_kind
-from loop_method.models import FieldModelSettings, Measured, fit_field_model
-from loop_method.reduce.order import study_orders
-from loop_method.reduce.settings import IdentificationSettings
-from loop_method.settings import Settings, setting
+from pdeloop.method.adapt import Context, ModelBased, TwoPoint
+from pdeloop.method.adapt.base import Record
+from pdeloop.method.adapt.belief import believe
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.design.lqg import noise_of
+from pdeloop.method.laws.registry import OWN_LAWS, law_kind
+from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.settings import IdentificationSettings
+from pdeloop.method.settings import Settings, setting
 from tests.support.interpreter import ROOT
 from tests.support.small import SMALL
 from tuner_node.build import build_training

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.models import FieldModelSettings, Measured, fit_field_model
-from loop_method.models.coarse import CoarseModel, coarse_points
-from loop_method.models.files import model_of
-from loop_method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models.coarse import CoarseModel, coarse_points
+from pdeloop.method.models.files import model_of
+from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
 
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.cost import Cost
-from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
-from loop_method.adapt.in_coordinates import CostInCoordinates, InCoordinates
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.trajectories import LowRankTrajectory, kept
-from loop_method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis, factored
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
+from pdeloop.method.adapt.in_coordinates import CostInCoordinates, InCoordinates
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.trajectories import LowRankTrajectory, kept
+from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis, factored
 from tests.support.small import same_bits
 
 N_Z, RANK, N_A, N_S, T = LARGE + 52, 9, 2, 4, 12

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.cost import Cost
-from loop_method.design.lqg import kalman_filter, law_of_innovations
-from loop_method.design.lqt import DesignError, track_outputs
-from loop_method.laws import Observer
-from loop_method.reduce.channels import Channels
-from loop_method.reduce.identifiability import NotIdentifiableError
-from loop_method.reduce.subspace import InnovationModel, subspace_model
+from pdeloop.messages.cost import Cost
+from pdeloop.method.design.lqg import kalman_filter, law_of_innovations
+from pdeloop.method.design.lqt import DesignError, track_outputs
+from pdeloop.method.laws import Observer
+from pdeloop.method.reduce.channels import Channels
+from pdeloop.method.reduce.identifiability import NotIdentifiableError
+from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 N, N_A, N_Y = 4, 2, 3
 RNG = np.random.default_rng(2)

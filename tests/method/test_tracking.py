@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.cost import Cost
-from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
-from loop_method.design.lqt import track
-from loop_method.design.tracking import track_horizon
-from loop_method.models.linear import LinearModel
-from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.design.finite_horizon import finite_horizon, finite_horizon_of
+from pdeloop.method.design.lqt import track
+from pdeloop.method.design.tracking import track_horizon
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 N, N_A, T, N_Y = 4, 2, 9, 3
 RNG = np.random.default_rng(3)

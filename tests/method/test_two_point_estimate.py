@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_method.adapt.two_point import direction, gradient
-from loop_method.seeds import field_seed
+from pdeloop.method.adapt.two_point import direction, gradient
+from pdeloop.method.seeds import field_seed
 
 SHAPE = (3, 4)
 

@@ -11,19 +11,19 @@ import scipy
 
 import pdeloop
 from controller_node.identification import Designed, DesignSettings, designed
-from loop_interfaces.model_rows import pack
-from loop_method.adapt import Context, Record, Trajectory, undeclared_noise
-from loop_method.adapt.belief import Belief
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.models import Measured
-from loop_method.models import undeclared_noise as of_models
-from loop_method.models.linear import LinearModel
-from loop_method.models.noise_level import noise_level, short_waves
-from loop_method.models.settings import DEFAULTS
-from loop_method.models.undeclared_noise import fit_undeclared_noise
-from loop_method.models.whiteness import correlations, is_white
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.model_rows import pack
+from pdeloop.method.adapt import Context, Record, Trajectory, undeclared_noise
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.models import Measured
+from pdeloop.method.models import undeclared_noise as of_models
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.noise_level import noise_level, short_waves
+from pdeloop.method.models.settings import DEFAULTS
+from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
+from pdeloop.method.models.whiteness import correlations, is_white
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import misjudged_noise, warnings

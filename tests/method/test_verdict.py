@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Record
-from loop_method.adapt.estimate import ZERO, Estimate, mean_of
-from loop_method.adapt.renewal import choose_fraction, held_out_fraction
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.verdict import (
+from pdeloop.method.adapt import Record
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
+from pdeloop.method.adapt.renewal import choose_fraction, held_out_fraction
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
     NONE,

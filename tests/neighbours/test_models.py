@@ -12,9 +12,9 @@ import pytest
 import scipy  # whose modules load when they are used
 
 import pdeloop
-from loop_method.design.lqg import kalman_filter
-from loop_method.design.lqt import DesignError
-from loop_method.reduce.subspace import subspace_model
+from pdeloop.method.design.lqg import kalman_filter
+from pdeloop.method.design.lqt import DesignError
+from pdeloop.method.reduce.subspace import subspace_model
 from tests.support.interpreter import ROOT
 
 A = 0.95 * np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])

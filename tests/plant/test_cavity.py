@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_method.design.tracking import track_horizon
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.cavity import Cavity
+from pdeloop.method.design.tracking import track_horizon
 
 NU = 0.05
 

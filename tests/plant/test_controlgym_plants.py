@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plants import SpectralPlant
+from pdeloop.messages.problem import load_parameters
 
 DATA = Path(__file__).parents[1] / "data"
 SEMILINEAR = ("kuramoto-sivashinsky", "fisher", "cahn-hilliard", "ginzburg-landau")

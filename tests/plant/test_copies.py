@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plant import Plant
 from pdeloop.api import Problem
+from pdeloop.messages.problem import shipped_problems
 from tests.support.small import SMALL, same_bits
 
 ROOT = Path(__file__).parents[2]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.cost import Cost
-from loop_interfaces.spec import ParameterError
-from loop_method.design.tracking import track_horizon
 from pde_sim_node.build import build_plant
 from pdeloop.bags.verify import verify
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.design.tracking import track_horizon
 from tests.support.recorded_here import record_run
 from tests.support.small import FEW_FITS, SMALL, same_bits
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import (
     ALLOWED,
@@ -36,6 +35,7 @@ from pde_sim_node.equations.random_modes import (
     BurgersModes,
     KortewegDeVriesModes,
 )
+from pdeloop.messages.problem import load_parameters
 
 ALL = pytest.mark.parametrize("kind", EQUATIONS.values(), ids=EQUATIONS.keys())
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.build import build_plant
 from pde_sim_node.plants import fmu
 from pde_sim_node.plants.loading import as_plant, make
 from pdeloop.cli import main
+from pdeloop.messages.own_code import OwnCodeError
 from tests.support.fmus import euler_step, exact_step, rod
 
 pytestmark = [

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Instruments, Plant
 from pdeloop.cli import main
+from pdeloop.messages.own_code import OwnCodeError
 from tests.support.interpreter import ROOT
 from tuner_node.narration import COSTLIER
 

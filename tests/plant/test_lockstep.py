@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.topics import COMPLETED, COST, STATE, VOID, CostColumn
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.topics import COMPLETED, COST, STATE, VOID, CostColumn
 from tests.support.lockstep import (
     PLANT,
     RUN,

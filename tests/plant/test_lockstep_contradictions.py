@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from loop_interfaces.topics import COST, VOID, CostColumn
 from pde_sim_node.taken_actions import REMEMBERED
+from pdeloop.messages.topics import COST, VOID, CostColumn
 from tests.support.lockstep import (
     RUN,
     answer,

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COST, PAUSED, STATE
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord, forget
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COST, PAUSED, STATE
 from tests.support.lockstep import (
     RUN,
     answer,

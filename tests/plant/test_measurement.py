@@ -11,11 +11,6 @@ import pytest
 
 import pdeloop
 from controller_node.policy import ProjectedLaw, excitation
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.grid import Grid
-from loop_interfaces.parameters import measured_size
-from loop_interfaces.topics import StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import Equation
 from pde_sim_node.instruments import (
@@ -28,6 +23,11 @@ from pde_sim_node.plant import Instruments, Plant
 from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.real_time import Timing
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.grid import Grid
+from pdeloop.messages.parameters import measured_size
+from pdeloop.messages.topics import StartColumn
 from tests.support.small import FEW_STEPS, parameters, same_bits, train_here
 from tuner_node.build import build_training
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.spec import ParameterError
-from loop_method.adapt import ModelBased
-from loop_method.design.finite_horizon import finite_horizon_of
-from loop_method.design.tracking import track_horizon
-from loop_method.laws.calls import laws_of
-from loop_method.laws.feedforward import FeedForward
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt import ModelBased
+from pdeloop.method.design.finite_horizon import finite_horizon_of
+from pdeloop.method.design.tracking import track_horizon
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.feedforward import FeedForward
 from tests.support.small import FEW_FITS
 
 N_Z, N_A, T = 6, 2, 20

@@ -27,7 +27,7 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     path = tmp_path / "fisher.py"
     program = (
         "import sys; from pde_sim_node.equations import load_equation;"
-        "from spectral_solver.pointwise import pointwise_loop;"
+        "from pdeloop.solver.pointwise import pointwise_loop;"
         "pointwise_loop(load_equation(sys.argv[1]).nonlinearity)"
     )
 

@@ -13,10 +13,10 @@ import pytest
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries, Schrodinger
 from pde_sim_node.plant import DIVERGED_COST
 from pde_sim_node.plants import SpectralPlant
+from pdeloop.solver import workers
+from pdeloop.solver.kernel import fine_length
+from pdeloop.solver.reference import ReferenceStep
 from pdeloop.training_run import load_compiled, resolve
-from spectral_solver import workers
-from spectral_solver.kernel import fine_length
-from spectral_solver.reference import ReferenceStep
 from tests.support.interpreter import python
 from tests.support.small import SMALL
 from tests.support.spectral_plants import P1, P2, P3, P10, PROBLEMS, make, unforced

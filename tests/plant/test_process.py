@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.plants.loading import as_plant, make
 from pdeloop.cli import main
+from pdeloop.messages.own_code import OwnCodeError
 from tests.support.interpreter import ROOT
 
 EXAMPLES = ROOT / "examples" / "processes"

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import STATE
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.real_time import RealTimePacer, Timing
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import STATE
 from tests.support.small import parameters, same_bits
 
 

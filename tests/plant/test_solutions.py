@@ -19,7 +19,7 @@ from pde_sim_node.equations import (
     Wave,
 )
 from pde_sim_node.plants import SpectralPlant
-from spectral_solver.exact import exact_propagator
+from pdeloop.solver.exact import exact_propagator
 from tests.support.plants import plant_of
 
 

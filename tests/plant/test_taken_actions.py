@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame, digest
-from loop_interfaces.topics import VOID, CostColumn
 from pde_sim_node.taken_actions import Episode, TakenActions
+from pdeloop.messages.frames import Frame, digest
+from pdeloop.messages.topics import VOID, CostColumn
 
 SIGNATURE = -0.25
 TAKEN = np.ones((1, 2))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.own_code import OwnCodeError
 from pde_sim_node.plants import DynamicsPlant
+from pdeloop.messages.own_code import OwnCodeError
 from tests.support.linear_dynamics import Linear
 
 

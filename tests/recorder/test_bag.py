@@ -16,13 +16,13 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
-from loop_interfaces.episodes import episode_name, episode_number
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import START, STATE
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.identification import identify_bag
+from pdeloop.messages.episodes import episode_name, episode_number
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import START, STATE
 from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import DIAGNOSTICS, ROSOUT, Source, sources

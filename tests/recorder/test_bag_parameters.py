@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from loop_interfaces.parameters import PLANT
-from loop_interfaces.topics import TARGET
 from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.cli import main
 from pdeloop.identification import identify_bag
+from pdeloop.messages.parameters import PLANT
+from pdeloop.messages.topics import TARGET
 from recorder_node.bag import BagError
 from recorder_node.sources import PARAMETERS_TOPIC
 from tests.support.converted import convert

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from loop_interfaces.topics import STATE
 from pdeloop.bags.reader import Bag
+from pdeloop.messages.topics import STATE
 from recorder_node import bag as bag_module
 from recorder_node.bag import BagError
 from recorder_node.recording import Recording

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.recorded_run import RecordedRun
 from pdeloop.bags.verify import verify
 from pdeloop.cli import main
 from pdeloop.identification import identify_bag
+from pdeloop.messages.spec import ParameterError
 from recorder_node.bag import BagError
 from tests.support.converted import convert
 from tests.support.written_bag import written

@@ -15,9 +15,9 @@ from rclpy.serialization import deserialize_message
 from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.reader import Bag
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import ACTION, COST, START, STATE
 from recorder_node.recording import Recording
 from recorder_node.sources import ARRAY_TYPE, CLOCK, sources
 from tests.support.converted import convert

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import ACTION, COST, MODEL, POLICY, START, STATE, TARGET, VOID, Topic
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import Report, verify
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import ACTION, COST, MODEL, POLICY, START, STATE, TARGET, VOID, Topic
 from recorder_node.recording import Recording
 from tests.support.written_bag import BY_TOPIC, RUN, SECOND, WHAT, encode, frame, recorded_episode
 

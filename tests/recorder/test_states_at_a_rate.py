@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import STATE
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
+from pdeloop.messages.frames import ArrayCodec
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import STATE
 from pdeloop.pairs import Transport
 from recorder_node.bag import BagError
 from recorder_node.recording import Recording, large_bag

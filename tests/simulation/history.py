@@ -7,7 +7,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from loop_interfaces.topics import ACTION, START
+from pdeloop.messages.topics import ACTION, START
 from tests.simulation.agenda import Agenda
 from tests.simulation.disk import Disk
 from tests.simulation.network import Network

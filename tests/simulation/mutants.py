@@ -33,7 +33,7 @@ from unittest import mock
 
 import pytest
 
-from loop_interfaces.affinity import usable_cores
+from pdeloop.process.affinity import usable_cores
 from tests.simulation.audit import undisturbed, verdict
 from tests.simulation.equivalent import ARGUED
 from tests.simulation.operators import mutations
@@ -84,7 +84,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "controller_node.answered_steps": _CONTROLLER,
     "controller_node.law_batch": (*_MEMORY, *_CONTROLLER),
     "controller_node.exploration": _CONTROLLER,
-    "loop_interfaces.signature": _SIGNATURE,
+    "pdeloop.messages.signature": _SIGNATURE,
 }
 """The modules that are changed, and their tests."""
 ENDS = {4: "simulation", 2: "tests", 3: "time limit", 0: "survived"}

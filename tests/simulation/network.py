@@ -10,11 +10,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from loop_interfaces.episodes import EPISODES_PER_START
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.signature import digest_of
-from loop_interfaces.topics import (
+from pdeloop.messages.episodes import EPISODES_PER_START
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.signature import digest_of
+from pdeloop.messages.topics import (
     ACTION,
     COST,
     MODEL,

@@ -18,10 +18,15 @@ import numpy as np
 from controller_node import identification
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.frames import Frame
-from loop_interfaces.problem import load_parameters
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.topics import (
+from pde_sim_node.build import build_plant, complete
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.plant import Plant
+from pde_sim_node.plants.loading import hand_over
+from pde_sim_node.real_time import Timing
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.problem import load_parameters
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.topics import (
     ACTION,
     COST,
     MODEL,
@@ -33,12 +38,7 @@ from loop_interfaces.topics import (
     TARGET,
     Topic,
 )
-from loop_method.adapt import ModelBased, RolloutResult
-from pde_sim_node.build import build_plant, complete
-from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.plant import Plant
-from pde_sim_node.plants.loading import hand_over
-from pde_sim_node.real_time import Timing
+from pdeloop.method.adapt import ModelBased, RolloutResult
 from tests.simulation.disk import Disk
 from tests.support.plants import Rods
 from tests.support.small import FEW_STEPS, parameters

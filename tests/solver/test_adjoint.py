@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plants import SpectralPlant
 from pdeloop.episode import projected_law, rollout
 from pdeloop.gradients import Gradients
+from pdeloop.messages.problem import load_parameters
 from tests.support.plants import Advection, plant_of
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")

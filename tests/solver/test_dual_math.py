@@ -15,8 +15,8 @@ import pytest
 
 from pde_sim_node.equations import AllenCahn
 from pdeloop.gradients import Gradients
-from spectral_solver.adjoint import derivative_loop
-from spectral_solver.dual_math import PAIRS, on_duals
+from pdeloop.solver.adjoint import derivative_loop
+from pdeloop.solver.dual_math import PAIRS, on_duals
 from tests.support.plants import plant_of
 
 POINTS = np.array([0.2, 0.35, 0.8])

@@ -10,7 +10,7 @@ import pytest
 
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries
 from pde_sim_node.plants import SpectralPlant
-from spectral_solver.etdrk4 import etdrk4_coefficients
+from pdeloop.solver.etdrk4 import etdrk4_coefficients
 from tests.support.plants import plant_of
 
 MAGNITUDES = np.array([0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 0.99, 1.0, 1.01, 1.5, 2.0, 5.0, 30.0])

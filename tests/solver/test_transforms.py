@@ -7,10 +7,10 @@ import numba
 import numpy as np
 import pytest
 
-from loop_interfaces.jit.simd import WIDTH
-from spectral_solver.fft import fft, is_transform_length, one_pass, pass8, plane_size
-from spectral_solver.memory import Constants, aligned, lay_out
-from spectral_solver.spectra import TRANSFORM, analyse, synthesise
+from pdeloop.jit.simd import WIDTH
+from pdeloop.solver.fft import fft, is_transform_length, one_pass, pass8, plane_size
+from pdeloop.solver.memory import Constants, aligned, lay_out
+from pdeloop.solver.spectra import TRANSFORM, analyse, synthesise
 
 PLAN = np.dtype(
     [

@@ -15,8 +15,8 @@ import pytest
 
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plants import SpectralPlant
-from spectral_solver import workers
-from spectral_solver.workers import SolverThreads, use_cores
+from pdeloop.solver import workers
+from pdeloop.solver.workers import SolverThreads, use_cores
 from tests.support.interpreter import ROOT, helps_solver, python
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
@@ -58,7 +58,7 @@ def test_a_small_step_is_compiled_code_alone_and_a_large_one_is_shared() -> None
     program = """
 import os, threading
 import numpy as np
-from spectral_solver import workers
+from pdeloop.solver import workers
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plants import SpectralPlant
 from tests.solver.test_workers import P1, rollout
@@ -85,8 +85,8 @@ def test_helpers_leave_the_core_that_their_process_is_kept_on() -> None:
     cores = sorted(os.sched_getaffinity(0))
     program = f"""
 import sys
-from loop_interfaces.affinity import pin_process
-from spectral_solver import workers
+from pdeloop.process.affinity import pin_process
+from pdeloop.solver import workers
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plants import SpectralPlant
 from tests.solver.test_workers import P1, rollout

@@ -20,7 +20,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from loop_interfaces.start import die_with
+from pdeloop.process.start import die_with
 
 COMMAND = [
     "chromium",

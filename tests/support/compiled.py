@@ -8,9 +8,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
-from loop_method.models.linear import LinearModel
-from loop_method.models.spectral import SpectralModel
+from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.training_run import load_compiled, resolve
 from tests.support.small import SMALL
 

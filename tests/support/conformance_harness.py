@@ -10,8 +10,12 @@ from typing import Any
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.topics import (
+from pdeloop.conformance.controller import ControllerCheck
+from pdeloop.conformance.plant import PlantCheck
+from pdeloop.conformance.probing import FAILED, Check, Message
+from pdeloop.conformance.tuner import TunerCheck
+from pdeloop.messages.protocol import ModelFailure, Publication
+from pdeloop.messages.topics import (
     ACTION,
     COST,
     MODEL,
@@ -23,10 +27,6 @@ from loop_interfaces.topics import (
     TARGET,
     Topic,
 )
-from pdeloop.conformance.controller import ControllerCheck
-from pdeloop.conformance.plant import PlantCheck
-from pdeloop.conformance.probing import FAILED, Check, Message
-from pdeloop.conformance.tuner import TunerCheck
 from pdeloop.problem_check import Finding
 from tests.support.lockstep import plant_protocol
 from tests.support.small import parameters

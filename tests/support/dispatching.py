@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, START, VOID
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED, START, VOID
 from tests.support.small import dispatcher_of
 from tuner_node.batch import Batch
 from tuner_node.dispatch import Dispatcher

@@ -15,11 +15,11 @@ import numpy as np
 from controller_node.fast_path import ControllerFastPath
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces import model_rows
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import HEADER, ArrayCodec, Frame
-from loop_interfaces.topics import ACTION, STATE
 from pde_sim_node.fast_path import PlantFastPath
+from pdeloop.messages import model_rows
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import HEADER, ArrayCodec, Frame
+from pdeloop.messages.topics import ACTION, STATE
 from tests.support.lockstep import PLANT, RUN, plant_protocol
 
 N_Z, N_S, N_A = 37, 5, 3

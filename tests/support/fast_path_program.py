@@ -12,13 +12,13 @@ import numpy as np
 import rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from fast_path.channel import CAPACITY, LARGE
-from loop_interfaces.frames import HEADER
-from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
-from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.sample_subscription import SerializedSubscription
-from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
-from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
+from pdeloop.fast_path.channel import CAPACITY, LARGE
+from pdeloop.messages.frames import HEADER
+from pdeloop.messages.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
+from pdeloop.messages.topics import ACTION, COST, STATE, VOID, CostColumn
+from pdeloop.ros.endpoints import raw_subscription, samples_qos
+from pdeloop.ros.node_loop import NodeLoop
+from pdeloop.ros.sample_subscription import SerializedSubscription
 from tests.support.fast_path_pair import Controller, Plant, with_number
 from tests.support.loop_harness import until
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import scipy.linalg
 
-from loop_interfaces.arrays import Array
+from pdeloop.messages.arrays import Array
 
 SOURCE = Path(__file__).with_name("rod_fmu.c")
 SEGMENTS, STEPS, SAMPLE = 20, 40, 0.1

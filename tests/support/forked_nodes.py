@@ -18,8 +18,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from loop_interfaces.start import run
 from pdeloop import supervisor
+from pdeloop.process.start import run
 
 
 def fork_nodes(folder: Path) -> None:

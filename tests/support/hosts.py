@@ -13,8 +13,8 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from loop_interfaces.isolation import PROFILE
-from loop_interfaces.problem import config_folder
+from pdeloop.messages.problem import config_folder
+from pdeloop.process.isolation import PROFILE
 
 INTERFACE = "lan0"
 

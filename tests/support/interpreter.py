@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from loop_interfaces.affinity import SOLVER
+from pdeloop.process.affinity import SOLVER
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 600.0

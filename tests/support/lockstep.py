@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import Publication
-from loop_interfaces.topics import COST, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.real_time import Timing
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import Publication
+from pdeloop.messages.topics import COST, STATE, VOID, CostColumn
 from tests.support.small import parameters
 
 RUN = 11

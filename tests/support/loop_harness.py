@@ -30,11 +30,11 @@ import pytest
 
 import pdeloop.domain
 import pdeloop.live
-from loop_interfaces.isolation import loopback_environment
-from loop_interfaces.start import BLAS_THREADS, die_with
 from pde_sim_node import run_record
 from pdeloop import supervisor
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
+from pdeloop.process.isolation import loopback_environment
+from pdeloop.process.start import BLAS_THREADS, die_with
 from tests.support import forked_nodes
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_method.models import Measured
+from pdeloop.method.models import Measured
 
 
 def rolled_out(rate, start, force, actions, step, internal):

@@ -26,7 +26,7 @@ from benchmarks.processes import (
     ended_well,
     progress,
 )
-from loop_interfaces.parameter_file import yaml_text
+from pdeloop.messages.parameter_file import yaml_text
 from pdeloop.pairs import namespaces
 from tests.support.hosts import environment, hosts, on
 from tests.support.interpreter import ROOT

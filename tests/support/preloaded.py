@@ -26,8 +26,8 @@ import tests.support.forked_workers
 import tests.support.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
-from loop_interfaces.one_thread import one_thread
 from pdeloop import cli
+from pdeloop.process.one_thread import one_thread
 from tests.support.compiled import COMPILED
 
 MAINS = {

@@ -13,13 +13,16 @@ import numpy as np
 import yaml
 
 from controller_node.identification import DesignSettings, design_each
-from loop_interfaces.arrays import Array
-from loop_interfaces.documents import parse_yaml
-from loop_interfaces.episodes import EPISODES_PER_START
-from loop_interfaces.frames import Frame
-from loop_interfaces.samples import clock_message
-from loop_interfaces.signature import design_digest, digest_of, signature
-from loop_interfaces.topics import (
+from pdeloop.bags.mcap_messages import Message
+from pdeloop.bags.reader import Bag
+from pdeloop.in_process import LocalPair
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.documents import parse_yaml
+from pdeloop.messages.episodes import EPISODES_PER_START
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.samples import clock_message
+from pdeloop.messages.signature import design_digest, digest_of, signature
+from pdeloop.messages.topics import (
     ACTION,
     COMPLETED,
     COST,
@@ -32,9 +35,6 @@ from loop_interfaces.topics import (
     CostColumn,
     Topic,
 )
-from pdeloop.bags.mcap_messages import Message
-from pdeloop.bags.reader import Bag
-from pdeloop.in_process import LocalPair
 from recorder_node.bag import FILE, METADATA, BagWriter, Channel
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, source_of, sources

@@ -10,11 +10,11 @@ import numpy as np
 from controller_node.identification import DesignSettings
 from controller_node.policy import excitation
 from controller_node.responder import Responder
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED
 from pde_sim_node.build import build_plant
 from pde_sim_node.plants import SpectralPlant
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED
 from tests.support.small import parameters, same_bits
 from tuner_node.batch import Batch
 

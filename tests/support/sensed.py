@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.arrays import Array
-from loop_method.models.sensed import Actuators, SensedModel
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.sensed import Actuators, SensedModel
 
 SENSORS = 8
 

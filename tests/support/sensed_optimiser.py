@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 import pdeloop
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import Context, ModelBased, Optimizer, Rollout, RolloutResult, Trajectory
-from loop_method.adapt.model_based_sensed import ModelBasedSensed
-from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.laws import Observer
-from loop_method.models.settings import DEFAULTS
 from pdeloop.episode import rollout
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.adapt import Context, ModelBased, Optimizer, Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.laws import Observer
+from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import SENSORS
 
 Array = np.ndarray

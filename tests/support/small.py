@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from loop_method.adapt import ModelBased
-from loop_method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.in_process import LocalPair, train
+from pdeloop.method.adapt import ModelBased
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher

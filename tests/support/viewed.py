@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import COMPLETED
 
 PLANT = 7
 

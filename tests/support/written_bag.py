@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import ACTION, COST, START, STATE
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import ACTION, COST, START, STATE
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, sources
 

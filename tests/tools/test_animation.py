@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pdeloop import animation
 from pdeloop.animation import FRAMES_PER_SECOND, HOLD, pictures
 from pdeloop.cli import FAILED, main
 from pdeloop.finished_run import load_run
+from pdeloop.method.seeds import Purpose, derive
 from pdeloop.report import page
 from pdeloop.report.data import ProblemData, behaviours
 from tests.support.small import SMALL

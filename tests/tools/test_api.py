@@ -13,9 +13,9 @@ import pytest
 
 import pdeloop
 from controller_node.law_batch import MemoryUnknownError
-from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
 from pdeloop.interruption import Interruption
+from pdeloop.method.seeds import Purpose, derive
 from tests.support.interpreter import python
 from tests.support.small import SMALL, same_bits
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.action_set import ActionSet
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.report.held_actions import FEW, saturated, share_text
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.jit.native import MachineCode
 from pdeloop.cli import main
+from pdeloop.jit.native import MachineCode
 from tests.support.small import SMALL
 
 TRAIN = ("train", str(SMALL))

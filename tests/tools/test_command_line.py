@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.loop_parameters import read_problem
 from pdeloop import cli
 from pdeloop.cli import main
 from pdeloop.commands import problems
+from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.output import print_json
 from tests.support.interpreter import python
 from tests.support.small import SMALL

@@ -18,14 +18,14 @@ import pytest
 
 from controller_node.law_batch import LawBatch
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.spec import ParameterError
-from loop_method.laws.extended_kalman import ExtendedKalman
 from pdeloop.cli import FAILED, main
 from pdeloop.comparison import compare
 from pdeloop.export import GainLaw, Parameters, curve_csv
 from pdeloop.finished_run import load_run
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.study.table import reduction_texts
 from tests.support.small import SMALL
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import ACTION, START, TARGET, Topic
 from pdeloop.conformance.controller import ControllerCheck
 from pdeloop.conformance.plant import PlantCheck
 from pdeloop.conformance.probing import Message
 from pdeloop.conformance.tuner import TunerCheck
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import ACTION, START, TARGET, Topic
 from tests.support.conformance_harness import MAKERS, findings, named, plant
 
 ONE_FIELD = {f"physical.amplitude_{end}": 1.0 for end in ("min", "max")}

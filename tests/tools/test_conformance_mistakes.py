@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import Publication
-from loop_interfaces.topics import (
+from pdeloop.conformance.probing import FAILED, Check, Message
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import Publication
+from pdeloop.messages.topics import (
     ACTION,
     COST,
     MODEL,
@@ -27,7 +28,6 @@ from loop_interfaces.topics import (
     StartColumn,
     Topic,
 )
-from pdeloop.conformance.probing import FAILED, Check, Message
 from tests.support.conformance_harness import (
     MAKERS,
     Mistake,

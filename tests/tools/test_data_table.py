@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.files import FileError
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import Measurements, read_measurements
+from pdeloop.messages.files import FileError
 from tests.support.linear_system import linear_system, trajectory
 
 STATES, ACTIONS = (np.round(part, 3) for part in trajectory(*linear_system(4), steps=60))

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.start import PARENT, die_with
 from pdeloop import cli, training_run
 from pdeloop.cli import main, parser
 from pdeloop.commands import problems
 from pdeloop.interruption import Interruption, interruptible
 from pdeloop.pairs import Transport
+from pdeloop.process.start import PARENT, die_with
 from pdeloop.supervisor import START
 from pdeloop.training_run import continuing
 from tests.support.interpreter import ROOT, python
@@ -99,7 +99,7 @@ def test_a_signal_ends_any_command_and_the_start_of_a_node_with_one_line(
     )
     for program, words in (
         ("pdeloop", ["-c", command]),
-        ("slow", ["-m", "loop_interfaces.start", "slow"]),
+        ("slow", ["-m", "pdeloop.process.start", "slow"]),
     ):
         done = subprocess.run(
             [sys.executable, *words],
@@ -118,7 +118,7 @@ def test_a_node_ends_with_its_code_and_nothing_after_it(tmp_path: Path) -> None:
         "def main():\n    print('done')\n    return 75\n"
     )
     done = subprocess.run(
-        [sys.executable, "-m", "loop_interfaces.start", "short"],
+        [sys.executable, "-m", "pdeloop.process.start", "short"],
         env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
         capture_output=True,
         text=True,
@@ -177,7 +177,7 @@ def test_a_node_whose_supervisor_has_ended_before_it_began_ends_too() -> None:
     [("pde_sim_node", "rclpy", "ros"), ("recorder_node", "mcap", "record")],
 )
 def test_a_node_names_what_is_not_installed(node: str, module: str, extra: str) -> None:
-    code = f"import sys; sys.modules[{module!r}] = None; from loop_interfaces.start import run; "
+    code = f"import sys; sys.modules[{module!r}] = None; from pdeloop.process.start import run; "
     done = python("-c", f"{code} assert run({node!r}) == 1")
     assert re.fullmatch(rf"{node}: needs {module}: .*'pdeloop\[{extra}\]'\n", done.stderr)
 

@@ -18,12 +18,12 @@ from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import RecordVideo as RecordVideos
 
 import pdeloop
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.environments import environment_id
 from pdeloop.environments.picture import Picture
 from pdeloop.frames import Frames
+from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.problem import shipped_problems
 
 BURGERS = "pdeloop/Burgers-v0"
 GRID: dict[str, Any] = {"n_z": 32, "horizon": 4}

@@ -18,9 +18,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import pdeloop
-from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import Environment, VectorEnvironment, environment_id
+from pdeloop.messages.problem import shipped_problems
 from tests.support.loop_harness import forked
 from tests.support.small import same_bits
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.cli import main
 from pdeloop.evaluation import changed, outcome
+from pdeloop.messages.spec import ParameterError
 from tests.support.small import SMALL
 from tuner_node.narration import failed, warnings
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from controller_node.law_batch import LawBatch
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.model_rows import ModelRows
-from loop_method.laws import Affine, Law
-from loop_method.laws.feedforward import FeedForward
-from loop_method.laws.observer import Observer
 from pdeloop.export import GainLaw, Parameters
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.laws import Affine, Law
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.observer import Observer
 from tests.tools.test_compare_and_export import DOUBLES, compiled
 
 N_Z, N_S, N_A, T = 6, 3, 4, 12

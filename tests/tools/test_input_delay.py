@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from loop_interfaces.model_rows import ModelRows
 from pdeloop.cli import main
+from pdeloop.messages.model_rows import ModelRows
 from tests.method.test_input_delay import A, B, K, cost_with_delay, logged
 from tests.tools.test_cli import error_of
 

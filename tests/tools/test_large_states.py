@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.arrays import Array
-from loop_interfaces.spec import ParameterError
-from loop_method.reduce.channels import state_faults
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.reduce.channels import state_faults
 from pdeloop.training_run import check_messages, resolve
 from tuner_node.batch import EPISODE_BYTES, MESSAGE_BYTES, most_environments
 from tuner_node.build import build_training

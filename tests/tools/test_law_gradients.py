@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.model_rows import ModelRows
-from loop_method.laws import Affine, FeedForward, Law, Observer
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.laws import Affine, FeedForward, Law, Observer
 
 N_Z, N_A, N_S, T, SEEDS = 6, 2, 3, 12, [3, 1]
 

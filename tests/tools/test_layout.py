@@ -13,10 +13,10 @@ import pytest
 from benchmarks import batch as bench_batch
 from benchmarks import train as bench_train
 from benchmarks.__main__ import parser as benchmarks_parser
-from loop_interfaces import affinity
-from loop_interfaces.spec import ParameterError
 from pdeloop import pairs
 from pdeloop.cli import main
+from pdeloop.messages.spec import ParameterError
+from pdeloop.process import affinity
 from pdeloop.supervisor import Child, keep_on
 from pdeloop.training_run import resolve
 from tests.support.small import SMALL

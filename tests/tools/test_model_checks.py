@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.one_thread import one_thread
-from loop_method.reduce.reduced_model import ReducedModel, Trajectory, steps_of
-from loop_method.reduce.regression import fit
 from pdeloop.cli import main
+from pdeloop.method.reduce.reduced_model import ReducedModel, Trajectory, steps_of
+from pdeloop.method.reduce.regression import fit
 from pdeloop.model_checks import fit_percent, largest_pole, residuals, stability
+from pdeloop.process.one_thread import one_thread
 from tests.method.test_input_delay import logged
 from tests.tools.test_cli import error_of
 

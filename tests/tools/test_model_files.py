@@ -13,10 +13,10 @@ import pytest
 from scipy.io import loadmat
 
 import pdeloop
-from loop_interfaces.arrays import Array
 from pdeloop.cli import main
 from pdeloop.finished_run import FinishedRun
 from pdeloop.law_form import law_form
+from pdeloop.messages.arrays import Array
 from tests.support.small import SMALL
 
 LIMIT = 0.2

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.problem import read_problem, shipped_problems
-from loop_interfaces.spec import ParameterError
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import FAILED, main
 from pdeloop.commands.new import write
+from pdeloop.messages.problem import read_problem, shipped_problems
+from pdeloop.messages.spec import ParameterError
 
 GROWS = "test_a_small_wave_grows_as_the_equation_says"
 LINEAR = "return self.rate - self.diffusivity * k**2"

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_method.adapt import Rollout, StepOptimizer
-from loop_method.adapt.registry import OWN_OPTIMIZERS
-from loop_method.laws import Affine
-from loop_method.laws.calls import along
-from loop_method.laws.registry import OWN_LAWS
 from pdeloop.cli import main
 from pdeloop.evaluation import evaluate
 from pdeloop.finished_run import load_run
 from pdeloop.in_process import LocalPair
+from pdeloop.method.adapt import Rollout, StepOptimizer
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.laws import Affine
+from pdeloop.method.laws.calls import along
+from pdeloop.method.laws.registry import OWN_LAWS
 from pdeloop.report.data import ReportData, of_run
 from pdeloop.report.page import _facts, _of_problem
 from tests.support.interpreter import ROOT

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_method.adapt import RolloutResult
-from loop_method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.cli import main
+from pdeloop.method.adapt import RolloutResult
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from tests.support.interpreter import ROOT
 from tests.support.small import SMALL, same_bits
 from tuner_node.build import build_training

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.loop_parameters import read_problem
-from loop_interfaces.own_code import OwnCodeError
-from loop_interfaces.problem import load_parameters
-from loop_method.models import kinds
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import main
+from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.messages.problem import load_parameters
+from pdeloop.method.models import kinds
 from tests.support.interpreter import ROOT, python
 from tests.support.small import FEW_FITS, same_bits
 

@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import pdeloop
-from loop_interfaces.frames import Frame
-from loop_interfaces.places import Box, boxes_of, parse, text_of
 from pde_sim_node.plants.loading import as_plant
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.places import Box, boxes_of, parse, text_of
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
 from viewer_node.loop_view import LoopView

@@ -12,15 +12,15 @@ import pytest
 
 import pdeloop
 from controller_node.identification import DesignSettings, designed
-from loop_interfaces.model_rows import pack
-from loop_interfaces.topics import CostColumn
-from loop_method.laws.calls import laws_of
-from loop_method.laws.extended_kalman import ExtendedKalman
 from pde_sim_node.build import build_plant
 from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
 from pdeloop.control_effect import judged
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.model_rows import pack
+from pdeloop.messages.topics import CostColumn
+from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.problem_check import check
 from pdeloop.training_run import resolve
 from tests.support.small import SMALL, parameters

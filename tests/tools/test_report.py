@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.report.data import gather
 from tests.support.browser import browser
 from tests.support.loop_harness import processes

@@ -13,10 +13,10 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from loop_interfaces.colour_scale import DARK
-from loop_interfaces.controllers import CONTROLLERS
-from loop_method.reduce.order import study_orders
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.colour_scale import DARK
+from pdeloop.messages.controllers import CONTROLLERS
+from pdeloop.method.reduce.order import study_orders
 from pdeloop.report.dark import BACK, INK, darken
 from pdeloop.report.data import gather
 from pdeloop.report.learning import bars

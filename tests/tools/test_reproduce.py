@@ -10,11 +10,11 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from loop_interfaces.topics import CostColumn
-from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
 from pdeloop.finished_run import interval, reduction
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.topics import CostColumn
+from pdeloop.method.seeds import Purpose, derive
 from pdeloop.reproduction import LEARNED, beside_the_paper, reproduction_in, runs_of
 from pdeloop.study.results import read_study, writing
 from pdeloop.study.table import beside_no_control, rows

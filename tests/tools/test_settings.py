@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 import pdeloop
-from loop_interfaces.parameters import table
-from loop_interfaces.spec import ParameterError
 from pdeloop.cli import FAILED, main
 from pdeloop.commands.settings import OWN_FLAGS, read_settings
 from pdeloop.finished_run import load_run
+from pdeloop.messages.parameters import table
+from pdeloop.messages.spec import ParameterError
 from tests.support.small import SMALL
 
 QUICK = ("--set", "evaluation_fields=2", "--set", "optimizer=two-point")

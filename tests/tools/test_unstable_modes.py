@@ -11,7 +11,6 @@ import pytest
 import scipy.fft
 
 import pdeloop
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plants import SpectralPlant
@@ -19,6 +18,7 @@ from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.loading import as_plant
 from pde_sim_node.plants.reactions import Plate
 from pdeloop import problem_check, unstable_modes
+from pdeloop.messages.problem import load_parameters
 from pdeloop.unstable_modes import (
     REACHED,
     controllability,

@@ -16,9 +16,9 @@ import pytest
 
 import pdeloop
 import pdeloop.environments
-from loop_interfaces.arrays import Array
 from pdeloop.environments import Environment, ResidualAction, warm_start
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.arrays import Array
 from tests.support.small import SMALL
 
 LIMIT = 0.3

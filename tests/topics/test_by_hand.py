@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.start import die_with
+from pdeloop.process.start import die_with
 from tests.support.loop_harness import ROOT, Processes
 
 pytestmark = pytest.mark.topics

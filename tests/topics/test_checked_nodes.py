@@ -35,8 +35,8 @@ DEAF = """
 import rclpy, time
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.ros.endpoints import writer_qos
-from loop_interfaces.topics import COST, START, STATE, TARGET
+from pdeloop.ros.endpoints import writer_qos
+from pdeloop.messages.topics import COST, START, STATE, TARGET
 rclpy.init()
 node = rclpy.create_node("deaf")
 for topic in (STATE, COST, TARGET):
@@ -73,10 +73,10 @@ DRAINS = """
 import time
 from functools import partial
 import numpy as np, rclpy
-from loop_interfaces.frames import Frame
-from loop_interfaces.ros.endpoints import Sender
-from loop_interfaces.ros.node_main import ros_node
-from loop_interfaces.topics import ACTION, STATE
+from pdeloop.messages.frames import Frame
+from pdeloop.ros.endpoints import Sender
+from pdeloop.ros.node_main import ros_node
+from pdeloop.messages.topics import ACTION, STATE
 from pdeloop.conformance.node import RosTransport
 with ros_node("checks", [], partial(RosTransport, (STATE,), "")) as (node, transport):
     sender = Sender(rclpy.create_node("plant"), STATE)

@@ -26,8 +26,8 @@ pytestmark = pytest.mark.topics
 
 STUCK = """
 import rclpy
-from loop_interfaces.ros import node_loop
-from loop_interfaces.topics import ACTION, STATE
+from pdeloop.ros import node_loop
+from pdeloop.messages.topics import ACTION, STATE
 from tests.support.fast_path_pair import Controller
 node_loop.HOUSEKEEPING = node_loop.WAIT = 600.0  # as long as a wait until a moment that was set back
 rclpy.init()

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.model_rows import unpack
-from loop_interfaces.problem import load_parameters
-from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
+from pdeloop.messages.model_rows import unpack
+from pdeloop.messages.problem import load_parameters
+from pdeloop.method.seeds import Purpose, derive
 from tests.support.loop_harness import ROOT, Processes, until
 from tests.support.small_loop import LIMIT
 from tests.support.undrawn import report
@@ -56,7 +56,7 @@ def example(name: str) -> Any:
 
 def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> None:
     source = (EXAMPLES / "saturated_controller.py").read_text()
-    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
+    assert not re.search(r"import (pde_sim_node|controller_node|pdeloop)", source)
     mark = "examples/saturated_controller.py"
     loop.node("pde_sim_node", *ros_arguments(mark, "pde_sim_node"))
     controller = ros_arguments(mark, "python examples/saturated_controller.py")

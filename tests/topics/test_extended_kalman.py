@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import pdeloop
-from loop_method.laws import ExtendedKalman
+from pdeloop.method.laws import ExtendedKalman
 from tests.support.loop_harness import Processes
 from tests.support.small import same_bits
 from tests.support.small_loop import LIMIT

@@ -30,8 +30,8 @@ def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: P
 RESTLESS = """
 import gc, math, sys, time
 from collections import Counter
-from fast_path.handler import FastPath
-from loop_interfaces.ros.node_loop import NodeLoop
+from pdeloop.fast_path.handler import FastPath
+from pdeloop.ros.node_loop import NodeLoop
 from {0}.node import main
 interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run
 def restless(self, housekeeping, *, deadline=lambda: None, **others):
@@ -75,7 +75,7 @@ def test_a_protocol_that_changes_hands_all_the_time_loses_nothing(
 
 WITHOUT = """
 import sys
-sys.modules["fast_path"] = None
+sys.modules["pdeloop.fast_path"] = None
 from {0}.node import FAST_PATH, main
 assert FAST_PATH is None
 sys.exit(main())

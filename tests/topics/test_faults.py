@@ -31,8 +31,8 @@ from tuner_node.batch import Batch, BatchResult
 pytestmark = pytest.mark.topics
 STOPS_WHILE_IT_STARTS = """
 import os, signal, sys
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros import node_loop, observer
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros import node_loop, observer
 
 class Body:
     def __init__(self, node, loop):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from loop_interfaces.model_rows import unpack
-from loop_method.seeds import Purpose, derive
+from pdeloop.messages.model_rows import unpack
+from pdeloop.method.seeds import Purpose, derive
 from tests.support.loop_harness import ROOT, Processes
 from tests.support.small_loop import LIMIT
 
@@ -40,7 +40,7 @@ def test_a_linear_plant_of_ordinary_messages_is_identified_and_tuned(
 ) -> None:
     source = PLANT.read_text()
     assert "pdeloop" not in re.sub(r'#.*|"""[^"]*"""', "", source)
-    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
+    assert not re.search(r"import (pde_sim_node|controller_node|pdeloop)", source)
     space: dict[str, np.ndarray] = {"__name__": "linear_plant"}
     exec(compile(source.split("VOLATILE =")[0], "linear_plant", "exec"), space)
     A, B, target = (np.asarray(space[name]) for name in ("A", "B", "TARGET"))

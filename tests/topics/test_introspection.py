@@ -162,9 +162,9 @@ BAD_START = """
 import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import writer_qos
-from loop_interfaces.topics import START
+from pdeloop.messages.frames import ArrayCodec, Frame
+from pdeloop.ros.endpoints import writer_qos
+from pdeloop.messages.topics import START
 rclpy.init()
 node = rclpy.create_node("stranger")
 publisher = node.create_publisher(Float64MultiArray, START.name, writer_qos(START))
@@ -298,8 +298,8 @@ def test_a_second_node_of_the_same_name_is_reported(loop: Processes):
 
 COMPUTES = """
 import time
-from loop_interfaces.diagnostics import Status, Level
-from loop_interfaces.ros.node_main import ros_node
+from pdeloop.messages.diagnostics import Status, Level
+from pdeloop.ros.node_main import ros_node
 fits = 0
 def housekeeping(now):
     global fits

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.isolation import (
+from pdeloop.domain import DomainError, own_domain
+from pdeloop.messages.problem import config_folder
+from pdeloop.process.isolation import (
     NETWORK,
     PROFILE,
     check_profile,
     loopback_environment,
     outside_sockets,
 )
-from loop_interfaces.problem import config_folder
-from pdeloop.domain import DomainError, own_domain
 from tests.support.loop_harness import ROOT, Processes, udp_sockets, until
 from tests.support.small_loop import (
     LIMIT,
@@ -38,7 +38,7 @@ import time
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
-from loop_interfaces import topics
+from pdeloop.messages import topics
 rclpy.init()
 node = rclpy.create_node("of_another_type")
 names = [value.name for value in vars(topics).values() if isinstance(value, topics.Topic)]
@@ -85,7 +85,7 @@ def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_pa
     if not shutil.which(alone[0]) or subprocess.run([*alone, "true"]).returncode != 0:
         pytest.skip("needs root, and the right to make namespaces")
     sources = tmp_path / "copy"
-    for folder in ("loop_interfaces", "controller_node", "config"):
+    for folder in ("pdeloop", "controller_node", "config"):
         shutil.copytree(ROOT / folder, sources / folder)
     (sources / "config" / "fastdds_loopback.xml").write_text(
         "<dds><profiles><nothing/></profiles></dds>"

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.protocol import NO_CONTROLLER
-from loop_interfaces.topics import MAX_GAIN
+from pdeloop.messages.protocol import NO_CONTROLLER
+from pdeloop.messages.topics import MAX_GAIN
 from tests.support.loop_harness import Processes, until
 from tests.support.small import SMALL, parameters, train_here
 from tests.support.small_loop import (

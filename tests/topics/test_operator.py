@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from loop_interfaces.protocol import STOPPED
+from pdeloop.messages.protocol import STOPPED
 from tests.support.loop_harness import Processes, until
 from tests.support.operator_harness import SLOW, full_speed, operator
 from tests.support.small import SMALL
@@ -35,8 +35,8 @@ def complaints(text: str) -> list[str]:
 JOINED_AGAIN = """
 import rclpy
 from rclpy.parameter import Parameter
-from loop_interfaces.parameters import PLANT
-from loop_interfaces.ros.parameters import declare, on_change, take_over
+from pdeloop.messages.parameters import PLANT
+from pdeloop.ros.parameters import declare, on_change, take_over
 
 rclpy.init()
 former = rclpy.create_node("plant")
@@ -216,7 +216,7 @@ def test_the_command_line_ends_with_a_stopped_tuner(loop: Processes, tmp_path):
 QUEUED = """
 import rclpy, threading
 from std_srvs.srv import Trigger
-from loop_interfaces.ros import node_loop
+from pdeloop.ros import node_loop
 rclpy.init()
 node_loop.SERVING = 60.0  # on a busy machine one call may take as long as a round has
 node, desk = rclpy.create_node("served"), rclpy.create_node("desk")
@@ -280,7 +280,7 @@ def test_a_malformed_request_for_parameters_is_refused_and_harms_no_node(loop: P
 
 REFUSED_AT_THE_END = """
 import rclpy
-from loop_interfaces.ros import node_loop
+from pdeloop.ros import node_loop
 rclpy.init()
 loop = node_loop.NodeLoop(rclpy.create_node("served"))
 rounds = 0

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import pdeloop
-from loop_method.laws.registry import OWN_LAWS
+from pdeloop.method.laws.registry import OWN_LAWS
 from tests.support.loop_harness import Processes, until
 from tests.support.small import SMALL, parameters, same_bits, train_here
 from tests.support.small_loop import LIMIT, adapted, assert_same_training

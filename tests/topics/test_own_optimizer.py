@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import pdeloop
-from loop_method.adapt.registry import OWN_OPTIMIZERS
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from tests.support.loop_harness import Processes
 from tests.support.small import SMALL, same_bits
 from tests.support.small_loop import LIMIT

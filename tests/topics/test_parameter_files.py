@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from loop_interfaces.parameter_file import read_parameter_file
-from loop_interfaces.spec import ParameterError
+from pdeloop.messages.parameter_file import read_parameter_file
+from pdeloop.messages.spec import ParameterError
 from tests.support.loop_harness import Processes
 from tests.support.small import SMALL
 
@@ -21,7 +21,7 @@ RCLPY = """
 import json, sys
 import rclpy
 from rclpy.node import Node
-from loop_interfaces.isolation import keep_on_this_machine
+from pdeloop.process.isolation import keep_on_this_machine
 
 keep_on_this_machine()
 folder, *nodes = sys.argv[1:]

@@ -92,8 +92,8 @@ def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
 INTAKE = """
 import rclpy, time
 from std_msgs.msg import String
-from loop_interfaces.ros.endpoints import raw_subscription
-from loop_interfaces.ros.sample_subscription import SerializedSubscription
+from pdeloop.ros.endpoints import raw_subscription
+from pdeloop.ros.sample_subscription import SerializedSubscription
 rclpy.init()
 node = rclpy.create_node("intake")
 intake = SerializedSubscription(raw_subscription(node, String, "words", 50), String, 50)
@@ -172,9 +172,9 @@ LATE_SUBSCRIPTION = """
 import time
 import rclpy
 from std_msgs.msg import Float64MultiArray, String
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, writer_qos
-from loop_interfaces.topics import MODEL, RECORDER_STATUS, START
+from pdeloop.messages.episodes import episode_name
+from pdeloop.ros.endpoints import raw_subscription, reader_qos, writer_qos
+from pdeloop.messages.topics import MODEL, RECORDER_STATUS, START
 
 rclpy.init()
 node = rclpy.create_node("late")
@@ -219,8 +219,8 @@ MATCHING = """
 import sys, time
 import rclpy, rclpy.executors
 from std_msgs.msg import String
-from loop_interfaces.ros import parameters
-from loop_interfaces.ros.peers import Peers
+from pdeloop.ros import parameters
+from pdeloop.ros.peers import Peers
 from recorder_node.matching import PATIENCE, Matching
 
 rclpy.init()

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.model_rows import pack
 from pdeloop.bags.mcap_messages import files
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.model_rows import pack
 from recorder_node.bag import BagWriter, Channel
 from recorder_node.sources import PARAMETERS_TOPIC
 from tests.support.loop_harness import until

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.arrays import Array
 from pdeloop.cli import main
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.arrays import Array
 from pdeloop.ros2_package import write_package
 from tests.support.loop_harness import Processes
 from tests.support.small import SMALL

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from loop_interfaces.problem import config_folder
+from pdeloop.messages.problem import config_folder
 from tests.support.loop_harness import Processes
 from tests.support.small_loop import LIMIT
 

@@ -91,9 +91,9 @@ FLOOD = """
 import sys, time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import writer_qos
-from loop_interfaces.topics import ARRAYS
+from pdeloop.messages.frames import ArrayCodec, Frame
+from pdeloop.ros.endpoints import writer_qos
+from pdeloop.messages.topics import ARRAYS
 from tests.topics.test_strangers import garbage
 rclpy.init()
 node = rclpy.create_node("flood")
@@ -149,9 +149,9 @@ STRANGER = """
 import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import samples_qos, writer_qos
-from loop_interfaces.topics import ACTION
+from pdeloop.messages.frames import ArrayCodec, Frame
+from pdeloop.ros.endpoints import samples_qos, writer_qos
+from pdeloop.messages.topics import ACTION
 from rclpy.qos import QoSProfile
 rclpy.init()
 node = rclpy.create_node("stranger")
@@ -195,9 +195,9 @@ SECOND_CONTROLLER = """
 from dataclasses import replace
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.topics import ACTION, STATE
+from pdeloop.messages.frames import ArrayCodec
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.messages.topics import ACTION, STATE
 rclpy.init()
 node = rclpy.create_node("second_controller")
 publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
@@ -235,9 +235,9 @@ SECOND_PLANT = """
 from dataclasses import replace
 import rclpy
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.topics import COST
+from pdeloop.messages.frames import ArrayCodec
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.messages.topics import COST
 rclpy.init()
 node = rclpy.create_node("second_plant")
 publisher = node.create_publisher(Float64MultiArray, "episode/cost", writer_qos(COST))

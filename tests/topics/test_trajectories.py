@@ -65,9 +65,9 @@ from dataclasses import replace
 import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
-from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.topics import ACTION, STATE
+from pdeloop.messages.frames import ArrayCodec
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.messages.topics import ACTION, STATE
 rclpy.init()
 node = rclpy.create_node("stranger")
 publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 import pdeloop
-from loop_interfaces.problem import config_folder
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.problem import config_folder
 from tests.support.loop_harness import Processes, until
 from tests.support.small_loop import LIMIT, assert_same_training
 from tuner_node.build import build_training

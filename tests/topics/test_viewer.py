@@ -9,7 +9,7 @@ import signal
 
 import pytest
 
-from loop_interfaces.topics import VIEW_NUMBERS
+from pdeloop.messages.topics import VIEW_NUMBERS
 from tests.support.loop_harness import Processes, until
 from tests.support.operator_harness import operator
 from tests.support.small import paced

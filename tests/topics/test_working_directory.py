@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from loop_interfaces.module_path import safe_environment
 from pdeloop.cli import COMMANDS
+from pdeloop.process.module_path import safe_environment
 from tests.support.interpreter import python
 from tests.support.loop_harness import Processes, until
 from tests.support.small import SMALL

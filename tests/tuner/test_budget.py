@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.parameter_file import yaml_text
-from loop_interfaces.spec import ParameterError
-from loop_interfaces.topics import CostColumn, StartColumn
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.parameter_file import yaml_text
+from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.topics import CostColumn, StartColumn
 from tests.support.small import CHECKED, FEW_STEPS, SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult

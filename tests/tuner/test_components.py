@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.parameters import measured_size
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.parameters import measured_size
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training, few_sensors
 from tuner_node.run_folder import model_of

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.episodes import episode_name
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START
+from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.protocol import ModelFailure
+from pdeloop.messages.topics import COMPLETED, MODEL, POLICY, START
 from tests.support.dispatching import (
     EXPLORATION,
     RUN,

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.model_rows import ModelRows
-from loop_method.adapt import Rollout, Trajectory
-from loop_method.laws.calls import along
-from loop_method.laws.observer import Observer
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.adapt import Rollout, Trajectory
+from pdeloop.method.laws.calls import along
+from pdeloop.method.laws.observer import Observer
 from tuner_node.law_check import check_law
 
 STEPS, N_S = 60, 3

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import POLICY, START
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import POLICY, START
 from tests.support.small import dispatcher_of
 from tuner_node.batch import Batch
 from tuner_node.dispatch import PAUSE_LEASE

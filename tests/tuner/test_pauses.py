@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame, FrameError
+from pdeloop.messages.frames import Frame, FrameError
 from tests.support.dispatching import RUN, batch, costs_of, dispatcher, starts
 
 

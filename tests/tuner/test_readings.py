@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.adapt import Trajectory
+from pdeloop.method.adapt import Trajectory
 from tests.support.small import parameters
 from tuner_node.build import build_training
 from tuner_node.readings import seeming_noise

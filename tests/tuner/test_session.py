@@ -7,9 +7,9 @@ from functools import cache
 
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
 from pdeloop.in_process import LocalPair
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.topics import MODEL, POLICY, START, StartColumn
 from tests.support.small import dispatcher_of, parameters, same_bits, train_here
 from tuner_node import training_state
 from tuner_node.batch import Batch

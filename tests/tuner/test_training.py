@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loop_interfaces.model_rows import unpack
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
-from loop_method.reduce.order import study_orders
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.model_rows import unpack
+from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn
+from pdeloop.method.reduce.order import study_orders
 from tests.support.small import CHECKED, FEW_STEPS, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import Batch, BatchResult

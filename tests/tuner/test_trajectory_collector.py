@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.topics import COMPLETED
+from pdeloop.messages.frames import Frame, FrameError
+from pdeloop.messages.topics import COMPLETED
 from tests.support.dispatching import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
 from tuner_node.errors import DispatchError

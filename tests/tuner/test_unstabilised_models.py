@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_method.design import lqg, lqt
-from loop_method.reduce.subspace import InnovationModel
 from pdeloop.in_process import LocalPair, train
+from pdeloop.method.design import lqg, lqt
+from pdeloop.method.reduce.subspace import InnovationModel
 from pdeloop.problem_check import check
 from tests.support.small import parameters
 from tuner_node.build import build_training

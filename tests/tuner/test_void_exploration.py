@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.topics import CostColumn, StartColumn
 from pdeloop.finished_run import load_run
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.topics import CostColumn, StartColumn
 from pdeloop.report import data
 from tests.support.small import SMALL, parameters, same_bits, train_here
 from tuner_node import training_state

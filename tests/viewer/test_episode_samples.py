@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
+from pdeloop.messages.frames import Frame
 from tests.support.viewed import PLANT, frame, state
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
 

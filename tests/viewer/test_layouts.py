@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from loop_interfaces.controllers import CONTROLLERS
-from loop_interfaces.problem import config_folder
-from loop_interfaces.topics import VIEW_NUMBERS
+from pdeloop.messages.controllers import CONTROLLERS
+from pdeloop.messages.problem import config_folder
+from pdeloop.messages.topics import VIEW_NUMBERS
 from viewer_node.loop_view import COSTS
 
 VIEWS = config_folder() / "views"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.topics import COMPLETED, VOID
+from pdeloop.messages.topics import COMPLETED, VOID
 from tests.support.viewed import cost, frame, start
 from viewer_node.learning_curve import MAX_POINTS, SENT, LearningCurve
 from viewer_node.loop_view import LoopView

@@ -16,10 +16,10 @@ import aiohttp
 import numpy as np
 import pytest
 
-from loop_interfaces.colour_scale import DARK, LIGHT, colours
-from loop_interfaces.frames import Frame
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.places import Box, text_of
+from pdeloop.messages.colour_scale import DARK, LIGHT, colours
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.places import Box, text_of
 from tests.support.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.loop_view import LoopView

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.cost import Cost
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.places import Box, text_of
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.places import Box, text_of
 from tests.support.viewed import frame, state
 from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, axes_of, bounds_of, path_of, places_of

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from loop_interfaces.diagnostics import Level
-from loop_interfaces.frames import Frame
-from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.topics import VIEW_NUMBERS
+from pdeloop.messages.diagnostics import Level
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.model_rows import ModelRows, pack
+from pdeloop.messages.topics import VIEW_NUMBERS
 from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import COLUMNS
 from viewer_node.loop_view import LoopView

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.action_set import ActionSet
-from loop_interfaces.cost import Cost
-from loop_interfaces.frames import Frame
-from loop_interfaces.grid import Axis, Grid
-from loop_interfaces.places import parse
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.frames import Frame
+from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.places import parse
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
 from viewer_node.loop_view import SILENT, LoopView
 from viewer_node.operation import Call

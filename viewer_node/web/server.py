@@ -31,9 +31,9 @@ from pathlib import Path
 from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from loop_interfaces.controllers import CONTROLLERS
-from loop_interfaces.documents import parse_json
-from loop_interfaces.text import printable
+from pdeloop.messages.controllers import CONTROLLERS
+from pdeloop.messages.documents import parse_json
+from pdeloop.messages.text import printable
 from viewer_node.operation import VERBS
 from viewer_node.web.page import Page
 

@@ -19,13 +19,13 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.endpoints import reader_qos, writer_qos
-from loop_interfaces.ros.node_main import node_main
-from loop_interfaces.ros.observer import Observer
-from loop_interfaces.ros.parameters import declare
-from loop_interfaces.spec import Spec
-from loop_interfaces.topics import ACTION, STATE, Topic
+from pdeloop.messages.spec import Spec
+from pdeloop.messages.topics import ACTION, STATE, Topic
+from pdeloop.process.isolation import keep_on_this_machine
+from pdeloop.ros.endpoints import reader_qos, writer_qos
+from pdeloop.ros.node_main import node_main
+from pdeloop.ros.observer import Observer
+from pdeloop.ros.parameters import declare
 
 PARAMETERS = (
     Spec("loss", 0.0, 0.0, 0.99).means("probability that a message is lost"),

@@ -1,5 +1,5 @@
 // Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-// The colours of a field: blue below the target or 0, red above. As loop_interfaces/colour_scale.py has
+// The colours of a field: blue below the target or 0, red above. As pdeloop/messages/colour_scale.py has
 // them: ColorBrewer's RdBu (Apache-2.0), which any colour vision can read, and on a dark page a
 // scale with a dark middle.
 

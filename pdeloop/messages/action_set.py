@@ -1,0 +1,293 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The actions that actuators can take, and those of an exploration.
+
+    P(a) = argmin |x - a|,    low <= x <= high,  sum x_j = 0 if asked for
+         = clip(a - s, low, high),
+
+with s = 0, or the shift with which the sum is zero. A plant applies P(a) of a requested action a. The
+derivative of P is 1 for each actuator that is not at a bound and 0 for the others; with a mean of zero
+that of the former is less their mean.
+
+Explorations are drawn around an operating point within the bounds, P(m + D x) with x ~ N(0, v I): m is
+the middle between two bounds, and otherwise the point nearest to 0 that is two standard deviations from
+the bound. D is the size of each actuator's standard deviation relative to the largest: a quarter of
+half the range between two bounds, and sqrt(0.1) otherwise. Without declared bounds m = 0 and D = I.
+
+References
+----------
+Kiwiel, "Breakpoint searching algorithms for the continuous quadratic knapsack problem", Mathematical
+Programming 112, 2008.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.spec import ParameterError
+
+NO_BOUND = 1e300
+"""Magnitude that stands for no bound in the parameter `action_bounds`."""
+EXPLORED = 0.25
+"""Standard deviation of exploratory actions as a share of the half range between two bounds."""
+UNBOUNDED_VARIANCE = 0.1
+"""Variance of exploratory actions of an actuator without two bounds."""
+_BALANCED = 1e-13
+"""Mean of actions, relative to the largest, that rounding explains."""
+
+
+class ActionSet:
+    """The actions a with low <= a <= high, and sum a_j = 0 if asked for.
+
+    Parameters
+    ----------
+    n_a : int
+        Actuators; 0: any number of them, with bounds in common.
+    low, high : number or (n_a,)
+        Bounds; infinite where there are none.
+    zero_mean : bool
+        Whether the actions of a step have mean zero.
+    limit : float
+        Magnitude at which all actions saturate besides; 0 for none.
+    exploration_mean : (n_a,) array, optional
+        m, the operating point; in place of the one above.
+
+    Attributes
+    ----------
+    low, high : (n_a,) array, or () for any number
+        The bounds, those of the limit included.
+    bounded : bool
+        Whether there is an action that is not in it.
+    signed : (n,) array
+        What signatures are of (`pdeloop.messages.signature`): the parameters `action_limit`,
+        `action_bounds` and `exploration_mean`.
+    exploration_mean, exploration_scale : (n_a,) array, or () for any number
+        m, and the diagonal of D.
+    exploration_variance : float
+        v unless another one is asked for.
+
+    Raises
+    ------
+    ValueError
+        A bound or the operating point does not fit, or no action is allowed.
+    """
+
+    def __init__(
+        self,
+        n_a: int = 0,
+        low: ArrayLike = -np.inf,
+        high: ArrayLike = np.inf,
+        zero_mean: bool = False,
+        *,
+        limit: float = 0.0,
+        exploration_mean: ArrayLike = (),
+    ) -> None:
+        own = [_bound(name, values, n_a) for name, values in (("low", low), ("high", high))]
+        self.zero_mean, reach = bool(zero_mean), limit or np.inf
+        self.low, self.high = np.maximum(own[0], -reach), np.minimum(own[1], reach)
+        if not (self.low <= self.high).all():
+            told = f", and within action_limit, {limit:g}" if limit else ""
+            raise ValueError(f"action_low must be at most action_high for each actuator{told}")
+        if zero_mean and not self.low.sum() <= 0.0 <= self.high.sum():
+            raise ValueError("no action between action_low and action_high has mean zero")
+        self.bounds: list[float] = []
+        """The parameter `action_bounds`."""
+        if zero_mean or np.isfinite(own).any():
+            least, most = (np.clip(part, -NO_BOUND, NO_BOUND).ravel().tolist() for part in own)
+            self.bounds = [*least, *most, float(self.zero_mean)]
+        self.bounded = bool(zero_mean or np.isfinite([self.low, self.high]).any())
+        mean = float_array("exploration_mean", exploration_mean)
+        if mean.size and not (mean.shape == (n_a,) and np.allclose(self.project(mean), mean)):
+            raise ValueError(
+                f"exploration_mean must be {n_a} numbers that are an admissible action, got "
+                f"{mean.tolist()}"
+            )
+        self.signed = np.array([limit, *self.bounds, *mean])
+        self.exploration_variance, self.exploration_scale = (
+            UNBOUNDED_VARIANCE,
+            np.ones_like(self.low),
+        )
+        self.exploration_mean = mean if mean.size else np.zeros_like(self.low)
+        self._moved = bool(self.bounds or mean.size)
+        if self.bounds:
+            self._set_exploration(given=bool(mean.size))
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> ActionSet:
+        """The set of the parameters `action_limit`, `action_bounds` and `exploration_mean`.
+
+        Examples
+        --------
+        >>> both = {"n_a": 2, "action_limit": 3.0, "action_bounds": [0.0, -1.0, 4.0, 2.0, 0.0]}
+        >>> ActionSet.of(both).project(np.array([[9.0, -9.0]]))
+        array([[ 3., -1.]])
+        """
+        n_a, bounds = values["n_a"], np.array(values.get("action_bounds") or [])
+        others: dict[str, Any] = {
+            "limit": values["action_limit"],
+            "exploration_mean": values.get("exploration_mean") or [],
+        }
+        try:
+            if not bounds.size:
+                return ActionSet(n_a, **others)
+            if bounds.size != 2 * n_a + 1 or bounds[-1] not in (0.0, 1.0):
+                raise ValueError(
+                    f"expected {n_a} lower bounds, {n_a} upper bounds, and 1 where actions have mean "
+                    f"zero, else 0; got {bounds.size} numbers"
+                )
+            own = np.where(np.abs(bounds) < NO_BOUND, bounds, np.copysign(np.inf, bounds))
+            low, high = own[:n_a], own[n_a:-1]
+            return ActionSet(n_a, low, high, bool(bounds[-1]), **others)
+        except ValueError as error:
+            name = "exploration_mean" if "exploration_mean" in str(error) else "action_bounds"
+            raise ParameterError(f"parameter '{name}': {error}") from error
+
+    def _set_exploration(self, *, given: bool) -> None:
+        two, most = np.isfinite(self.high - self.low), np.sqrt(UNBOUNDED_VARIANCE)
+        with np.errstate(invalid="ignore"):
+            own = np.where(two, 0.5 * EXPLORED * (self.high - self.low), most)
+            middle = np.where(two, 0.5 * (self.low + self.high), 0.0)
+            inside = np.clip(middle, self.low + 2.0 * own, self.high - 2.0 * own)
+        if two.any():
+            self.exploration_variance = float(own.max()) ** 2
+        self.exploration_scale = own / max(float(own.max()), 1e-300)
+        if not given:
+            self.exploration_mean = (
+                self.project(inside) if inside.ndim else inside * (not self.zero_mean)
+            )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ActionSet) and np.array_equal(self.signed, other.signed)
+
+    def __hash__(self) -> int:
+        return hash(self.signed.tobytes())
+
+    def __repr__(self) -> str:
+        mean = ", zero_mean=True" if self.zero_mean else ""
+        return f"{type(self).__name__}(low={self.low.tolist()}, high={self.high.tolist()}{mean})"
+
+    def project(self, actions: Array, out: Array | None = None) -> Array:
+        """The nearest actions of the set; what is in it already is left as it is, to the bit.
+
+        Parameters
+        ----------
+        actions : (..., n_a)
+            Each is projected by itself, with the same bits in any batch. One that is not finite gives
+            one that is not.
+        out : array, optional
+            Where the result is written, also `actions` itself; a new array, or `actions` where every
+            action is in the set, without it.
+
+        Examples
+        --------
+        >>> ActionSet(3, -1.0, 1.0, True).project(np.array([[0.0, 0.5, 5.0]])).round(9)
+        array([[-0.75, -0.25,  1.  ]])
+        """
+        if not self.bounded:
+            if out is None or out is actions:
+                return actions
+            out[...] = actions
+            return out
+        moved = actions - self._shifts(actions) if self.zero_mean else actions
+        clipped: Array = np.clip(moved, self.low, self.high, out=out)
+        return clipped
+
+    def pull_back(self, requested: Array, y: Array) -> Array:
+        """The transposed derivative of `project` at requested actions times y, all (..., n_a).
+
+        At a bound it is that from inside.
+
+        Examples
+        --------
+        >>> ActionSet(high=1.0).pull_back(np.array([0.5, 5.0]), np.array([3.0, 3.0]))
+        array([3., 0.])
+        """
+        if not self.bounded:
+            return y
+        moved = requested - self._shifts(requested) if self.zero_mean else requested
+        free = (moved >= self.low) & (moved <= self.high)
+        pulled: Array = y * free
+        if self.zero_mean:
+            count = np.maximum(free.sum(axis=-1, keepdims=True), 1)
+            pulled = pulled - free * (pulled.sum(axis=-1, keepdims=True) / count)
+        return pulled
+
+    def inside(self, applied: Array) -> NDArray[np.bool_]:
+        """Which of applied actions (..., n_a) are not at a bound."""
+        found: NDArray[np.bool_] = (applied > self.low) & (applied < self.high)
+        return found
+
+    def free(self, n_a: int) -> Array:
+        """Orthonormal directions (n_a, n) in which actions can move: all, or those of mean zero.
+
+        Examples
+        --------
+        >>> ActionSet(2, zero_mean=True).free(2).round(3).tolist()
+        [[0.707], [-0.707]]
+        """
+        if not self.zero_mean:
+            return np.eye(n_a)
+        # Helmert's contrasts: one actuator against the mean of those before it.
+        rows = np.tril(np.ones((n_a, n_a)), -1)[1:] - np.diag(np.arange(1.0, n_a), 1)[:-1]
+        found: Array = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).T
+        return found
+
+    def explored(self, draws: Array) -> Array:
+        """The exploratory actions P(m + D x) of draws x of N(0, v I), (..., n_a).
+
+        Examples
+        --------
+        >>> heater = ActionSet(low=0.0, high=4.0)
+        >>> heater.explored(np.array([-1.0, 0.0, 9.0])), heater.exploration_variance
+        (array([1., 2., 4.]), 0.25)
+        """
+        return self.project(
+            self.exploration_mean + self.exploration_scale * draws if self._moved else draws
+        )
+
+    def _shifts(self, actions: Array) -> Array:
+        """s of each action, (..., 1)."""
+        rows = np.ascontiguousarray(actions).reshape(-1, actions.shape[-1])
+        with np.errstate(invalid="ignore"):
+            shifts = rows.mean(axis=1)
+            shifts[np.abs(shifts) <= _BALANCED * np.abs(rows).max(axis=1)] = 0.0
+            moved = rows - shifts[:, None]
+            whole = ((moved >= self.low) & (moved <= self.high)).all(axis=1)
+        for m in np.flatnonzero(~whole):
+            shifts[m] = self._balance(rows[m])
+        found: Array = shifts.reshape(*actions.shape[:-1], 1)
+        return found
+
+    def _balance(self, a: Array) -> float:
+        """s of one action: between two breakpoints the sum falls with it, linearly."""
+        if not np.isfinite(a).all():
+            return np.nan
+        breaks = np.sort(np.concatenate([a - self.low, a - self.high]))
+        breaks = breaks[np.isfinite(breaks)]
+        sums = np.clip(a - breaks[:, None], self.low, self.high).sum(axis=1)
+        last = int(np.count_nonzero(sums > 0.0))  # sums fall: the zero is between last - 1 and last
+        if last in (0, len(breaks)):
+            between = breaks[0] - 1.0 if last == 0 else breaks[-1] + 1.0
+        else:
+            between = 0.5 * (breaks[last - 1] + breaks[last])
+        held: Array = np.clip(a - between, self.low, self.high)
+        free = (held > self.low) & (held < self.high)
+        if not free.any():
+            return float(between)
+        return float((a[free].sum() + held[~free].sum()) / np.count_nonzero(free))
+
+
+def _bound(side: str, values: ArrayLike, n_a: int) -> Array:
+    bound = float_array(f"action_{side}", values)
+    if bound.shape not in ((), (n_a,)) or np.isnan(bound).any():
+        raise ValueError(f"action_{side} must be a number or {n_a} numbers, got {values!r}")
+    own: Array = np.broadcast_to(bound, n_a).copy() if n_a else bound.copy()
+    return own
+
+
+ANY_ACTION = ActionSet()
+"""Every action is admissible."""

@@ -1,0 +1,392 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The interface of optimisers: they ask for rollouts and are told the results.
+
+    while not optimizer.done:
+        rollouts = optimizer.ask()                # the same until tell
+        row = optimizer.tell([measure(rollout) for rollout in rollouts])
+
+An optimiser runs no rollouts and uses no clock, so the same object serves a loop over topics and a
+loop in one process. Its randomness is a pure function of (seed, tells), and `state` holds
+everything that `restore` needs to continue as if nothing had happened, to the last bit.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.laws.base import Law
+from pdeloop.method.models.sensed import Actuators
+from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.settings import Settings as _Settings
+
+Row = dict[str, float | int | bool | str]
+State = dict[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One episode of one environment.
+
+    Attributes
+    ----------
+    states : (T, n_z) or (T + 1, n_z) array
+        z_0 .. z_{T-1}, and z_T if it is known.
+    actions : (T, n_a) array
+        a_k, held from z_k to z_{k+1}.
+
+    A diverged episode may be shorter, or end in values that are not finite.
+    """
+
+    states: Array
+    actions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """An episode requested by an optimiser.
+
+    Attributes
+    ----------
+    policy : (size,) or (n_a, 2 n_s)
+        The law's parameters theta, of the shape that the optimiser was given.
+    field_seed : int
+        Seed of the initial field.
+    """
+
+    policy: Array
+    field_seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutResult:
+    """The outcome of a rollout.
+
+    Attributes
+    ----------
+    cost : float
+        Its mean stage cost; meaningless if it diverged.
+    diverged : bool
+        True if the plant's state left its bound.
+    trajectory : Trajectory or None
+        Its states and actions, for optimisers that learn from trajectories.
+    """
+
+    cost: float
+    diverged: bool = False
+    trajectory: Trajectory | None = None
+
+    @property
+    def usable(self) -> bool:
+        """True if the cost is a finite measurement."""
+        return not self.diverged and bool(np.isfinite(self.cost))
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A rollout that was measured, with its trajectory.
+
+    Attributes
+    ----------
+    policy : array
+        Theta, of the shape of the optimiser's.
+    cost : float
+        Mean stage cost; infinite if it diverged.
+    states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
+        What can be learned from: all of the episode, or its samples before it ran away.
+    stamp : int
+        Its number among the rollouts of the optimiser, from 0; -1: from before the optimisation.
+    field_seed : int
+        Seed of its initial field; -1: not known.
+    """
+
+    policy: Array
+    cost: float
+    states: Array
+    actions: Array
+    stamp: int = -1
+    field_seed: int = -1
+
+    @property
+    def usable(self) -> bool:
+        """True if the rollout came to its end."""
+        return bool(np.isfinite(self.cost))
+
+    @property
+    def acted_from(self) -> Array:
+        """The states that an action followed, (L, n_z)."""
+        return self.states[: len(self.actions)]
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """The problem as a model-based optimiser knows it.
+
+    Attributes
+    ----------
+    U : (n_z, n_s) array
+        Basis of the projected state.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        Q = state_weight I, R = action_weight I.
+    horizon : int
+        T, the steps of an episode.
+    exploration : Trajectory
+        The exploratory trajectory that the reduced model was identified from.
+    measured : sequence of Record
+        Rollouts from before the optimisation: those that checked the first law, and no control.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown.
+    sensors : int
+        n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
+        consist; 0: the states are whole.
+    actuator_positions : sequence of float
+        Centres of the actuators as shares of the domain; none: equally spaced.
+    actuator_widths : sequence of float
+        Width of each as a share of the domain; none: not declared.
+    periodic : bool
+        Whether the states are fields on one periodic axis, which models of the whole field assume.
+    line : bool
+        Whether they are fields on one axis, or plain vectors.
+    shape : tuple of int
+        Points of each axis, where they are fields on several; none: they are not.
+    further : sequence of Trajectory
+        Other explorations, from other initial fields.
+    cost : Cost or None
+        The whole cost, where the weights and the target do not say it.
+    law : Law, optional
+        The law whose parameters theta is, with its derivatives if it has any.
+    field_models : FieldModelSettings
+        How models of the whole field are fitted and one is chosen.
+    """
+
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    exploration: Trajectory
+    measured: Sequence[Record] = ()
+    action_set: ActionSet = ANY_ACTION
+    noise: float = 0.0
+    sensors: int = 0
+    actuator_positions: Sequence[float] = ()
+    actuator_widths: Sequence[float] = ()
+    periodic: bool = True
+    line: bool = True
+    shape: tuple[int, ...] = ()
+    further: Sequence[Trajectory] = ()
+    cost: Cost | None = None
+    law: Law | None = None
+    field_models: FieldModelSettings = DEFAULTS
+
+    @property
+    def every_exploration(self) -> Sequence[Trajectory]:
+        """The exploration of the reduced model first."""
+        return (self.exploration, *self.further)
+
+    def actuators(self, n_a: int) -> Actuators:
+        """What is declared of the n_a actuators."""
+        centres = np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)
+        return Actuators(centres, np.array(self.actuator_widths or np.zeros(n_a)))
+
+
+class Optimizer(Protocol):
+    """The interface of an optimiser: declarations of its class, and methods of its objects.
+
+    A history row holds JSON numbers, booleans and strings; a cost that is not finite is left out of
+    it. Every row has `rollouts` (told so far, in total) and `diverged` (how many of those told now
+    did).
+
+    Parameters
+    ----------
+    policy0 : (size,) array
+        The initial theta, the vector of the law's parameters, whichever law it is. An optimiser
+        that `needs_affine_law` is given the matrix [K_a K_b], (n_a, 2 n_s).
+    seed : int
+        Determines everything random.
+    rollouts : int
+        The budget.
+    settings : Settings
+        Settings of the class's own type.
+    context : Context, optional
+        What is known of the problem, if it needs trajectories.
+    """
+
+    name: ClassVar[str]
+    """The name that selects this optimiser."""
+    Settings: ClassVar[type[_Settings]] = _Settings
+    """Its constants; none if it does not say otherwise."""
+    needs_trajectories: ClassVar[bool] = False
+    """True if results have to come with their trajectories."""
+    needs_affine_law: ClassVar[bool] = False
+    """True if it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
+    also_improves: ClassVar[tuple[str, ...]] = ()
+    """Names of other laws that it improves, whose theta it is given as a vector."""
+    any_cost: ClassVar[bool] = False
+    """True if it can use any quadratic cost (`pdeloop.messages.cost.Cost`), if it needs trajectories;
+    otherwise scalar weights and a constant target. Optimisers that need only costs can."""
+    judges_first_law: ClassVar[bool] = False
+    """True if it always compares the first law with no control itself."""
+    in_coordinates: ClassVar[bool] = False
+    """True if it can work on coordinates in an orthonormal basis of the measured states in place of
+    states of more than 2,048 numbers (`pdeloop.method.adapt.in_coordinates`)."""
+    explorations: ClassVar[int] = 1
+    """Rollouts of an exploration, from as many initial fields."""
+    law_of_moving_targets: ClassVar[str] = ""
+    """The law preferred where the target changes from step to step; empty: as without."""
+    law_of_sensors: ClassVar[str] = ""
+    """The law preferred where the state is that of few sensors; empty: as without."""
+    iteration_rollouts: ClassVar[int] = 0
+    """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
+    preferences: ClassVar[Mapping[str, Any]] = {}
+    """Parameters of the training with the defaults that it was tuned for."""
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: Any,
+        context: Context | None = None,
+    ) -> None: ...
+
+    @classmethod
+    def for_context(cls, context: Context) -> "type[Optimizer]":
+        """The class that is made for a problem: this one, or one derived from it."""
+        return cls
+
+    @classmethod
+    def first_step(cls, settings: Any) -> int:
+        """Rollouts of its first step, without which there is nothing to adapt with."""
+
+    @classmethod
+    def settings_of(cls, values: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+        """The settings of a training with these parameters; given: those of `Settings` by name."""
+        return cls.Settings(**given)
+
+    @property
+    def policy(self) -> Array:
+        """The current policy, in its initial shape; always finite."""
+
+    @property
+    def tells(self) -> int:
+        """Number of calls of `tell`."""
+
+    @property
+    def done(self) -> bool:
+        """True once no further rollouts are needed."""
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts needed next.
+
+        Returns
+        -------
+        list of Rollout
+            The same ones on every call until `tell`; none when done.
+        """
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the results of the rollouts that were asked for.
+
+        Parameters
+        ----------
+        results
+            One for each rollout of `ask`, in the same order.
+
+        Returns
+        -------
+        dict
+            A row of the history.
+
+        Raises
+        ------
+        ValueError
+            There are more or fewer results.
+        """
+
+    def state(self) -> State:
+        """Everything a checkpoint needs.
+
+        Returns
+        -------
+        dict of str to array
+            Arrays without objects, as `numpy.savez` stores them.
+        """
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from the state of an optimiser that was made with the same arguments.
+
+        Parameters
+        ----------
+        state : dict of str to array, (...)
+            As `state` returned it.
+
+        Raises
+        ------
+        ValueError
+            An array is missing, or has another shape or type.
+        """
+
+
+def checked_theta(theta: ArrayLike) -> Array:
+    """A finite copy of a law's parameters, of any shape, or a ValueError."""
+    array = np.array(theta, dtype=np.float64, order="C")
+    if not array.size:
+        raise ValueError("a policy must have parameters, but it is empty.")
+    if not np.isfinite(array).all():
+        raise ValueError("a policy must be finite, but there is NaN or infinity in it.")
+    return array
+
+
+def taken_theta(state: Mapping[str, NDArray[np.generic]], like: Array) -> Array:
+    """The array `policy` of a `state`, of the shape of `like`: older ones have gains as matrices."""
+    known = state.get("policy")
+    if known is not None and known.size == like.size:
+        state = {"policy": known.reshape(like.shape)}
+    return checked_array(state, "policy", "f", like.shape).copy()
+
+
+def checked_policy(policy: ArrayLike) -> Array:
+    """A finite copy of gains of shape (n_a, 2 n_s), or a ValueError."""
+    array = np.array(policy, dtype=np.float64, order="C")
+    if array.ndim != 2 or 0 in array.shape or array.shape[1] % 2:
+        raise ValueError(
+            f"a policy [K_a K_b] must have shape (n_a, 2 n_s), but its shape is {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError("a policy must be finite, but there is NaN or infinity in it.")
+    return array
+
+
+def require_positive(**values: float) -> None:
+    """A ValueError that names the first value that is not positive and finite."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive and finite, but it is {value}.")
+
+
+def require_results(results: Sequence[RolloutResult], expected: int) -> None:
+    """A ValueError unless there is one result per rollout that was asked for."""
+    if not expected:
+        raise ValueError(
+            "the optimiser is done and asked for no rollouts; check `done` before `tell`."
+        )
+    if len(results) != expected:
+        raise ValueError(f"tell needs one result per rollout, {expected}, but got {len(results)}.")
+
+
+def part_of(state: Mapping[str, NDArray[np.generic]], prefix: str) -> State:
+    """The arrays with a prefix, without it."""
+    names = [name for name in state if name.startswith(prefix)]
+    return {name.removeprefix(prefix): state[name] for name in names}

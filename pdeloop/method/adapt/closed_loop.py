@@ -1,0 +1,412 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Laws in a closed loop: their cost, and on a model of the plant its exact gradient.
+
+The law is linear in the projected state s = U^T z and its memory p, and returns the action and the
+input of the memory:
+
+    [r_k; u_k] = theta [s_k; p_k; 1],        a_k = P(r_k),
+    z_{k+1} = f(z_k, a_k),                   p_{k+1} = u_k + B a_k,
+
+with f the model, p_0 = s_0, and P the nearest admissible action (`pdeloop.messages.action_set`). The
+affine law has no memory, and theta = [K_a b]; `observed_loop` has that of a law with an observer. From
+an initial field z_0 the cost is
+
+    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),
+
+or another quadratic one. With g_k = dJ/d[r_k; u_k] of the adjoint (`pdeloop.method.models.sweep`) its
+gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt.base import Record
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.models import FieldModel
+from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopProblem:
+    """Laws a = K_a U^T z + b, and their cost.
+
+    Attributes
+    ----------
+    U : (n_z, n_s) array
+        Basis of the projected state s = U^T z.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        q and r.
+    horizon : int
+        T, the steps of an episode.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
+    """
+
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    action_set: ActionSet = ANY_ACTION
+
+    @cached_property
+    def s_r(self) -> Array:
+        """U^T z_r, (n_s,), as a plain sum like the controller's."""
+        projected: Array = np.sum(self.U * self.target[:, None], axis=0)
+        return projected
+
+    @cached_property
+    def constant_feature(self) -> float:
+        """The last feature of the law: 0 where b = K_b s_r cannot be anything but 0, else 1."""
+        inside = float(np.sum(self.s_r * self.s_r))
+        return 1.0 if inside > 1e-20 * float(np.sum(self.target * self.target)) else 0.0
+
+    def theta(self, policy: Array) -> Array:
+        """[K_a b] of a policy [K_a K_b], (n_a, n_s + 1)."""
+        n_s = self.U.shape[1]
+        return np.column_stack([policy[:, :n_s], policy[:, n_s:] @ self.s_r])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        """[K_a K_b] of theta; among the K_b with the wanted b the one next to that of `near`."""
+        n_s = self.U.shape[1]
+        return self._changed(near, theta[:, :n_s], theta[:, n_s] - near[:, n_s:] @ self.s_r)
+
+    def _changed(self, policy: Array, K_a: Array, change: Array) -> Array:
+        """The policy with other gains K_a, and with b changed by (n_a,)."""
+        n_s, changed = self.U.shape[1], policy.copy()
+        changed[:, :n_s] = K_a
+        if self.constant_feature:
+            changed[:, n_s:] += np.outer(change, self.s_r / float(np.sum(self.s_r * self.s_r)))
+        return changed
+
+    def mean_cost(self, states: Array, actions: Array) -> float:
+        """Mean stage cost of states (..., n_z) and the actions (..., n_a) that answer them."""
+        error = states - self.target
+        cost = self.state_weight * np.sum(error * error)
+        cost += self.action_weight * np.sum(actions * actions)
+        return float(cost) / max(math.prod(actions.shape[:-1]), 1)
+
+    def cost_of(self, record: Record) -> float:
+        """Mean stage cost of the recorded part of a rollout."""
+        return self.mean_cost(record.acted_from, record.actions)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop(ClosedLoopProblem):
+    """A model of the plant under such laws, and their cost on it.
+
+    A class derived from it says how a law remembers, or what of a model's state is seen.
+
+    Attributes
+    ----------
+    model : FieldModel
+    noise : float
+        Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
+        is the same in every simulation of as many fields.
+    cost : Cost or None
+        Another quadratic cost in place of that of q, r and z_r.
+    """
+
+    model: FieldModel = field(kw_only=True)
+    noise: float = field(default=0.0, kw_only=True)
+    cost: Cost | None = field(default=None, kw_only=True)
+
+    @property
+    def constants(self) -> int:
+        """Columns of theta that are constant parts: 1, or one for each step."""
+        return 1
+
+    replays: ClassVar[bool] = False
+    """True if initial fields are measured rollouts, with what in them was not foreseen."""
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """The initial field of each rollout, (n, n_z)."""
+        return np.stack([record.states[0] for record in records])
+
+    def replays_of(self, records: Sequence[Record]) -> Array:
+        """Initial fields with which a simulation repeats measured rollouts under their own laws.
+
+        Rows [z_0, e_0, .., e_{T-1}], (n, n_z (T + 1)), with e_k = z_{k+1} - f(z_k, a_k); 0 where
+        nothing was measured, or the model is not finite.
+        """
+        found = np.zeros((len(records), self.horizon + 1, self.model.n_z))
+        for row, record in zip(found, records, strict=True):
+            steps = min(len(record.actions), len(record.states) - 1, self.horizon)
+            row[0] = record.states[0]
+            with np.errstate(all="ignore"):
+                after = self.model.step(record.states[:steps], record.actions[:steps])
+            row[1 : steps + 1] = np.nan_to_num(
+                record.states[1 : steps + 1] - after, nan=0.0, posinf=0.0, neginf=0.0
+            )
+        return found.reshape(len(records), -1)
+
+    @property
+    def memory_input(self) -> Array:
+        """B of the memory, (n_p, n_a); n_p = 0: the law has none."""
+        return np.zeros((0, self.model.n_a))
+
+    @property
+    def no_control(self) -> Array:
+        """Theta of a = 0."""
+        n_p = len(self.memory_input)
+        return np.zeros((self.model.n_a + n_p, self.U.shape[1] + n_p + self.constants))
+
+    def curvature(self, own: Array) -> Array:
+        """Cost matrix of a change of the law's outputs [a; u], from that of an action, (n_a, n_a)."""
+        return own
+
+    def costs(self, theta: Array, fields: Array) -> Array:
+        """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
+        return self.simulate(theta, fields).costs
+
+    def simulate(self, theta: Array, fields: Array) -> Simulation:
+        """Roll theta (n_a + n_p, n_s + n_p + constants) out from the fields (F, n_z)."""
+        n_z, n_a = self.model.n_z, self.model.n_a
+        states, _, actions = rolled(self._sweep, n_a, *self._rolled(theta, fields))
+        known = np.isfinite(states).all(axis=2)
+        with np.errstate(all="ignore"):
+            costs = self._slopes(states, actions, fields)[0]
+        costs[~(np.all(known, axis=1) & np.isfinite(costs))] = np.inf
+        known = np.logical_and.accumulate(known, axis=1)
+        states[~known], actions[~known[:, 1:]] = 0.0, 0.0
+        features = np.empty((*actions.shape[:2], states.shape[2] - n_z + self.U.shape[1] + 1))
+        features[..., :-1] = self._features(states, self._offsets(fields)) * known[:, :-1, None]
+        features[..., -1] = self.constant_feature
+        states, actions, features = (x.swapaxes(0, 1) for x in (states, actions, features))
+        return Simulation(states[..., :n_z], actions, costs, features)
+
+    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
+        """The weighted sum of the costs, and its gradient, of the shape of theta.
+
+        Infinite, with a gradient of zero, where a cost of positive weight is.
+        """
+        fields, weights = fields[weights > 0.0], weights[weights > 0.0]
+        costs, g, features = self.slopes(theta, fields)
+        if not (np.isfinite(costs).all() and np.isfinite(g).all()):
+            return np.inf, np.zeros_like(theta)
+        by_gains = np.einsum("f,fij->ij", weights, g.swapaxes(1, 2) @ features)
+        by_step = np.einsum("f,fki->ik", weights, g)
+        by_b = by_step if self.constants > 1 else by_step.sum(axis=1, keepdims=True)
+        return float(weights @ costs), np.hstack([by_gains, self.constant_feature * by_b])
+
+    def slopes(
+        self, theta: Array, fields: Array, added: Array | float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """J from each of the fields, (F,), and its slopes by what is added to the law's outputs [r; u].
+
+        And [s; p] of each step, (F, T, n_s + n_p). What is not finite is NaN or infinite.
+
+        added: (F, T, n_a + n_p).
+        """
+        begin, v, K, b, e = self._rolled(theta, fields)
+        v, offsets, n_f = v + added, self._offsets(fields), theta.shape[1] - self.constants
+        costs, g, features = np.empty(len(v)), np.empty(v.shape), np.empty((*v.shape[:2], n_f))
+
+        def work(own: Sweep, rows: slice) -> None:
+            with np.errstate(all="ignore"):
+                states, requested, actions = own.roll(begin[rows], v[rows], K, b, _of(e, rows))
+                costs[rows], on_states, on_a, eta = self._slopes(states, actions, fields[rows])
+                g[rows] = own.roll_back(requested[..., : on_a.shape[2]], on_states, on_a, K, eta)
+                features[rows] = self._features(states, _of(offsets, rows))
+
+        self._sweep.each(len(fields), work)
+        return costs, g, features
+
+    @cached_property
+    def _sweep(self) -> Sweep:
+        return sweep_of(self.model, self.action_set, self.horizon, self.memory_input)
+
+    @cached_property
+    def _stage(self) -> Cost:
+        """The cost, of the outputs unless it is another one."""
+        if self.cost is not None:
+            return self.cost
+        return Cost(
+            len(self.target),
+            self.model.n_a,
+            self.horizon,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            target=self.target,
+        )
+
+    def _rolled(
+        self, theta: Array, fields: Array
+    ) -> tuple[Array, Array, Array, Array, Array | None]:
+        """[z_0; p_0], v, K, b and e of `Sweep.roll`."""
+        (n_p, _), n_s = self.memory_input.shape, self.U.shape[1]
+        gains, constants = theta[:, :n_s], self.constant_feature * theta[:, n_s + n_p :]
+        K = np.hstack([self._pull_outputs(gains @ self.U.T), theta[:, n_s : n_s + n_p]])
+        v = np.zeros((len(fields), self.horizon, len(theta)))
+        if self.constants > 1:
+            v += constants.T
+        offsets, begin = self._offsets(fields), self._start(fields)
+        first = self._outputs(begin) @ self.U
+        if offsets is not None:
+            v += offsets @ gains.T
+            first += offsets[:, 0]
+        b = constants[:, 0] if self.constants == 1 else np.zeros(len(theta))
+        return np.hstack([begin, first[:, :n_p]]), v, K, b, self._disturbances(fields)
+
+    def _slopes(
+        self, states: Array, actions: Array, fields: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """J of rows (M,), and its derivatives by [z; p] and a of each step, and by the last [z; p]."""
+        n_z, T = self.model.n_z, self.horizon
+        z, cost = states[:, :-1, :n_z], self._stage
+        on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
+        if self.cost is None:
+            unforeseen = self._unforeseen(fields)
+            outputs = self._outputs(z) if unforeseen is None else self._outputs(z) + unforeseen
+            J, on_outputs, on_actions = cost.along(outputs, actions, 0)
+            on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
+        else:
+            J, on_z, on_actions = cost.along(z, actions, 0)
+            of_end, at_end = cost.at_end(states[:, -1, :n_z])
+            J, on_states[..., :n_z], eta[:, :n_z] = J + of_end, on_z / T, at_end / T
+        return J / T, on_states, on_actions / T, eta
+
+    def _features(self, states: Array, offsets: Array | None) -> Array:
+        """[s; p] of each step, (M, T, n_s + n_p)."""
+        n_z = self.model.n_z
+        s = self._outputs(states[:, :-1, :n_z]) @ self.U
+        return np.concatenate([s if offsets is None else s + offsets, states[:, :-1, n_z:]], axis=2)
+
+    def unsaturated(self, theta: Array, fields: Array, weights: Array) -> Array:
+        """The law with less excess where an action is at a bound from all fields, nearly the same one.
+
+        There the cost does not depend on theta. The mean excess over the bound is taken from the
+        constants, so that actions are on both sides of it.
+        """
+        simulation, n_a = self.simulate(theta, fields), self.model.n_a
+        n_f = theta.shape[1] - self.constants
+        requested = simulation.features[:, :, :-1] @ theta[:n_a, :n_f].T
+        requested += self.constant_feature * theta[:n_a, n_f:].T[:, None][: self.horizon]
+        excess = requested - simulation.actions
+        if self.constants == 1:
+            excess = excess.reshape(1, -1, n_a)
+            weights = np.tile(weights, self.horizon) / self.horizon
+        always = (excess != 0.0).all(axis=1)
+        excess = np.where(always, np.einsum("kfi,f->ki", excess, weights), 0.0)
+        changed = theta.copy()
+        changed[:n_a, n_f:] -= excess.T
+        return changed
+
+    def moment(self, simulation: Simulation, weights: Array) -> Array:
+        """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields."""
+        features = simulation.features
+        found: Array = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
+        return found
+
+    def _start(self, fields: Array) -> Array:
+        """The model's state at the beginning; replayed rollouts have innovations after it."""
+        return fields[:, : len(self.U)]
+
+    def _disturbances(self, fields: Array) -> Array | None:
+        """What is added to the states after each step, (F, T, n_z); None: nothing is."""
+        n_z = len(self.U)
+        return fields[:, n_z:].reshape(len(fields), -1, n_z) if fields.shape[1] > n_z else None
+
+    def _outputs(self, z: Array) -> Array:
+        """What U^T is applied to, and the target is of, for states (..., n_z)."""
+        return z
+
+    def _unforeseen(self, fields: Array) -> Array | None:
+        """What is added to the outputs, (F, T, n_y); None: nothing is."""
+        return None
+
+    def _pull_outputs(self, by_outputs: Array) -> Array:
+        """The derivative by z of that by the outputs."""
+        return by_outputs
+
+    def _offsets(self, fields: Array) -> Array | None:
+        """What is added to s, (F, T, n_s); None: nothing is."""
+        unforeseen = self._unforeseen(fields)
+        found = None if unforeseen is None else unforeseen @ self.U
+        if self.noise:
+            size = self.horizon, len(fields), self.U.shape[1]
+            drawn = self._noise(np.random.default_rng(0).standard_normal(size)).swapaxes(0, 1)
+            found = drawn if found is None else found + drawn
+        return found
+
+    def _noise(self, drawn: Array) -> Array:
+        """The noise on U^T z, whose columns are orthonormal, of numbers of N(0, 1)."""
+        return self.noise * drawn
+
+
+def _of(rows: Array | None, some: Any) -> Array | None:
+    return None if rows is None else rows[some]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """States (T + 1, F, n_z), actions (T, F, n_a), mean stage costs (F,) and features (T, F, n_f).
+
+    The features are what the law was of, [s_k; p_k; 1]. From where a field's simulation is not finite
+    its states, its actions and what the law knew of it are zero.
+    """
+
+    states: Array
+    actions: Array
+    costs: Array
+    features: Array
+
+    def of_fields(self, chosen: NDArray[Any]) -> Simulation:
+        """Of some of the fields."""
+        return Simulation(
+            self.states[:, chosen],
+            self.actions[:, chosen],
+            self.costs[chosen],
+            self.features[:, chosen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FeedForwardLoop(ClosedLoop):
+    """Laws a_k = K U^T z_k + b_k; theta is [K b_0 .. b_{T-1}].
+
+    Attributes
+    ----------
+    law : FeedForward
+        Whose vector of parameters a policy is.
+    """
+
+    law: FeedForward = field(kw_only=True)
+
+    constant_feature: ClassVar[float] = 1.0
+
+    @property
+    def constants(self) -> int:
+        return self.horizon
+
+    def theta(self, policy: Array) -> Array:
+        parts = self.law.parts(np.ravel(policy))
+        return np.hstack([parts["K"], parts["b"].T])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        n_s = self.U.shape[1]
+        parts = {"K": theta[:, :n_s], "b": theta[:, n_s:].T}
+        return self.law.vector(parts).reshape(near.shape)
+
+    def moment(self, simulation: Simulation, weights: Array) -> Array:
+        """F, with a number that is 1 at a step and else 0 for each step."""
+        features, n_s, T = simulation.features, self.U.shape[1], self.horizon
+        found = np.zeros((n_s + T, n_s + T))
+        found[:n_s, :n_s] = super().moment(simulation, weights)[:n_s, :n_s]
+        found[:n_s, n_s:] = np.einsum("kfi,f->ik", features[:, :, :n_s], weights) / T
+        found[n_s:, :n_s] = found[:n_s, n_s:].T
+        found[n_s:, n_s:] = np.eye(T) / T
+        return found

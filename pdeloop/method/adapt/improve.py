@@ -1,0 +1,234 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Improvement of a law on a model of the whole field.
+
+L-BFGS on the weighted cost over initial fields, in the coordinates
+
+    x = G^{1/2} theta F^{1/2},        G = R + B^T P B,        F = mean [s; 1][s; 1]^T,
+
+with P of the linear-quadratic problem at the target: of a linear plant the cost has the Hessian 2 I
+there, so that few steps suffice and none of them depends on the units of actions and states.
+
+References
+----------
+Nocedal, Wright, "Numerical Optimization", 2nd ed., algorithm 7.5 (L-BFGS). Byrd, Lu, Nocedal, Zhu, SIAM
+J. Sci. Comput. 16, 1995 (the implementation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.design.finite_horizon import action_curvature
+
+_MEMORY = 40
+"""Gradient differences that L-BFGS keeps."""
+_WINDOW = 5
+"""L-BFGS steps that together must reach `least_gain`."""
+_ISOTROPY = 1e-3
+"""Share of the identity in the second moment of [s; 1] that scales the gains."""
+_HALVINGS = 12
+"""Maximum number of halvings of a law until the model's fields are finite."""
+
+FAR = 10.0
+"""The cost of a law without a finite one, per cost of the law to begin with."""
+LARGEST = 512
+"""Numbers of a state up to which R + B^T P B is worked out; its work grows with their third power."""
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """A law, and its weighted cost on the fields where the law to begin with has a finite one.
+
+    Attributes
+    ----------
+    theta : (n_a, n_s + 1) array
+    before, after : float
+    steps : int
+        Of L-BFGS.
+    """
+
+    theta: Array
+    before: float
+    after: float
+    steps: int
+
+
+class Coordinates:
+    """x of theta, and back.
+
+    left: L^{-T} of G = L L^T; right: the same of F.
+    """
+
+    def __init__(self, curvature: Array, moment: Array) -> None:
+        self._left, self._right = (
+            linalg.solve_triangular(
+                linalg.cholesky(matrix, lower=True), np.eye(len(matrix)), lower=True
+            ).T
+            for matrix in (curvature, moment)
+        )
+
+    def theta(self, x: Array) -> Array:
+        """The law with the coordinates x, of any shape."""
+        theta: Array = self._left @ x.reshape(len(self._left), -1) @ self._right.T
+        return theta
+
+    def gradient(self, by_theta: Array) -> Array:
+        """d/dx of d/dtheta, (n_a (n_s + 1),)."""
+        by_x: Array = (self._left.T @ by_theta @ self._right).ravel()
+        return by_x
+
+
+def improve(
+    loop: ClosedLoop,
+    theta: Array,
+    fields: Array,
+    weights: Array,
+    curvature: Array,
+    settings: ImprovementSettings,
+    least_gain: float | None = None,
+    trust: float = 0.0,
+) -> Improvement | None:
+    """The law after a descent, or None where no law to begin with is finite on the model.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The model and the cost.
+    theta : (n_a, n_s + 1) array
+        The law to begin with. It is halved where its simulations are not finite from any field.
+    fields, weights : (F, n_z) and (F,) arrays
+        Initial fields; those from which the law to begin with is not finite are left out.
+    curvature : (n_a, n_a) array
+        G.
+    settings : ImprovementSettings
+        Constants of the descent.
+    least_gain : float, optional
+        In place of that of the settings.
+    trust : float
+        Weight of the added cost |x - x_0|^2, with x_0 the initial law: for a linear plant the step is
+        1/(1 + trust) of the whole one.
+    """
+    for _ in range(_HALVINGS + 1):
+        simulation = loop.simulate(theta, fields)
+        finite = np.isfinite(simulation.costs) & (weights > 0.0)
+        if finite.any():
+            break
+        theta = 0.5 * theta
+    else:
+        return None
+    fields, weights = fields[finite], weights[finite] / weights[finite].sum()
+    moment = loop.moment(simulation.of_fields(finite), weights)
+    count = len(moment) - loop.constants
+    size = float(np.trace(moment[:count, :count])) / count
+    if not (size > 0.0 and np.isfinite(moment).all()):
+        return None
+    # s and the constants each in its own unit.
+    units = np.append(np.full(count, size), np.full(loop.constants, 1.0 / loop.constants))
+    moment[np.diag_indices(len(moment))] += _ISOTROPY * units
+    gain = settings.least_gain if least_gain is None else least_gain
+    return _descend(
+        loop,
+        theta,
+        fields,
+        weights,
+        Coordinates(curvature, moment),
+        settings,
+        gain,
+        trust,
+    )
+
+
+def _descend(
+    loop: ClosedLoop,
+    theta: Array,
+    fields: Array,
+    weights: Array,
+    coordinates: Coordinates,
+    settings: ImprovementSettings,
+    least_gain: float,
+    trust: float,
+) -> Improvement:
+    # Not at the top: a node that never improves a law has no need of it.
+    from scipy.optimize import minimize
+
+    before, by_theta = loop.gradient(theta, fields, weights)
+    # Of a quadratic cost the step -g/2 leads to its minimum. L-BFGS begins with one of unit length.
+    unit = 0.5 * float(np.linalg.norm(coordinates.gradient(by_theta)))
+    if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):
+        return Improvement(theta, before, before, 0)
+    best, values = Improvement(theta, before, before, 0), [1.0]
+    least, held = before, trust * unit**2
+
+    def objective(y: Array) -> tuple[float, Array]:
+        nonlocal best, least
+        at, cost, gradient = theta, before, by_theta  # the descent starts from known values
+        if y.any():
+            at = theta + coordinates.theta(unit * y)
+            cost, gradient = loop.gradient(at, fields, weights)
+        if not (cost < FAR * before and np.isfinite(gradient).all()):
+            return FAR, np.zeros_like(y)
+        total = cost + held * float(y @ y)
+        if total < least:
+            least, best = total, Improvement(at, before, cost, best.steps)
+        slope = unit * coordinates.gradient(gradient) + 2.0 * held * y
+        return total / before, slope / before
+
+    def stop_when_flat(_: Array) -> None:
+        values.append(least / before)
+        earlier = values[max(len(values) - 1 - _WINDOW, 0)]
+        few = len(values) <= _WINDOW
+        if not few and earlier - values[-1] <= least_gain * values[-1]:
+            raise StopIteration
+
+    minimize(
+        objective,
+        np.zeros(theta.size),
+        jac=True,
+        method="L-BFGS-B",
+        callback=stop_when_flat,
+        options={
+            "maxiter": settings.iterations,
+            "maxcor": _MEMORY,
+            "ftol": 0.0,
+            "gtol": 0.0,
+        },
+    )
+    return Improvement(best.theta, before, best.after, len(values) - 1)
+
+
+def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
+    """The law that is finite from most of the fields, and cheapest where all of those are."""
+    if all(np.array_equal(law, laws[0]) for law in laws):
+        return laws[0]
+    return laws[index_of_cheapest(np.array([loop.costs(theta, fields) for theta in laws]), weights)]
+
+
+def index_of_cheapest(costs: Array, weights: Array) -> int:
+    """The row of costs (laws, F) that `cheapest` chooses, the first of several alike."""
+    lost = ~np.isfinite(costs) @ weights
+    common = np.isfinite(costs[lost <= lost.min()]).all(axis=0)
+    total = np.where(common, costs, 0.0) @ weights
+    return int(np.lexsort((total, lost))[0])
+
+
+def curvature_of(loop: ClosedLoop) -> Array:
+    """R + B^T P B of the model linearised at the target; R where there is none."""
+    n_a, r = loop.model.n_a, loop.action_weight
+    if loop.model.n_z <= LARGEST:
+        A, B = loop.model.linearise(loop.target, np.zeros(n_a))
+        if np.isfinite(A).all() and np.isfinite(B).all():
+            try:
+                found = action_curvature(A, B, loop.state_weight, r, loop.horizon)
+            except np.linalg.LinAlgError:
+                found = np.full((n_a, n_a), np.nan)
+            found = 0.5 * (found + found.T)
+            if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
+                return loop.curvature(found)
+    return loop.curvature(r * np.eye(n_a))

@@ -1,0 +1,209 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""An optimiser for large states, which works on their coordinates in a basis.
+
+With orthonormal rows W that span U, the target and the measured states, x = W^T z contains all that an
+optimiser needs: s = U^T z = (W^T U)^T x, and |z - z_r| = |x - W^T z_r|. W grows with later
+rollouts (`pdeloop.method.reduce.snapshots`); nothing else in a checkpoint grows with the size of a
+state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt.base import (
+    Context,
+    Optimizer,
+    Record,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    Trajectory,
+)
+from pdeloop.method.adapt.trajectories import LowRankTrajectory
+from pdeloop.method.laws.base import Law
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.observer import Observer
+from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
+from pdeloop.process.one_thread import one_thread
+
+_ROWS, _OWN = "basis", "own."
+
+
+class InCoordinates(Optimizer):
+    """What `make` makes, for states as coordinates.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the optimiser of a context.
+    context : Context
+        Of whole states.
+    """
+
+    name = "in_coordinates"
+
+    def __init__(self, make: Callable[[Context], Optimizer], context: Context) -> None:
+        self.basis = SnapshotBasis(np.ascontiguousarray(context.U.T))
+        self.basis.extend(context.target[None])
+        self._noise = context.noise
+        explorations = [self._seen(known) for known in context.every_exploration]
+        measured = [self._recorded(record) for record in context.measured]
+        own = replace(
+            context,
+            U=self.basis.coordinates(context.U.T).T,
+            target=self.basis.coordinates(context.target[None])[0],
+            exploration=explorations[0],
+            further=explorations[1:],
+            measured=measured,
+            periodic=False,
+            line=False,
+            shape=(),
+            cost=context.cost and CostInCoordinates(context.cost, self.basis),
+            law=self._law(context),
+        )
+        self._own = make(own)
+
+    def _law(self, context: Context) -> Law | None:
+        """The law of the coordinates, where it is more than gains."""
+        if not isinstance(context.law, FeedForward | Observer):
+            return None
+        U = self.basis.coordinates(context.U.T).T
+        return type(context.law)(replace(context.law.model, U=U), context.law.horizon)
+
+    @classmethod
+    def first_step(cls, settings: Any) -> int:
+        """Of no meaning: the class of the optimiser itself is asked."""
+        return 0
+
+    @property
+    def policy(self) -> Array:
+        """See `Optimizer`, as all that follows."""
+        return self._own.policy
+
+    @property
+    def tells(self) -> int:
+        return self._own.tells
+
+    @property
+    def done(self) -> bool:
+        return self._own.done
+
+    def ask(self) -> list[Rollout]:
+        return self._own.ask()
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        return self._own.tell(
+            [
+                replace(result, trajectory=result.trajectory and self._seen(result.trajectory))
+                for result in results
+            ]
+        )
+
+    def state(self) -> State:
+        return {_ROWS: self.basis.rows} | {
+            _OWN + name: array for name, array in self._own.state().items()
+        }
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        n_z = self.basis.rows.shape[1]
+        rows = checked_array(state, _ROWS, "f", (None, n_z))
+        if len(rows) > CAPACITY:
+            raise ValueError(f"'{_ROWS}' has {len(rows)} rows; expected at most {CAPACITY}")
+        self.basis.rows = rows
+        names = [name for name in state if name.startswith(_OWN)]
+        self._own.restore({name.removeprefix(_OWN): state[name] for name in names})
+
+    def _seen(self, trajectory: Trajectory) -> Trajectory:
+        """In coordinates, with the basis extended by new directions."""
+        states, finite = trajectory.states, True
+        if isinstance(trajectory, LowRankTrajectory):
+            states = trajectory.modes * linalg.norm(trajectory.coordinates, axis=0)[:, None]
+        else:
+            finite = bool(np.isfinite(states).all())
+        if finite:
+            self.basis.extend(states, self._noise)
+        if isinstance(trajectory, LowRankTrajectory):
+            own = trajectory.coordinates @ self.basis.coordinates(trajectory.modes)
+        else:
+            own = self.basis.coordinates(states)
+        return Trajectory(own, trajectory.actions)
+
+    def _recorded(self, record: Record) -> Record:
+        known = self._seen(Trajectory(record.states, record.actions))
+        return replace(record, states=known.states)
+
+
+class CostInCoordinates(Cost):
+    """A cost of whole states z = W x, of their coordinates x.
+
+    |E W x - w_k|^2 = |R x - Q^T w_k|^2 + |w_k - Q Q^T w_k|^2 with E W = Q R, which is made again
+    when W has grown.
+    """
+
+    def __init__(self, whole: Cost, basis: SnapshotBasis) -> None:
+        super().__init__(CAPACITY, whole.n_a, whole.horizon)
+        self._whole, self._basis, self._rows = whole, basis, 0
+        self._made: Cost = self
+
+    @property
+    def _present(self) -> Cost:
+        """For the present W."""
+        whole, rows = self._whole, self._basis.rows
+        if len(rows) != self._rows:
+            (R, aims), (last, aim) = (
+                self._squares(rows.T, terminal=terminal) for terminal in (False, True)
+            )
+            self._made = Cost(
+                CAPACITY,
+                whole.n_a,
+                whole.horizon,
+                action_weight=whole.action_weight,
+                action_target=whole.action_target,
+                output=np.vstack([R, last]),
+                target=np.column_stack([aims, np.repeat(aim, whole.horizon, axis=0)]),
+                state_weight=np.repeat([1.0, 0.0], [len(R), len(last)]),
+                terminal_weight=np.repeat([0.0, 1.0], [len(R), len(last)]),
+            )
+            self._rows = len(rows)
+        return self._made
+
+    def _squares(self, W: Array, *, terminal: bool) -> tuple[Array, Array]:
+        """R, and its aims Q^T w_k as rows, both with one number more for what no x can reach."""
+        E = self._whole.residual(W, terminal=terminal)
+        w = np.atleast_2d(self._whole.residual_target(terminal=terminal))
+        with one_thread():
+            Q, R = linalg.qr(E, mode="economic")
+            aims = w @ Q
+            beyond = linalg.norm(w - aims @ Q.T, axis=1)
+        whole = np.zeros((len(R) + 1, CAPACITY))
+        whole[: len(R), : W.shape[1]] = R
+        return whole, np.column_stack([aims, beyond])
+
+    def add(self, totals: Array, states: Array, actions: Array, k: int) -> None:
+        """See `Cost`, as all that follows."""
+        self._present.add(totals, states, actions, k)
+
+    def add_terminal(self, totals: Array, states: Array) -> None:
+        self._present.add_terminal(totals, states)
+
+    def along(self, states: Array, actions: Array, first: int) -> tuple[Array, Array, Array]:
+        return self._present.along(states, actions, first)
+
+    def at_end(self, states: Array) -> tuple[Array, Array]:
+        return self._present.at_end(states)
+
+
+def is_large(context: Context) -> bool:
+    """True if an optimiser sees coordinates in place of the states."""
+    return len(context.target) > LARGE

@@ -1,0 +1,486 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The optimiser `model_based`: a law is improved on a model of the whole field, and judged by rollouts.
+
+    stage       rollouts                                    afterwards
+    renewing    the current law, each on a fresh field      a model is fitted to all rollouts and the
+                                                            law improved on it (`renewal`)
+    judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
+
+Where no model predicts the rollouts, laws are steps along measured ones (`replay`), each rolled out on
+the fields of the first law, and compared with no control as well; then rollouts alone decide.
+
+Sources and equations: docs/optimizers.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import (
+    Context,
+    Optimizer,
+    Record,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    checked_policy,
+    checked_theta,
+    require_positive,
+    require_results,
+)
+from pdeloop.method.adapt.belief import (
+    Belief,
+    also_around,
+    also_in_pieces,
+    also_near,
+    believe,
+    largest_error,
+)
+from pdeloop.method.adapt.estimate import Estimate
+from pdeloop.method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
+from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress
+from pdeloop.method.adapt.renewal import renew, renew_from_states
+from pdeloop.method.adapt.replay import (
+    FIRST_TRUST,
+    GROWS,
+    LARGEST_TRUST,
+    SHRINKS,
+    best_measured,
+    best_on_same_fields,
+    costs_by_field,
+    step,
+)
+from pdeloop.method.adapt.schedule import Schedule
+from pdeloop.method.adapt.sensed_loop import can_be_sensed
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.trajectories import Records, cleaned
+from pdeloop.method.adapt.undeclared_noise import believe_in_noise
+from pdeloop.method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    beats_no_control,
+    choose,
+    earlier_law,
+    evidence_of,
+    evidence_of_rollouts,
+    measured_change,
+)
+from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.seeds import field_seed
+from pdeloop.process.one_thread import one_thread
+
+__all__ = ["ModelBased"]
+
+_REACH = 3.0
+"""Magnitude of the states that a model must describe, in terms of the largest one measured before."""
+_NONE_ROLLOUTS = 2
+"""Rollouts without control on fields of the first law, where no model tells what they cost."""
+_MIXTURE_STREAM = 0x4D4958  # "MIX"
+
+
+class ModelBased(Optimizer):
+    """Policy optimisation on a model of the whole field.
+
+    Parameters
+    ----------
+    policy0 : (n_a, 2 n_s) or (size,) array
+        Where to start, [K_a K_b] or the vector of a law with an observer; the first law.
+    seed : int
+        Determines the initial fields.
+    rollouts : int
+        The budget, without the rollouts that the context has already.
+    settings : ModelBasedSettings, optional
+        Constants.
+    context : Context
+        Basis, target, weights, horizon, the explorations and what else was measured.
+    """
+
+    name = "model_based"
+    Settings = ModelBasedSettings
+    needs_trajectories = True
+    any_cost = True
+    needs_affine_law = True
+    also_improves = ("observer", "extended_kalman", "feedforward", "predictive")
+    in_coordinates = True
+    judges_first_law = True
+    explorations = 2
+    law_of_moving_targets = "feedforward"
+    law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: ModelBasedSettings | None = None,
+        context: Context | None = None,
+    ) -> None:
+        require_positive(rollouts=rollouts)
+        if context is None:
+            raise ValueError("this optimiser needs a context with trajectories, got none")
+        self._settings = settings or ModelBasedSettings()
+        self._context, self._seed, self._budget = context, seed, rollouts
+        self._declared = context.noise
+        vector = isinstance(context.law, FeedForward | Observer)
+        self._first = checked_theta(policy0) if vector else checked_policy(policy0)
+        self._none = np.zeros_like(self._first)
+        explored = [
+            Record(self._none, np.inf, known.states, known.actions)
+            for known in context.every_exploration
+        ]
+        self._before = [*explored, *context.measured]
+        self._schedule = Schedule(len(self._before), rollouts, self._settings)
+        self._reach = _REACH * max(float(np.abs(known.states).max()) for known in self._before)
+        self._records = Records(self._reach)
+        self._progress = Progress(self._first.copy())
+
+    @classmethod
+    def for_context(cls, context: Context) -> type[Optimizer]:
+        """Another one for a law that plans, or estimates the state from few readings."""
+        # Not at the top: they know this class.
+        from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
+        from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+        from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
+
+        if isinstance(context.law, Predictive):
+            return ModelBasedPredictive
+        if not (context.sensors and isinstance(context.law, Observer)):
+            return cls
+        return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings
+
+    @classmethod
+    def first_step(cls, settings: ModelBasedSettings) -> int:
+        """A rollout of the first law, and those that judge the next one."""
+        return 1 + settings.judging
+
+    @property
+    def policy(self) -> Array:
+        """The present law, and at the end the chosen one."""
+        return self._progress.policy.copy()
+
+    @property
+    def belief(self) -> Belief | None:
+        """The model that the law was improved on last; None: there is none."""
+        return self._progress.belief
+
+    @property
+    def records(self) -> list[Record]:
+        """The rollouts that it was told of."""
+        return self._records.all()
+
+    @property
+    def fields(self) -> Array:
+        """The initial fields of all rollouts, (n, n_z)."""
+        return self._fields()
+
+    @property
+    def tells(self) -> int:
+        """Number of calls of `tell`."""
+        return self._progress.tells
+
+    @property
+    def done(self) -> bool:
+        """True once no further rollouts are needed."""
+        return self._progress.stage == ENDED
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts of the current stage, at once where they do not depend on each other."""
+        own, progress = self._records.count, self._progress
+        if progress.stage == ENDED:
+            return []
+        if progress.replayed:
+            return self._on_known_fields()
+        if progress.stage == RENEWING:
+            laws = [progress.policy] * (self._next_renewal() - own)
+        else:
+            laws = [progress.policy] * (self._schedule.judging - progress.none_is_close)
+            laws += [self._none] * progress.none_is_close
+        return [self._rollout(law, own + i) for i, law in enumerate(laws)]
+
+    def _on_known_fields(self) -> list[Rollout]:
+        """Rollouts of a step along measured ones, on fields of the first law.
+
+        No control follows once, and the final law comes to fresh fields together with the first one.
+        """
+        progress, judging = self._progress, self._schedule.judging
+        known = list(costs_by_field(self._records.all(), self._first))
+        if progress.stage == RENEWING:
+            left = self._schedule.last - self._records.count
+            count = min(judging, left, len(known))
+            asked = [Rollout(progress.policy.copy(), seed) for seed in known[:count]]
+            if not costs_by_field(self._records.all(), self._none):
+                free = max(min(_NONE_ROLLOUTS, left - count), 0)
+                asked += [Rollout(self._none.copy(), seed) for seed in known[:free]]
+            return asked
+        own = costs_by_field(self._records.all(), progress.policy)
+        asked = [Rollout(progress.policy.copy(), seed) for seed in known if seed not in own]
+        asked, fresh = asked[:judging], self._records.count
+        while len(asked) < judging:
+            asked.append(self._rollout(progress.policy, fresh))
+            if len(asked) < judging and not np.array_equal(progress.policy, self._first):
+                asked.append(self._rollout(self._first, fresh))
+            fresh += 1
+        return asked
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the rollouts, and carry out the next stage."""
+        asked = self.ask()
+        require_results(results, len(asked))
+        for result in results:
+            self._records.validated_samples(result)
+        self._progress.tells += 1
+        # One thread: a threaded LAPACK rounds differently for another number of threads.
+        with one_thread():
+            added = [
+                self._records.add(rollout, result)
+                for rollout, result in zip(asked, results, strict=True)
+            ]
+            row = self._measured(added)
+            if self._progress.stage == RENEWING:
+                self._renew(row)
+            else:
+                self._judge(row)
+        diverged = sum(not result.usable for result in results)
+        return row | {"rollouts": self._records.count, "diverged": diverged}
+
+    def _next_renewal(self) -> int:
+        """Own rollouts after which the law is renewed next."""
+        return self._schedule.doubled(self._records.count)
+
+    def _rollout(self, policy: Array, number: int) -> Rollout:
+        return Rollout(policy.copy(), field_seed(self._seed, number))
+
+    def _measured(self, added: Sequence[Record]) -> Row:
+        """The mean cost of some rollouts, and the model's earlier prediction of it."""
+        row: Row = {"role": self._progress.stage}
+        own = [r for r in added if np.array_equal(r.policy, self._progress.policy)]
+        added = own if self._progress.replayed else added
+        if all(record.usable for record in added):
+            row["cost"] = float(np.mean([record.cost for record in added]))
+        predicted = self._predicted(added)
+        if predicted and np.isfinite(predicted).all():
+            row["predicted"] = float(np.mean(predicted))
+        return row
+
+    def _predicted(self, added: Sequence[Record]) -> list[float]:
+        """The costs of rollouts on the last model; none without one."""
+        belief = self._progress.belief
+        return [] if belief is None else belief.predicted_costs(self._context, added)
+
+    def _data(self) -> list[Record]:
+        """All rollouts, denoised."""
+        noise, measured = self._context.noise, self._measurements()
+        return cleaned(measured, noise, line=self._context.line) if noise else measured
+
+    def _measurements(self) -> list[Record]:
+        """All rollouts as they were measured."""
+        return [r for r in (*self._before, *self._records.all()) if len(r.states)]
+
+    def _begin_judging(self) -> None:
+        """Also without control, if that may be as good as the law."""
+        self._progress.stage = JUDGING
+        belief, policy = self._progress.belief, self._progress.policy
+        if belief is not None and self._schedule.judging > 1 and policy.any():
+            loop, fields = belief.loop(self._context), self._fields()
+            none, own = (loop.costs(loop.theta(law), fields).mean() for law in (self._none, policy))
+            self._progress.none_is_close = bool(none <= (1.0 + self._settings.close) * own)
+
+    def _fields(self) -> Array:
+        """Initial fields of all rollouts."""
+        return initial_fields(self._data())
+
+    def _renew(self, row: Row) -> None:
+        """Improve the law on the model that predicts the rollouts, or go on without one."""
+        final = self._records.count >= self._schedule.last
+        belief = self._believe()
+        known = self._measurements()
+        other = believe_in_noise(self._context, known, belief, self._settings)
+        if other is not None:
+            belief, row["noise"] = other
+            self._take_noise(other[1])
+        elif belief is not None and not self._is_believed(belief):
+            belief = also_in_pieces(self._context, known, belief, self._settings)
+        if belief is None or not self._is_believed(belief):
+            belief = also_near(self._context, known, belief, self._settings, self._reach)
+        if belief is None or not self._is_believed(belief):
+            best = best_measured(self._records.all(), self._first)
+            belief = also_around(self._context, known, belief, self._settings, best)
+        if belief is not None:
+            row["model"] = belief.model.kind
+            if np.isfinite(belief.error):
+                row["mismatch"] = belief.error
+        if belief is not None and self._is_believed(belief):
+            self._progress.belief, self._progress.replayed = belief, False
+            self._improve(belief, row, final)
+        else:
+            self._replay(belief, row, final)
+        if final and self._progress.stage == RENEWING:
+            self._begin_judging()
+
+    def _believe(self) -> Belief | None:
+        """The model that predicts the rollouts; the kind selected before is tried first."""
+        before = self._progress.belief
+        kind = "" if before is None else before.model.kind
+        return believe(self._context, self._measurements(), kind)
+
+    def _take_noise(self, noise: float) -> None:
+        """Go on as if this measurement noise had been declared; 0: it was as declared."""
+        self._progress.noise = noise
+        self._context = replace(self._context, noise=noise or self._declared)
+
+    _unpredicted = "no model of the whole field predicts the rollouts"
+
+    def _is_believed(self, belief: Belief) -> bool:
+        """True if the law is improved on this model."""
+        return belief.error <= largest_error(self._context, self._settings)
+
+    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
+        """A step along measured rollouts from the law that is best on fields of the first one."""
+        progress, records = self._progress, self._records.all()
+        laws = {record.policy.tobytes(): record.policy for record in records}
+        best = best_on_same_fields(records, list(laws.values()), self._first)
+        if progress.replayed:
+            good = np.array_equal(best, progress.policy)
+            progress.trust = min(progress.trust * (GROWS if good else SHRINKS), LARGEST_TRUST)
+        else:
+            progress.replayed, progress.trust = True, FIRST_TRUST
+        progress.policy = best.copy()
+        row["reason"] = f"{self._unpredicted}: steps along measured ones"
+        if final:
+            return
+        found = None
+        if model is not None:
+            loop = model.loop(self._context)
+            usable = [record for record in records if record.usable]
+            if usable:
+                found = step(loop, loop.replays_of(usable), best, self._settings, progress.trust)
+        if found is None:
+            row["reason"] = f"{self._unpredicted}, and no step along them stays finite"
+        else:
+            progress.policy, row["steps"] = found
+
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        loop, fields = belief.loop(self._context), self._fields()
+        first, none = loop.theta(self._first), loop.theta(self._none)
+        safe = beats_no_control(loop, first, fields)
+        base, near = (first, self._first) if safe else (none, self._none)
+        self._progress.safe = safe
+        improved = base if self._progress.improved is None else self._progress.improved
+        rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
+        data = self._data()
+        states = measured_states(data, self._settings.chaotic_fields)
+        if not belief.whole or any_state_serves(loop, base, fields, states):
+            row["chaotic"] = True
+            found = renew_from_states(loop, base, improved, data, rng, self._settings, final=final)
+        else:
+            found = renew(
+                loop,
+                base,
+                improved,
+                self._progress.parts,
+                fields,
+                rng,
+                self._settings,
+                components=belief.components,
+                periodic=self._context.periodic,
+                final=final,
+            )
+        if found is None:
+            row["reason"] = "no improved law stays finite on the model; the law is kept"
+            return
+        self._progress.improved, self._progress.parts = found.improved, found.parts
+        self._progress.fraction, self._progress.change = found.fraction, found.change
+        self._progress.policy = loop.policy(found.theta, near) if found.fraction else near.copy()
+        row["fraction"], row["steps"] = found.fraction, found.steps
+        if np.isfinite(found.change.value):
+            row["predicted_change"], row["deviation"] = found.change.value, found.change.error
+
+    def _judge(self, row: Row) -> None:
+        """Choose between the first law, the final one, no control and all others that were measured."""
+        laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
+        base = self._decide(row, laws)
+        self._look_back(row, self._compared(laws, base), base)
+        early = "" if self._progress.replayed else _known_well(len(self._fields()))
+        self._end(row, str(row["reason"]), early)
+
+    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
+        """Which of the laws were compared with the one to stay with."""
+        return laws
+
+    def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
+        """Choose between the first law, the final one and no control; the name of that to stay with."""
+        progress, known = self._progress, self._rollouts()
+        base = FIRST if progress.safe or progress.replayed else NONE
+        if progress.replayed or progress.belief is None:
+            evidence = evidence_of_rollouts(laws, base, known)
+        else:
+            loop, fields = progress.belief.loop(self._context), self._fields()
+            evidence = evidence_of(loop, laws, base, known, fields, progress.change)
+        verdict = choose(evidence, base, self._settings.confidence)
+        progress.policy = laws[verdict.chosen].copy()
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        return base
+
+    _model_compares = True
+    """Whether laws of earlier rollouts are compared on the model as well."""
+
+    def _look_back(self, row: Row, laws: Mapping[str, Array], base: str) -> None:
+        """Return another measured law in place of the chosen one where it is better beyond chance.
+
+        laws: that were compared, that to stay with as `base`.
+        """
+        progress, loop, known = self._progress, None, self._rollouts()
+        if progress.belief is not None and self._model_compares and not progress.replayed:
+            loop = progress.belief.loop(self._context)
+        confidence, fields = self._settings.confidence, self._fields()
+        found = earlier_law(loop, progress.policy, list(laws.values()), known, fields, confidence)
+        if found is None:
+            return
+        law, saved = found
+        name = FIRST if np.array_equal(law, self._first) else ADAPTED
+        size = f"{-saved.value:.4g} (standard error {saved.error:.2g})"
+        other = "the first law" if name == FIRST else "an earlier adapted law"
+        row["reason"] = f"{row['reason']}; {other} costs {size} less and is returned"
+        change = measured_change(known, law, laws[base])
+        if change is None:
+            change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))
+        row["chosen"], progress.policy = name, law.copy()
+        row["predicted_change"], row["deviation"] = change.value, change.error
+
+    def _rollouts(self) -> list[Record]:
+        """The rollouts of laws, denoised."""
+        return self._data()[len(self._context.every_exploration) :]
+
+    def _end(self, row: Row, reason: str, early: str = "") -> None:
+        row["reason"], self._progress.stage = reason, ENDED
+        if self._records.count < self._budget:
+            row["early"] = early or reason
+
+    def state(self) -> State:
+        """The progress and all rollouts."""
+        return self._progress.state() | self._records.state()
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint of an optimiser with the same arguments."""
+        n_z, shape = len(self._context.U), self._first.shape
+        self._progress = Progress.of(state, shape)
+        self._take_noise(self._progress.noise)
+        if self._progress.belief is not None:
+            self._progress.belief.check(self._context)
+        self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
+
+
+def _known_well(fields: int) -> str:
+    """Why rollouts are left."""
+    return f"more than {fields} fields would not change the law"

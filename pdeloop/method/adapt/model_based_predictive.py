@@ -1,0 +1,333 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
+
+The affine law is trained as ever. On the last model that predicts the rollouts, plans of 20, 40 and 80
+steps are simulated in closed loop from a few measured initial fields, as actions or as deviations from
+the affine law, whichever is cheaper there; the shortest within 2 % of the cheapest is taken. The last
+rollouts are of the law with that plan, from fresh fields. It replaces the affine law only if it is
+better by more than chance (`verdict`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt.base import (
+    Context,
+    Optimizer,
+    Record,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    part_of,
+    require_results,
+)
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.estimate import ZERO, mean_change
+from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, PREDICTIVE, Evidence, choose
+from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.models.base import FieldModel
+from pdeloop.method.seeds import field_seed
+from pdeloop.process.one_thread import one_thread
+
+LENGTHS = (20, 40, 80)
+"""Steps H of the plans that are tried."""
+SHORTER = 0.02
+"""Share of the cost that a plan of half the steps may be worse."""
+FEW = 4
+"""Measured initial fields from which plans are simulated."""
+RESTS = 0.01
+"""The target is an equilibrium of the model if a step from there moves the state by at most this share
+of its mean distance from it."""
+_TRAINING, _JUDGING, _ENDED = "training", "judging", "ended"
+_OWN = "own."
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A law that plans.
+
+    Attributes
+    ----------
+    theta : (size,) array
+    costs, before : (F,) arrays
+        Its costs from some initial fields on the model, and those of the affine law.
+    """
+
+    theta: Array
+    costs: Array
+    before: Array
+
+
+class ModelBasedPredictive(Optimizer):
+    """`ModelBased`, and then the law `predictive` on its model; parameters as there."""
+
+    name = "model_based"
+    Settings = ModelBasedSettings
+    needs_trajectories = True
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: ModelBasedSettings | None = None,
+        context: Context | None = None,
+    ) -> None:
+        if context is None or not isinstance(context.law, Predictive):
+            raise ValueError("this optimiser needs a context with a law that plans")
+        self._law, self._seed = context.law, seed
+        self._settings = settings or ModelBasedSettings()
+        self._shape = self._law.model.policy.shape
+        self._first = np.reshape(np.asarray(policy0, dtype=np.float64), self._shape)
+        measured = [self._matrix(record) for record in context.measured]
+        self._context = replace(context, measured=measured, law=None)
+        spare = rollouts - ModelBased.first_step(self._settings)
+        self._judging = max(min(self._settings.judging, spare), 0)
+        self._affine = ModelBased(
+            self._first,
+            seed=seed,
+            rollouts=rollouts - self._judging,
+            settings=self._settings,
+            context=self._context,
+        )
+        self._stage, self._tells, self._count = _TRAINING, 0, 0
+        self._candidate: Candidate | None = None
+        self._chosen: Array | None = None
+
+    @classmethod
+    def first_step(cls, settings: ModelBasedSettings) -> int:
+        """As of `ModelBased`."""
+        return ModelBased.first_step(settings)
+
+    @property
+    def policy(self) -> Array:
+        """Theta of the present affine law, and at the end of the chosen one."""
+        return self._affine.policy.ravel() if self._chosen is None else self._chosen.copy()
+
+    @property
+    def tells(self) -> int:
+        """Number of calls of `tell`."""
+        return self._tells
+
+    @property
+    def done(self) -> bool:
+        """True once no further rollouts are needed."""
+        return self._stage == _ENDED
+
+    def ask(self) -> list[Rollout]:
+        """Rollouts of affine laws, and the last ones of the law that plans."""
+        if self._stage == _TRAINING:
+            return self._affine.ask()
+        if self._candidate is None:
+            return []
+        numbers = range(self._count, self._count + self._judging)
+        return [Rollout(self._candidate.theta.copy(), field_seed(self._seed, n)) for n in numbers]
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the rollouts."""
+        asked = self.ask()
+        require_results(results, len(asked))
+        self._count += len(asked)
+        self._tells += 1
+        if self._stage == _TRAINING:
+            row = self._affine.tell(results)
+            if self._affine.done:
+                self._begin_judging(row)
+            return row
+        diverged = sum(not result.usable for result in results)
+        row = {"role": "judging", "rollouts": self._count, "diverged": diverged}
+        if not diverged:
+            row["cost"] = float(np.mean([result.cost for result in results]))
+        with one_thread():
+            self._judge(results, row)
+        self._stage = _ENDED
+        return row
+
+    def _begin_judging(self, row: Row) -> None:
+        """Make the law that plans, or say why there is none."""
+        self._stage = _ENDED
+        belief = self._affine.belief
+        if belief is None:
+            why = "no model of the whole field was accepted"
+        elif len(self._context.U) != len(self._law.model.U):
+            why = f"plans use states of at most {len(self._context.U)} numbers"
+        elif not self._judging:
+            why = "too few rollouts are left to judge one that plans"
+        else:
+            with one_thread():
+                made = self._made(belief, row)
+            if isinstance(made, Candidate):
+                self._candidate, self._stage = made, _JUDGING
+                row.pop("early", None)
+                return
+            why = made
+        row["reason"] = f"{row.get('reason', '')}; the affine law stays: {why}".removeprefix("; ")
+
+    def _made(self, belief: Belief, row: Row) -> Candidate | str:
+        """The law that plans on this model; or why there is none."""
+        loop, every = belief.loop(self._context), self._affine.fields
+        fields = every[np.unique(np.linspace(0, len(every) - 1, FEW).round().astype(int))]
+        before = loop.costs(loop.theta(self._affine.policy), fields)
+        planner, costs = self._planner(belief.model, fields)
+        share = 1.0 - float(np.sum(costs) / np.sum(before))
+        row["plan_steps"], row["plan_saves"] = planner.steps, share if np.isfinite(share) else 0.0
+        if not np.sum(costs) < np.sum(before):
+            return "on the model no plan is better"
+        try:
+            theta = self._law.theta_of(self._affine.policy, planner)
+        except ValueError as error:
+            return str(error)
+        return Candidate(theta, costs, before)
+
+    def _planner(self, model: FieldModel, fields: Array) -> tuple[Planner, Array]:
+        """The plans to use, and their costs from initial fields."""
+        context, settings = self._context, self._law.settings
+        n_s, policy = context.U.shape[1], self._affine.policy
+        cost = context.cost or Cost(
+            model.n_z,
+            model.n_a,
+            context.horizon,
+            state_weight=context.state_weight,
+            action_weight=context.action_weight,
+            target=context.target,
+        )
+        s_r = np.sum(context.U * context.target[:, None], axis=0)
+        plain = Planner(
+            model,
+            cost,
+            context.action_set,
+            np.ascontiguousarray(policy[:, :n_s] @ context.U.T),
+            policy[:, n_s:] @ s_r,
+            around=False,
+            steps=1,
+            terminal=rests(model, cost, fields),
+            iterations=settings.iterations,
+            first=settings.first_iterations,
+            starts=settings.starts,
+        )
+        lengths = sorted({min(steps, self._law.longest) for steps in LENGTHS})
+        if settings.steps:
+            lengths = [settings.steps]
+        tried: list[tuple[float, Planner, Array]] = []
+        for steps in lengths:
+            ways = (True, False) if not tried else (tried[-1][1].around,)
+            for around in ways:
+                planner = replace(plain, around=around, steps=steps)
+                costs = simulated(planner, fields)
+                tried.append((float(np.sum(costs)), planner, costs))
+            if len(ways) == 2:
+                tried = [min(tried, key=lambda each: each[0])]
+        most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
+        return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
+
+    def _judge(self, results: Sequence[RolloutResult], row: Row) -> None:
+        """Keep the affine law, unless the one that plans is better by more than chance."""
+        candidate, belief = self._candidate, self._affine.belief
+        assert candidate is not None and belief is not None
+        loop, policy = belief.loop(self._context), self._affine.policy
+        theta = loop.theta(policy)
+        planner = self._law.planner(self._law.parts(candidate.theta))
+        excess, costs, before = list[float](), [candidate.costs], [candidate.before]
+        usable = [r for r in results if r.usable and r.trajectory is not None]
+        if usable:
+            fields = np.stack([r.trajectory.states[0] for r in usable if r.trajectory is not None])
+            own = simulated(planner, fields)
+            costs.append(own)
+            before.append(loop.costs(theta, fields))
+            row["predicted"] = float(np.mean(own))
+            excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
+        excess += [np.inf] * (len(results) - len(usable))
+        base = FIRST if np.array_equal(policy, self._first) else ADAPTED if policy.any() else NONE
+        rolled = [r for r in self._affine.records if np.array_equal(r.policy, policy)]
+        of_base = [
+            record.cost - float(loop.costs(theta, loop.beginnings([record]))[0])
+            for record in rolled
+        ]
+        change = mean_change(np.concatenate(costs), np.concatenate(before))
+        evidence = {
+            base: Evidence(ZERO, np.array([e for e in of_base if not np.isnan(e)])),
+            PREDICTIVE: Evidence(change, np.array(excess), (change,)),
+        }
+        verdict = choose(evidence, base, self._settings.confidence)
+        if verdict.chosen == PREDICTIVE:
+            self._chosen = candidate.theta
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+
+    def _matrix(self, record: Record) -> Record:
+        return replace(record, policy=np.reshape(record.policy, self._shape))
+
+    def state(self) -> State:
+        """That of `ModelBased`, the stage, and the law that plans."""
+        arrays: State = {_OWN + name: value for name, value in self._affine.state().items()}
+        arrays |= {
+            "stage": np.array(self._stage),
+            "tells": np.array(self._tells),
+            "count": np.array(self._count),
+            "plans": np.array(self._chosen is not None),
+        }
+        if self._candidate is not None:
+            known = self._candidate
+            arrays |= {"theta": known.theta, "costs": np.stack([known.costs, known.before])}
+        return arrays
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint of an optimiser with the same arguments."""
+        stage = str(checked_array(state, "stage", "U", ()))
+        if stage not in (_TRAINING, _JUDGING, _ENDED):
+            raise ValueError(f"its stage is {stage!r}")
+        self._affine.restore(part_of(state, _OWN))
+        self._stage, self._candidate = stage, None
+        self._tells = int(checked_array(state, "tells", "i", ()))
+        self._count = int(checked_array(state, "count", "i", ()))
+        if "theta" in state:
+            theta = checked_array(state, "theta", "f", (None,)).copy()
+            self._law.planner(self._law.parts(theta))  # ValueError for none
+            costs, before = checked_array(state, "costs", "f", (2, None), finite=False)
+            self._candidate = Candidate(theta, costs.copy(), before.copy())
+        plans = bool(checked_array(state, "plans", "b", ()))
+        if (plans or stage == _JUDGING) and self._candidate is None:
+            raise ValueError("it has no law that plans")
+        self._chosen = self._candidate.theta if plans and self._candidate else None
+
+
+def simulated(planner: Planner, fields: Array) -> Array:
+    """Mean stage costs (F,) on the planner's own model from initial fields (F, n_z)."""
+    cost, z = planner.cost, fields
+    totals, plan = np.zeros(len(fields)), np.zeros((len(fields), planner.steps, len(planner.b)))
+    with np.errstate(all="ignore"):
+        for k in range(cost.horizon):
+            a, plan, _ = planner.step(plan, z, k)
+            plan = planner.shifted(plan)
+            cost.add(totals, z, a, k)
+            z = planner.model.step(z, a)
+            lost = ~np.isfinite(z).all(axis=1)
+            totals[lost], z[lost] = np.inf, 0.0
+        cost.add_terminal(totals, z)
+    totals[~np.isfinite(totals)] = np.inf
+    found: Array = totals / cost.horizon
+    return found
+
+
+def rests(model: FieldModel, cost: Cost, fields: Array) -> bool:
+    """True if the target is constant and an equilibrium of the model."""
+    point, a_r = cost.field_target, cost.action_target
+    if cost.target.ndim > 1:
+        return False
+    with np.errstate(all="ignore"):
+        moved = np.linalg.norm(model.step(point[None], a_r[None])[0] - point)
+        size = np.mean(np.linalg.norm(fields - point, axis=1))
+    return bool(moved <= RESTS * size)

@@ -1,0 +1,279 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`model_based` for a law that estimates the state, on a model of the field between few sensors.
+
+Where one equation reproduces the readings of the rollouts (`pdeloop.method.models.sensed`), the law is
+designed and improved on it as on a model of the whole field, from the initial fields estimated from the
+readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
+current law and those of `observer_design`. Laws are compared on other draws. In simulations of the
+filter's own equation what trusts it looks too good: the cheapest law on an estimate gets a filter that
+trusts the equation less where it then costs hardly more.
+The last rollouts of the final law begin where those of the first law did, and these pairs decide
+between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
+law that measured better than the final one is returned in its place.
+Where no equation reproduces the rollouts, it continues with a model of the readings
+(`model_based_readings`) and tries again with more of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import Record, Rollout, Row
+from pdeloop.method.adapt.belief import Belief, believe
+from pdeloop.method.adapt.estimate import Estimate, mean_of
+from pdeloop.method.adapt.estimated_loop import estimated_laws, least_trusting
+from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
+from pdeloop.method.adapt.initial_fields import mixtures, weighted
+from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.observer_design import compensators
+from pdeloop.method.adapt.progress import JUDGING, RENEWING
+from pdeloop.method.adapt.replay import FEWEST
+from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    Verdict,
+    choose,
+    evidence_against_none,
+    evidence_of_pairs,
+)
+from pdeloop.method.adapt.whole_field_law import whole_field_law
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.models.sensed import SensedModel
+from pdeloop.method.models.settings import SENSED_REPRODUCED
+
+_ATTEMPTS = 5
+"""Maximum number of times that an equation is looked for in vain."""
+_OBSERVER_GAIN = 3e-4
+"""As `least_gain`, for the last improvement of the law observer."""
+_OBSERVER_DRAWS = 2
+"""Sets of drawn initial fields, each of at most `mixtures`, for a law between few sensors."""
+
+DRAWN_STREAM = 0x44524157  # "DRAW"
+OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
+"""Entries of a row that describe the law that follows."""
+
+
+class ModelBasedSensed(ModelBasedReadings):
+    """`ModelBasedReadings`, on a model of the field as long as one reproduces the readings."""
+
+    @property
+    def _sensed(self) -> SensedModel | None:
+        """The model of the field that is believed."""
+        belief = self._progress.belief
+        model = None if belief is None else belief.model
+        return model if isinstance(model, SensedModel) else None
+
+    def _next_renewal(self) -> int:
+        """After as many rollouts as judge a law; on a model of the field later after twice as many."""
+        own, last = self._records.count, self._schedule.last
+        if self._sensed is None:
+            return min(own + self._settings.judging, last)
+        return 2 * own if 4 * own <= last else last
+
+    def _renew(self, row: Row) -> None:
+        """Where laws run too far away to be fitted, rollouts without control show the equation."""
+        super()._renew(row)
+        if (
+            self._progress.stage != RENEWING
+            or self._sensed is not None
+            or not self._attempts_left(self._records.count + self._settings.judging)
+        ):
+            return
+        if not any(
+            own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]
+        ):
+            self._progress.policy = self._none.copy()
+            for name in OF_A_LAW:
+                row.pop(name, None)
+            row["reason"] = (
+                "no equation was found, and the law diverges: no control is rolled out next"
+            )
+
+    def _attempts_left(self, own: int) -> bool:
+        """True if an equation is looked for after so many own rollouts."""
+        return own // self._settings.judging < _ATTEMPTS
+
+    def _believe(self) -> Belief | None:
+        """In an equation where one reproduces the readings, else in a model of the readings.
+
+        More rollouts may determine one that the first ones did not.
+        """
+        measured, model = self._measurements(), self._sensed
+        if model is not None or self._attempts_left(self._records.count):
+            found = sensed_from(self._context, measured, model)
+            if found is not None:
+                return Belief(*found, 1)
+        return believe(self._context, measured)
+
+    def _fields(self) -> Array:
+        """Initial fields of the rollouts whose readings the equation reproduces; of all if of none."""
+        if self._sensed is None:
+            return super()._fields()
+        loop = sensed_loop(self._context, self._sensed)
+        found = [loop.smoothed(record) for record in self._data()]
+        most = SENSED_REPRODUCED
+        good = [field for field, error in found if error <= most]
+        return np.stack(good or [field for field, _ in found])
+
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        """The law of least cost on the model, among the current one and those that it designs."""
+        if not isinstance(belief.model, SensedModel):
+            super()._improve(belief, row, final)
+            return
+        loop, fields = sensed_loop(self._context, belief.model), self._fields()
+        progress, settings, law = self._progress, self._settings, self._context.law
+        # A law with memory has many parameters, and simulations cost no rollout.
+        sets = _OBSERVER_DRAWS if final else 1
+        drawn, others = (self._drawn(fields, sets, which) for which in range(2))
+        every, weights = weighted(fields, drawn)
+        now = loop.theta(progress.policy)
+        linear = now if now.ndim > 1 else loop.theta(self._first)
+        laws, steps = _observers(loop, linear, every, weights, settings, final)
+        if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
+            further, more = estimated_laws(
+                loop, law, every, weights, settings, self._context.field_models
+            )
+            laws, steps = [*laws, *further], steps + more
+        if not laws:
+            row["reason"] = "no improved law stays finite on the model; the law is kept"
+            return
+        held_out = others if len(others) else fields
+        equal = np.full(len(held_out), 1.0 / len(held_out))
+        theta = cheapest(loop, [now, *laws], held_out, equal)
+        if theta is not now:
+            if isinstance(law, ExtendedKalman) and theta.ndim == 1:
+                theta = least_trusting(loop, law, theta, held_out, settings)
+            progress.policy = loop.policy(theta, self._first)
+        first = loop.costs(loop.theta(self._first), held_out)
+        none = loop.costs(loop.no_control, held_out)
+        progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
+        change = gained(loop.costs(theta, held_out), first if progress.safe else none)
+        progress.fraction, progress.change = 1.0, change
+        row["steps"] = steps
+        if np.isfinite(change.value):
+            row["predicted_change"], row["deviation"] = change.value, change.error
+
+    def _drawn(self, fields: Array, sets: int, which: int) -> Array:
+        """Draws from the distribution of the fields, as often as there are sets."""
+        rng = np.random.default_rng([self._seed, DRAWN_STREAM, self._records.count, which])
+        most, periodic = self._settings.mixtures, self._context.periodic
+        drawn = [mixtures(fields, most, rng, periodic=periodic) for _ in range(sets)]
+        return np.concatenate(drawn)
+
+    def ask(self) -> list[Rollout]:
+        """No control where it may stay, and the final law on the fields of the one that may stay."""
+        asked = super().ask()
+        if self._sensed is None or self._progress.stage not in (RENEWING, JUDGING):
+            return asked
+        first = self._of(self._first)
+        if self._progress.stage == JUDGING:
+            known = self._of(self._base[1]) or first
+            numbers = [record.stamp for record in known]
+            return [
+                self._rollout(own.policy, numbers[i % len(numbers)]) for i, own in enumerate(asked)
+            ]
+        if self._progress.safe or self._of(self._none):
+            return asked
+        return [replace(own, policy=self._none) for own in asked[: len(first)]] + asked[
+            len(first) :
+        ]
+
+    @property
+    def _base(self) -> tuple[str, Array]:
+        """The law to stay with on the model."""
+        return (FIRST, self._first) if self._progress.safe else (NONE, self._none)
+
+    def _of(self, law: Array) -> list[Record]:
+        """The rollouts of a law in the order of its fields."""
+        return [own for own in self._records.all() if np.array_equal(own.policy, law)]
+
+    def _begin_judging(self) -> None:
+        super()._begin_judging()
+        self._progress.none_is_close &= self._sensed is None or not self._of(self._none)
+
+    def _judge(self, row: Row) -> None:
+        """The law that measured best in place of the last one, if that is on a model of readings."""
+        if self._sensed is None:
+            super()._judge(row)
+        else:
+            ModelBased._judge(self, row)
+
+    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
+        if self._sensed is None:
+            return laws
+        return {base: laws[base], ADAPTED: laws[ADAPTED]}
+
+    def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
+        """As on a model of the whole field, where there is one, if measured costs agree."""
+        base = super()._decide(row, laws)
+        stays, final = laws[base], laws[ADAPTED]
+        if (
+            self._sensed is not None
+            and row["chosen"] in (base, ADAPTED)
+            and not np.array_equal(final, stays)
+        ):
+            self._compare_pairs(row, base, stays, final)
+        return base
+
+    def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
+        """Decide between the final law and the one to stay with on the same fields."""
+        judged = self._records.all()[-self._schedule.judging :]
+        own = np.array([record.cost for record in judged if np.array_equal(record.policy, final)])
+        known = np.array([record.cost for record in self._of(stays)])
+        count = min(len(own), len(known))
+        if count < FEWEST:
+            return
+        costs, others = {ADAPTED: own[:count], base: known[:count]}, known[count:]
+        if base == NONE:
+            before = [r for r in self._context.measured if r.usable and not r.policy.any()]
+            others = np.concatenate([others, [record.cost for record in before]])
+            evidence = evidence_against_none(costs, others, {ADAPTED: [self._progress.change]})
+        else:
+            evidence = evidence_of_pairs(costs, base)
+        measured = choose(evidence, base, self._settings.confidence)
+        self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
+        self._report(row, measured)
+
+    @staticmethod
+    def _report(row: Row, verdict: Verdict) -> None:
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+
+
+def _observers(
+    loop: SensedLoop,
+    now: Array,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+    final: bool,
+) -> tuple[list[Array], int]:
+    """The cheapest law with an observer to begin with, the one after a descent, and its steps."""
+    longer = settings
+    if final:
+        iterations, gain = settings.observer_iterations, _OBSERVER_GAIN
+        longer = replace(settings, iterations=iterations, least_gain=gain)
+    laws = [now]
+    whole = whole_field_law(loop, fields, weights, settings, len(loop.law.model.A))
+    laws += [] if whole is None else compensators(loop, whole, longer if final else None)
+    start = cheapest(loop, laws, fields, weights)
+    gain = longer.least_gain if final else longer.first_gain
+    found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
+    return ([], 0) if found is None else ([start, found.theta], found.steps)
+
+
+def gained(costs: Array, base: Array) -> Estimate:
+    """The mean change against the costs of another law, where both are finite.
+
+    NaN where neither ever is.
+    """
+    known = np.isfinite(costs) & np.isfinite(base)
+    return mean_of(costs[known] - base[known]) if known.any() else Estimate(np.nan, np.nan)

@@ -1,0 +1,143 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""How far an optimisation with `model_based` has come: its stage, laws and model, for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import State
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.estimate import ZERO, Estimate
+
+RENEWING, JUDGING, ENDED = "renewing", "judging", "ended"
+LARGEST = 1e150
+"""Largest change on fields that were left out."""
+_STAGES = (RENEWING, JUDGING, ENDED)
+
+
+@dataclass(eq=False)
+class Progress:
+    """State of an optimisation that changes over time, apart from its rollouts.
+
+    Attributes
+    ----------
+    policy : array
+        The present law, and at the end the chosen one.
+    stage : str
+        One of `renewing`, `judging`, `ended`.
+    tells : int
+        Number of calls of `tell`.
+    belief : Belief or None
+        The model that the law was improved on last.
+    improved : array or None
+        The law after the last descent, with which the next one begins.
+    parts : list of arrays
+        The same for each part of the fields, from the other parts.
+    fraction : float
+        How far the law moved from the first one at the last renewal.
+    change : Estimate
+        What it then cost more than that one on fields that did not make it.
+    replayed : bool
+        True if the law was last improved along measured rollouts, as no model predicts them.
+    trust : float
+        Weight of the distance from a law in such a step.
+    none_is_close : bool
+        True if no control is judged as well.
+    safe : bool
+        True if the first law is better than no control on the model.
+    noise : float
+        Measurement noise that was found in place of the declared one; 0: none was.
+    """
+
+    policy: Array
+    stage: str = RENEWING
+    tells: int = 0
+    belief: Belief | None = None
+    improved: Array | None = None
+    parts: list[Array] = field(default_factory=list)
+    fraction: float = 0.0
+    change: Estimate = ZERO
+    replayed: bool = False
+    trust: float = 0.0
+    none_is_close: bool = False
+    safe: bool = True
+    noise: float = 0.0
+
+    def state(self) -> State:
+        """All of it, as the arrays of a checkpoint."""
+        arrays: State = {
+            "stage": np.array(self.stage),
+            "tells": np.array(self.tells),
+            "policy": self.policy.copy(),
+            "held_out": held_out(self.fraction, self.change),
+            "replayed": np.array(self.replayed),
+            "trust": np.array(self.trust),
+            "none_is_close": np.array(self.none_is_close),
+            "safe": np.array(self.safe),
+            "noise": np.array(self.noise),
+        }
+        if self.improved is not None:
+            arrays["laws"] = np.stack([self.improved, *self.parts])
+        if self.belief is not None:
+            arrays |= self.belief.state()
+        return arrays
+
+    @classmethod
+    def of(cls, state: Mapping[str, NDArray[np.generic]], shape: tuple[int, ...]) -> Progress:
+        """The progress in a checkpoint, whose laws have this shape; ValueError if there is none."""
+        stage = str(checked_array(state, "stage", "U", ()))
+        if stage not in _STAGES:
+            raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        laws: list[Array] = []
+        if "laws" in state:
+            laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
+        fraction, change = fraction_and_change(state)
+        return cls(
+            checked_array(state, "policy", "f", shape).copy(),
+            stage=stage,
+            tells=int(checked_array(state, "tells", "i", ())),
+            belief=Belief.of(state),
+            improved=laws[0] if laws else None,
+            parts=laws[1:],
+            fraction=fraction,
+            change=change,
+            replayed=bool(checked_array(state, "replayed", "b", ())),
+            trust=float(checked_array(state, "trust", "f", ())),
+            none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
+            safe=bool(checked_array(state, "safe", "b", ())),
+            noise=noise_of(state),
+        )
+
+
+def noise_of(state: Mapping[str, NDArray[np.generic]]) -> float:
+    """The noise that was found, 0: none; ValueError for a standard deviation that is negative."""
+    noise = float(checked_array(state, "noise", "f", ()))
+    if noise < 0.0:
+        raise ValueError(f"its noise is {noise:g}; expected 0 or more")
+    return noise
+
+
+def held_out(fraction: float, change: Estimate) -> Array:
+    """How far a law moved and what fields that did not make it say, as an array of a checkpoint."""
+    return np.array([fraction, change.value, change.error, change.degrees])
+
+
+def fraction_and_change(state: Mapping[str, NDArray[np.generic]]) -> tuple[float, Estimate]:
+    """What `held_out` made an array of.
+
+    ValueError for numbers whose squares are infinite, unless they are themselves, and for no degrees of
+    freedom.
+    """
+    numbers = checked_array(state, "held_out", "f", (4,), finite=False)
+    if (np.abs(numbers[np.isfinite(numbers)]) > LARGEST).any():
+        raise ValueError(f"'held_out' has a number beyond {LARGEST:g}")
+    fraction, value, error, degrees = numbers.tolist()
+    if not degrees > 0.0:
+        raise ValueError(f"'held_out' has {degrees:g} degrees of freedom; expected more than 0")
+    return fraction, Estimate(value, error, degrees)

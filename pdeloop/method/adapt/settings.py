@@ -1,0 +1,128 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The constants of `model_based`: how a law is improved, and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pdeloop.method.settings import Settings, setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImprovementSettings(Settings):
+    """The constants of improving a law on a model, and of the verdict on it.
+
+    All are dimensionless: costs and gains are scaled by those of the initial law.
+    """
+
+    judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
+    believed: float = setting(
+        0.05,
+        "largest error E at which a model is used; above it, laws are steps along measured rollouts",
+        0.0,
+        1.0,
+    )
+    believed_noisy: float = setting(
+        0.3,
+        "the same with measurement noise",
+        0.0,
+        1.0,
+    )
+    mixtures: int = setting(
+        24,
+        "maximum number of initial fields drawn around the measured ones; half as many before "
+        "the final law",
+        0,
+        1000,
+    )
+    most_mixtures: int = setting(
+        96,
+        "the same for the final law if the one from fewer fields is not confirmed by the fields "
+        "left out",
+        0,
+        1000,
+    )
+    confirmed: float = setting(
+        0.5,
+        "share of the gain on its own fields that a law must reach on those left out; otherwise "
+        "it is made again on more drawn fields",
+        0.0,
+        1.0,
+    )
+    chaotic_fields: int = setting(
+        32,
+        "measured states used as initial fields of a chaotic plant, for which no fields are drawn",
+        4,
+        1000,
+    )
+    iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
+    least_gain: float = setting(
+        1e-3,
+        "relative reduction of the cost that a window must reach for the descent to continue",
+        0.0,
+        1.0,
+    )
+    first_gain: float = setting(2e-2, "the same before the last renewal", 0.0, 1.0)
+    folds: int = setting(
+        2,
+        "parts of the fields, each held out once to choose how far the law moves",
+        2,
+        100,
+    )
+    close: float = setting(
+        0.2,
+        "no control is also rolled out if its cost on the model exceeds the law's by at most "
+        "this share",
+        0.0,
+        10.0,
+    )
+    confidence: float = setting(
+        1.0,
+        "standard errors by which a law must beat the first one if they are known exactly; more "
+        "if they are estimated from few rollouts",
+        0.0,
+        10.0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelBasedSettings(ImprovementSettings):
+    """The constants of `model_based`."""
+
+    first_renewal: int = setting(
+        6,
+        "rollouts before the first improvement, explorations included; then at least twice as many "
+        "each time",
+        2,
+        1_000_000,
+    )
+    enough_fields: int = setting(
+        48, "number of measured fields at which improvements stop", 2, 1_000_000
+    )
+    observer_iterations: int = setting(
+        400,
+        "as iterations, for the last improvement of the law observer on a model of the field",
+        1,
+        10_000,
+    )
+    filter_unpredicted: float = setting(
+        0.04,
+        "share of the size of a field that its filter adds to the noise of a reading for what no "
+        "model predicts; 6 times as much, or else 3 times, where filter_margin allows it",
+        0.0,
+        1.0,
+    )
+    filter_margin: float = setting(
+        0.03,
+        "largest relative increase in the cost on the model at which a filter that trusts the "
+        "equation less is still used",
+        0.0,
+        1.0,
+    )
+    readings_trust: float = setting(
+        1.0,
+        "weight of the distance from the start of a step on a model of readings; for a linear "
+        "plant the step is 1/(1 + weight) of the full one",
+        0.0,
+        1e6,
+    )

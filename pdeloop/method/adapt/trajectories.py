@@ -1,0 +1,201 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The trajectories an optimiser remembers, and how they survive a checkpoint."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pdeloop.messages.array_files import Arrays, checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory
+from pdeloop.method.models.denoising import cleaned_states
+from pdeloop.method.reduce.snapshots import LARGE, factored
+from pdeloop.process.one_thread import one_thread
+
+
+class LowRankTrajectory(Trajectory):
+    """A trajectory whose states are products of coordinates (L, r) and orthonormal modes (r, n_z)."""
+
+    coordinates: Array
+    modes: Array
+
+    def __init__(self, coordinates: Array, modes: Array, actions: Array) -> None:
+        for name, array in ("coordinates", coordinates), ("modes", modes), ("actions", actions):
+            object.__setattr__(self, name, array)
+
+    @property
+    def states(self) -> Array:
+        """The states, made anew each time."""
+        with one_thread():
+            whole: Array = self.coordinates @ self.modes
+        return whole
+
+
+def kept(states: Array, actions: Array) -> Trajectory:
+    """A trajectory to keep, with large states as factors; states may be a view."""
+    if states.shape[1] > LARGE and np.isfinite(states).all():
+        return LowRankTrajectory(*factored(states), actions)
+    return Trajectory(np.ascontiguousarray(states), actions)
+
+
+def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:
+    """A trajectory as arrays of a checkpoint."""
+    if isinstance(trajectory, LowRankTrajectory):
+        parts = {"coordinates": trajectory.coordinates, "modes": trajectory.modes}
+        parts["actions"] = trajectory.actions
+        return {f"{name}.{part}": array for part, array in parts.items()}
+    return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
+
+
+def taken_trajectory(arrays: Arrays, name: str, n_z: int | None, n_a: int) -> Trajectory:
+    """The trajectory of that name, or a ValueError. n_z: None if it is not known."""
+    actions = checked_array(arrays, f"{name}.actions", "f", (None, n_a))
+    if f"{name}.modes" in arrays:
+        modes = checked_array(arrays, f"{name}.modes", "f", (None, n_z))
+        states = checked_array(arrays, f"{name}.coordinates", "f", (None, len(modes)))
+        found: Trajectory = LowRankTrajectory(states, modes, actions)
+    else:
+        states = checked_array(arrays, f"{name}.states", "f", (None, n_z))
+        found = Trajectory(states, actions)
+    if len(states) - len(actions) not in (0, 1):
+        raise ValueError(f"'{name}' has {len(states)} states and {len(actions)} actions")
+    return found
+
+
+def is_kept(arrays: Arrays, name: str) -> bool:
+    """True if there is a trajectory of that name."""
+    return f"{name}.actions" in arrays
+
+
+def record_arrays(name: str, record: Record) -> State:
+    """A measured rollout as arrays of a checkpoint."""
+    own: State = {
+        f"{name}.policy": record.policy,
+        f"{name}.cost": np.array(record.cost),
+        f"{name}.field_seed": np.array(record.field_seed),
+    }
+    return own | trajectory_arrays(name, record)
+
+
+def taken_record(
+    arrays: Arrays,
+    name: str,
+    n_z: int | None,
+    n_a: int,
+    shape: tuple[int | None, ...],
+    stamp: int = -1,
+) -> Record:
+    """The rollout of that name with a policy of this shape, or a ValueError."""
+    policy = checked_array(arrays, f"{name}.policy", "f", shape)
+    cost = float(checked_array(arrays, f"{name}.cost", "f", (), finite=False))
+    field_seed = int(checked_array(arrays, f"{name}.field_seed", "i", ()))
+    known = taken_trajectory(arrays, name, n_z, n_a)
+    return Record(policy, cost, known.states, known.actions, stamp, field_seed)
+
+
+class Records:
+    """The rollouts of an optimiser.
+
+    Parameters
+    ----------
+    limit : float
+        A diverged rollout counts until a state exceeds this magnitude.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._records: dict[int, Record] = {}
+        self.count = 0
+
+    def all(self) -> list[Record]:
+        """The rollouts, oldest first."""
+        return [self._records[stamp] for stamp in sorted(self._records)]
+
+    def add(self, rollout: Rollout, result: RolloutResult) -> Record:
+        """Remember a rollout."""
+        states, actions = self.validated_samples(result)
+        cost = float(result.cost) if result.usable else float("inf")
+        record = Record(
+            np.array(rollout.policy), cost, states, actions, self.count, rollout.field_seed
+        )
+        self._records[record.stamp] = record
+        self.count += 1
+        return record
+
+    def state(self) -> State:
+        """The remembered rollouts as arrays."""
+        arrays: State = {
+            "stamps": np.array(sorted(self._records), dtype=np.int64),
+            "count": np.array(self.count),
+            "limit": np.array(self._limit),
+        }
+        for record in self._records.values():
+            arrays |= record_arrays(f"record{record.stamp}", record)
+        return arrays
+
+    def restore(
+        self, arrays: Arrays, n_z: int, shape: tuple[int, ...], n_a: int | None = None
+    ) -> None:
+        """Restore the content of a `state`; ValueError if it is not one.
+
+        shape: of the policies, whose rows are as many as actuators if n_a does not say how many.
+        """
+        n_a = shape[0] if n_a is None else n_a
+        count, limit = (
+            checked_array(arrays, "count", "i", ()),
+            checked_array(arrays, "limit", "f", ()),
+        )
+        stamps = checked_array(arrays, "stamps", "i", (None,)).tolist()
+        self._records = {s: taken_record(arrays, f"record{s}", n_z, n_a, shape, s) for s in stamps}
+        self.count, self._limit = int(count), float(limit)
+
+    def validated_samples(self, result: RolloutResult) -> tuple[Array, Array]:
+        """The states and actions that can be learned from, or a ValueError."""
+        trajectory, usable = result.trajectory, result.usable
+        if trajectory is None:
+            raise ValueError(
+                "this optimiser learns from trajectories, but a result has none; record the states "
+                "and actions of the rollouts, or choose an optimiser that needs costs only."
+            )
+        states = np.array(trajectory.states, dtype=np.float64)
+        actions = np.array(trajectory.actions, dtype=np.float64)
+        if states.ndim != 2 or actions.ndim != 2 or len(states) - len(actions) not in (0, 1):
+            raise ValueError(
+                "a trajectory needs T or T + 1 states for T actions, but the shapes are "
+                f"{states.shape} and {actions.shape}."
+            )
+        if usable:
+            if not (np.isfinite(states).all() and np.isfinite(actions).all()):
+                raise ValueError("a rollout that did not diverge must have a finite trajectory.")
+            return states, actions
+        with np.errstate(invalid="ignore"):
+            bad = ~(np.abs(states).max(axis=1) <= self._limit)
+        # A plant may hold the last state of a diverged environment.
+        bad[1:] |= (states[1:] == states[:-1]).all(axis=1)
+        length = int(np.argmax(bad)) if bad.any() else len(states)
+        finite = np.isfinite(actions).all(axis=1)
+        length = min(length, int(np.argmin(finite)) if not finite.all() else length)
+        return states[:length], actions[: max(length - 1, 0)]
+
+
+def within(
+    record: Record, limit: float, centre: Array | float = 0.0, units: Array | float = 1.0
+) -> Record:
+    """The rollout up to the first state of which a number is farther from `centre`, in units."""
+    far = np.abs((record.states - centre) / units).max(axis=1) > limit
+    if not far.any():
+        return record
+    length = int(np.argmax(far))
+    actions = record.actions[: max(length - 1, 0)]
+    return replace(record, states=record.states[:length], actions=actions)
+
+
+def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
+    """Denoised rollouts.
+
+    line: whether the states are fields on one axis, of which initial ones are known best by their
+    spectra.
+    """
+    clean = cleaned_states([record.states for record in records], noise, line=line)
+    return [replace(own, states=states) for own, states in zip(records, clean, strict=True)]

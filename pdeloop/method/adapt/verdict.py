@@ -1,0 +1,338 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The choice of the law to return: the first one, unless another is better by more than chance.
+
+Costs of different initial fields are compared through the model. The mean cost of a law over the
+distribution is
+
+    m + mean over its own rollouts of (measured - model),
+
+with m the mean of its model costs over all measured fields: the model is a control variate, so that one
+rollout is as informative as many without it. The fields of that mean are the same for all laws, so the
+difference of two laws has little variance; for the final law, which was computed from these fields,
+the mean is over held-out fields.
+
+Where no model predicts rollouts, they alone count, by one of two rules:
+
+- the mean over pairs from the same fields (`evidence_of_pairs`), in which cancels what a field costs
+  with either law,
+- against no control of which further rollouts are known, the difference of two means
+  (`evidence_against_none`): its costs vary from field to field, where those of a law hardly do, so that
+  the error of a pair is that of a single rollout of no control, however many others there are.
+
+The rule of choice accounts for how well the error of few rollouts is known (`estimate`).
+
+A first law was designed for the plant, and is given up only for one that is better by more than chance.
+No control was not: what chance may explain is settled there by the expected cost, if all that is known
+of it says the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import Record
+from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
+
+FIRST, ADAPTED, NONE, PREDICTIVE = "first", "adapted", "none", "predictive"
+NAMES = {
+    FIRST: "the first law",
+    ADAPTED: "the adapted law",
+    NONE: "no control",
+    PREDICTIVE: "the law that plans",
+}
+NO_OTHER = "no other law is better by more than chance"
+ALL_AGREE = "which may be chance, but every estimate agrees"
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidence for a law.
+
+    Attributes
+    ----------
+    change : Estimate
+        Its model cost against that of the law to stay with, in the mean over measured fields that did
+        not make it.
+    excess : (k,) array
+        Measured less model cost of its own rollouts; infinite where one diverged.
+    also : sequence of Estimate
+        What else is known of the same change, too uncertain or too much in favour of the law to decide
+        by itself.
+    """
+
+    change: Estimate
+    excess: Array
+    also: Sequence[Estimate] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The law that is returned, its change against the one to stay with, the error of that, and why."""
+
+    chosen: str
+    change: float
+    deviation: float
+    reason: str
+
+
+def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
+    """The law with the least cost, and `base` where the difference may be chance.
+
+    Where `base` is no control, another law is taken in spite of that if every estimate favours it.
+
+    confidence: standard errors by which another law has to be better, were they known exactly.
+    """
+    stays = Verdict(base, 0.0, 0.0, NO_OTHER)
+    missed: list[str] = []
+    lost = bool(np.isinf(evidence[base].excess).any())
+    of_base = _correction(evidence[base])
+    found: list[Verdict] = []
+    likely: list[Verdict] = []
+    for name, own in evidence.items():
+        if name == base or not np.isfinite(own.change.value):
+            continue
+        if np.isinf(own.excess).any():
+            if name in (ADAPTED, PREDICTIVE):
+                stays = Verdict(base, 0.0, 0.0, f"a rollout of {NAMES[name]} diverged")
+            continue
+        change = own.change + _correction(own) - of_base
+        size = change.value, change.error
+        if lost:
+            known = own.change.value, own.change.error
+            found.append(Verdict(name, *known, f"a rollout of {NAMES[base]} diverged"))
+        elif change.is_negative(confidence):
+            found.append(Verdict(name, *size, size_of(name, base, *size)))
+        else:
+            missed.append(size_of(name, base, *size))
+            if base == NONE and own.also and all(e.value < 0.0 for e in (change, *own.also)):
+                likely.append(Verdict(name, *size, f"{missed[-1]}, {ALL_AGREE}"))
+    if missed and stays.reason == NO_OTHER:
+        stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
+    return min(found or likely, key=lambda verdict: verdict.change, default=stays)
+
+
+def size_of(name: str, base: str, change: float, deviation: float) -> str:
+    """A difference with its standard error, in words.
+
+    >>> size_of(ADAPTED, FIRST, -4.116, 1.179)
+    'the adapted law costs 4.116 (standard error 1.2) less than the first law'
+    """
+    law, other = (NAMES[own] for own in (name, base))
+    more = "less" if change < 0.0 else "more"
+    return f"{law} costs {abs(change):.4g} (standard error {deviation:.2g}) {more} than {other}"
+
+
+def is_cheaper(own: Array, other: Array) -> bool:
+    """True if a law diverges from fewer fields than another one, or from as many and costs less.
+
+    own, other: costs from the same fields, infinite where the law diverges; those from which neither
+    does are compared.
+
+    >>> is_cheaper(np.array([np.inf, 9.0]), np.array([np.inf, np.inf]))
+    True
+    >>> is_cheaper(np.array([np.inf, 9.0, 1.0]), np.array([2.0, np.inf, 0.5]))
+    False
+    """
+    came, back = np.isfinite(own), np.isfinite(other)
+    if came.sum() != back.sum():
+        return bool(came.sum() > back.sum())
+    both = came & back
+    return bool(own[both].sum() < other[both].sum())
+
+
+def beats_no_control(loop: ClosedLoop, first: Array, fields: Array) -> bool:
+    """True if a law is cheaper than no control on the model; where that says nothing, if it is another.
+
+    A first law that is not is nothing to stay near to.
+    """
+    none = loop.no_control
+    costs = [loop.costs(theta, fields) for theta in (first, none)]
+    return is_cheaper(*costs) if np.isfinite(costs).any() else not np.array_equal(first, none)
+
+
+def evidence_of(
+    loop: ClosedLoop,
+    laws: Mapping[str, Array],
+    base: str,
+    records: Sequence[Record],
+    fields: Array,
+    held_out: Estimate,
+) -> dict[str, Evidence]:
+    """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
+
+    base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
+    held_out: change of the adapted law on fields that did not make it.
+    """
+    if loop.replays:  # a rollout replayed is itself
+        return evidence_of_rollouts(laws, base, records)
+    stay = loop.costs(loop.theta(laws[base]), fields)
+    evidence = {}
+    for name, law in laws.items():
+        excess = _excess(loop, law, [r for r in records if np.array_equal(r.policy, law)])
+        same = name != base and np.array_equal(law, laws[base])
+        if same or not (len(excess) or name == base):
+            continue
+        change = held_out
+        if name != ADAPTED:
+            with np.errstate(invalid="ignore"):
+                differences = loop.costs(loop.theta(law), fields) - stay
+            known = bool(np.isfinite(differences).all())
+            change = mean_of(differences) if known else Estimate(np.inf)
+        evidence[name] = Evidence(change, excess, (change,))
+    return evidence
+
+
+def evidence_of_rollouts(
+    laws: Mapping[str, Array], base: str, records: Sequence[Record]
+) -> dict[str, Evidence]:
+    """The evidence of rollouts alone, except for `base` only for laws that were measured.
+
+    It is the mean difference on the initial fields that a law and the base share if there are two or
+    more, else the difference of their means.
+    """
+    costs: dict[str, dict[int, float]] = {}
+    for name, law in laws.items():
+        if name == base or not np.array_equal(law, laws[base]):
+            own = [r for r in records if np.array_equal(r.policy, law)]
+            # A rollout whose field is not known is on one of its own.
+            costs[name] = {
+                r.field_seed if r.field_seed >= 0 else -1 - i: r.cost for i, r in enumerate(own)
+            }
+    evidence = {}
+    for name, mine in costs.items():
+        values = np.array(list(mine.values()))
+        lost = values[np.isinf(values)]
+        if name == base:
+            evidence[name] = Evidence(ZERO, lost)
+        elif len(values):
+            evidence[name] = Evidence(_difference(mine, costs[base]), lost)
+    return evidence
+
+
+def _difference(own: Mapping[int, float], base: Mapping[int, float]) -> Estimate:
+    """The mean of some costs less that of others, by the seeds of their initial fields."""
+    finite, others = (
+        {seed: cost for seed, cost in costs.items() if np.isfinite(cost)} for costs in (own, base)
+    )
+    common = [seed for seed in finite if seed >= 0 and seed in others]
+    if len(common) > 1:
+        return mean_of(np.array([finite[seed] - others[seed] for seed in common]))
+    if not (finite and others):
+        return ZERO
+    return mean_of(np.array(list(finite.values()))) - mean_of(np.array(list(others.values())))
+
+
+def earlier_law(
+    loop: ClosedLoop | None,
+    chosen: Array,
+    others: Sequence[Array],
+    records: Sequence[Record],
+    fields: Array,
+    confidence: float,
+) -> tuple[Array, Estimate] | None:
+    """The measured law, of none that was compared before, that beats the chosen one beyond chance.
+
+    The difference is that of rollouts, and on a model that of its costs corrected by rollouts, as in
+    `evidence_of`; the estimate with the smaller error counts. A law that was measured is so never lost
+    to one that a model promised more of.
+
+    others: the laws that were compared; loop: of the model, or none; fields: as for `evidence_of`.
+
+    Returns
+    -------
+    law, its change against the chosen one, or None
+    """
+    laws = {record.policy.tobytes(): record.policy for record in records}
+    known = {law.tobytes() for law in (chosen, *others)}
+    found: tuple[Array, Estimate] | None = None
+    for law in (law for key, law in laws.items() if key not in known):
+        if sum(np.array_equal(record.policy, law) for record in records) < 2:
+            continue
+        estimates = [measured_change(records, law, chosen)]
+        if loop is not None:
+            pair = {"law": law, FIRST: chosen}
+            evidence = evidence_of(loop, pair, FIRST, records, fields, ZERO)
+            estimates.append(_change(evidence, "law", FIRST))
+        usable = [own for own in estimates if own is not None and np.isfinite(own.value)]
+        if usable:
+            change = min(usable, key=lambda own: own.error)
+            if change.is_negative(confidence) and (found is None or change.value < found[1].value):
+                found = law, change
+    return found
+
+
+def measured_change(records: Sequence[Record], law: Array, base: Array) -> Estimate | None:
+    """The change of a law against another by their rollouts; None where either lacks finite ones."""
+    evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records)
+    measured = any(np.array_equal(record.policy, base) for record in records)
+    return _change(evidence, "law", FIRST) if measured else None
+
+
+def _change(evidence: Mapping[str, Evidence], name: str, base: str) -> Estimate | None:
+    """The change of a law against another, corrected by rollouts; None where either lacks one."""
+    if name not in evidence or base not in evidence:
+        return None
+    own, other = evidence[name], evidence[base]
+    if np.isinf(own.excess).any():
+        return None
+    return own.change + _correction(own) - _correction(other)
+
+
+def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
+    """The evidence of rollouts alone: means over pairs from the same initial fields.
+
+    costs: those of each law, field by field, infinite where it diverged; base: the law to stay with.
+    """
+    evidence = {}
+    for name, own in costs.items():
+        known = np.isfinite(own) & np.isfinite(costs[base])
+        difference = mean_of(own[known] - costs[base][known]) if known.any() else ZERO
+        evidence[name] = Evidence(difference, own[np.isinf(own)])
+    return evidence
+
+
+def evidence_against_none(
+    costs: Mapping[str, Array], others: Array, known: Mapping[str, Sequence[Estimate]]
+) -> dict[str, Evidence]:
+    """The evidence of rollouts alone against no control: differences of means, of all its rollouts.
+
+    costs: as for `evidence_of_pairs`, and after those of the other laws' fields further ones of no
+    control; others: its costs from before; known: what else is known of the change by a law.
+    """
+    none = np.concatenate([costs[NONE], others])
+    evidence = {NONE: Evidence(ZERO, none[np.isinf(none)])}
+    for name, own in costs.items():
+        if name == NONE:
+            continue
+        came = np.isfinite(own) & np.isfinite(none[: len(own)])
+        before, further = none[: len(own)][came], none[len(own) :]
+        change, pairs = ZERO, ZERO
+        if came.any():
+            change = mean_difference(own[came], before, further[np.isfinite(further)])
+            pairs = mean_of(own[came] - before)
+        also = known.get(name, ())
+        evidence[name] = Evidence(change, own[np.isinf(own)], (pairs, *also) if also else ())
+    return evidence
+
+
+def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
+    """Measured less model cost of the rollouts of a law; infinite where one diverged."""
+    excess = []
+    for record in own:
+        model = loop.costs(loop.theta(law), loop.beginnings([record]))[0]
+        if not record.usable:
+            excess.append(np.inf)
+        elif np.isfinite(model):  # a model that overflows carries no information on the rollout
+            excess.append(record.cost - float(model))
+    return np.array(excess)
+
+
+def _correction(own: Evidence) -> Estimate:
+    """The mean of measured less model cost; 0 where nothing was measured."""
+    finite = own.excess[np.isfinite(own.excess)]
+    return mean_of(finite) if len(finite) else ZERO

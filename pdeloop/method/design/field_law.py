@@ -1,0 +1,485 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A first law from a model of the whole field, linearised at the target.
+
+POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
+the directions that it senses, also for other fields: a plant that is unstable at its target is
+saturated by the end of the episode, and an episode has only one initial field. A model of the whole
+field (`pdeloop.method.models`) that predicts the episodes is linearised at the target, with e = z - z_r
+(if that is far outside of the data and the model not exact, at the measured state nearest to it),
+
+    e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
+
+and the law a = K e + b that minimises the cost over the horizon senses only the n_a rows of K. They
+are the first columns of U; the others are POD modes of the remainder of simulated states, with that law
+and without control. If U has too few columns for both, all are POD modes.
+
+No model is the only judge of its own law. The model of the whole field and the reduced one are accepted
+by their errors on parts of the data that they were not fitted to, relative to the variation of the data
+and to the error of the other one. Every accepted model predicts the cost of both laws, and the law with
+the lower of their worst predictions is used. All errors are of numbers in units of their own variation.
+
+References
+----------
+Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.design.finite_horizon import finite_horizon, finite_horizon_of
+from pdeloop.method.models import (
+    FieldModel,
+    FieldModelSettings,
+    FittedModel,
+    Measured,
+    affine_law,
+    fit_field_model,
+)
+from pdeloop.method.models.base import Law, Samples, saturated
+from pdeloop.method.models.choice import UNKNOWN, Accuracy, Scale, accuracy_of, limited, turns
+from pdeloop.method.models.denoising import smoothed
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.prediction import pieces as cut
+from pdeloop.method.models.prediction import predicted, usable
+from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
+from pdeloop.method.reduce.reduced_model import (
+    ReducedModel,
+    Steps,
+    Trajectory,
+    leading_modes,
+    pieces,
+)
+from pdeloop.method.reduce.regression import fit
+from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
+from pdeloop.process.one_thread import one_thread
+
+_FIELD_LARGEST = 512
+"""Largest state for which a model of the whole field is fitted for the first law."""
+_FIELD_PIECES = 8
+"""Pieces of an episode that the model may predict instead of the whole."""
+_FIELD_THINNING = 5
+"""Interval between the simulated states that the basis is computed from."""
+_FIELD_ROOM = 2.0
+"""Modes per actuator from which on the basis includes the rows of the full-state feedback."""
+
+EXACT = 1e-6
+"""E of a model that counts as exact."""
+NOISY = 0.3
+"""Largest error of an accepted model with measurement noise, which leaves initial states uncertain."""
+FAR = 3.0
+"""Distance of the target from the mean state, relative to that of the farthest measured state, above
+which it is outside of the data."""
+LEAST = 1e-6
+"""Least unit of a number of the state, relative to the largest: what hardly moves has no say."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldLaw:
+    """The outcome of fitting a model of the whole field.
+
+    Attributes
+    ----------
+    fitted : FittedModel or None
+        The model with its error, and the errors of all kinds; None where none can be fitted.
+    rows : ModelRows or None
+        Its law, with the linearised model on U; None if the model is not accurate enough.
+    cost, other_cost : float
+        The worst mean stage costs that accepted models predict from the initial fields of the
+        trajectories, of its law and of the law to compare with; infinite where there is none, or it
+        diverges.
+    noise : float
+        Measurement noise that the model was fitted for where another one, or none, was declared; 0:
+        what was declared. There is no law then, as the exploration was drawn for the declared noise,
+        and is too weak for the effects of the actuators where that is less.
+    regression : Accuracy
+        Of the regression, to compare with `fitted.own`.
+    judges : tuple of str
+        The models that were accepted.
+    remark : str
+        Where the model is linearised, if the target is far outside of the data.
+    """
+
+    fitted: FittedModel | None
+    rows: ModelRows | None = None
+    cost: float = np.inf
+    other_cost: float = np.inf
+    noise: float = 0.0
+    regression: Accuracy = UNKNOWN
+    judges: tuple[str, ...] = ()
+    remark: str = ""
+
+    @property
+    def better(self) -> bool:
+        """True if its law is cheaper on the model than the other one."""
+        return self.rows is not None and self.cost < self.other_cost
+
+    def summary(self) -> dict[str, Any]:
+        """The report as data."""
+        fitted = self.fitted
+        return {
+            "kind": fitted and fitted.model.kind,
+            "error": fitted and fitted.error,
+            "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
+            "own_error": fitted and _number(fitted.own.simulated),
+            "one_step_error": fitted and _number(fitted.own.one_step),
+            "regression_error": _number(self.regression.simulated),
+            "regression_one_step_error": _number(self.regression.one_step),
+            "believed": self.rows is not None,
+            "judges": list(self.judges),
+            "linearised": self.remark,
+            "noise": self.noise,
+            "predicted_cost": _number(self.cost),
+            "predicted_cost_of_regression": _number(self.other_cost),
+            "law": "field" if self.better else "regression",
+        }
+
+    def text(self) -> list[str]:
+        """The report as text."""
+        fitted = self.fitted
+        if fitted is None:
+            return ["no model of the whole field can be fitted: the law of the regression is used"]
+        lines = [
+            f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} in "
+            "predicting the data",
+            f"  relative to what the data do, on parts held out: {fitted.own.simulated:.2g}, "
+            f"regression {self.regression.simulated:.2g}; of single steps {fitted.own.one_step:.2g} "
+            f"and {self.regression.one_step:.2g}",
+            f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
+        ]
+        if self.remark:
+            lines.append(f"  {self.remark}")
+        if self.noise:
+            return [
+                *lines,
+                f"  undeclared measurement noise of about {self.noise:.2g} was found: the law of "
+                "the regression is used; declare it (measurement_noise) and explore again, as "
+                "strongly as it requires",
+            ]
+        if self.rows is None:
+            exact = "regression" in self.judges
+            reason = "the regression is more accurate" if exact else "it is not accurate enough"
+            return [*lines, f"  {reason}: the law of the regression is used"]
+        taken = "its law is used" if self.better else "the law of the regression is used"
+        costs = (
+            f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
+        )
+        by = f" by {' and '.join(self.judges)}, the worse one," if len(self.judges) > 1 else ""
+        return [*lines, f"  predicted mean stage cost{by} {costs}: {taken}"]
+
+
+def _number(cost: float) -> float | None:
+    return cost if np.isfinite(cost) else None
+
+
+def _cost(cost: float) -> str:
+    return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
+
+
+def best_model(
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    action_set: ActionSet = ANY_ACTION,
+    settings: IdentificationSettings = DEFAULTS,
+    noise: float = 0.0,
+    models: FieldModelSettings = MODEL_DEFAULTS,
+    axes: tuple[int, ...] = (),
+) -> tuple[FittedModel | None, float, list[Measured]]:
+    """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
+
+    The noise is what the model was fitted for where another, or none, was declared; 0: as declared.
+    Pieces, because the state of a chaotic plant soon becomes independent of its initial field. They are
+    predicted even by models that take noise for the field, so noise that was not declared is
+    looked for before. A target far outside of the data makes every error small, so a model that does
+    not reproduce what the data do is chosen again by that. The work grows with the third power of the
+    size of the state, so there is a largest one. Last, what the model was chosen by. axes: as for
+    `field_law`; noise that was not declared is looked for on one axis alone.
+    """
+    rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
+    if len(target) > _FIELD_LARGEST:
+        return None, 0.0, rollouts
+    scale, line = variation(trajectories), len(axes) < 2
+    shape = () if line or len(target) % math.prod(axes) else axes
+
+    def fitted(data: Sequence[Measured], by_scale: bool = False) -> FittedModel | None:
+        return fit_field_model(
+            data,
+            target,
+            action_set=action_set,
+            noise=noise,
+            settings=models,
+            line=line,
+            shape=shape,
+            scale=scale,
+            by_scale=by_scale,
+        )
+
+    whole = fitted(rollouts)
+    error = np.inf if whole is None else whole.error
+    if line:
+        misjudged = fit_undeclared_noise(
+            rollouts,
+            target,
+            settings=models,
+            most=settings.field_error,
+            better_than=np.inf if noise else error,
+            declared=noise,
+            action_set=action_set,
+        )
+        if misjudged is not None:
+            return *misjudged, rollouts
+    data, best = rollouts, whole
+    if error > settings.field_error:
+        parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
+        found = fitted(parts)
+        if found is not None and found.error < error:
+            data, best, error = parts, found, found.error
+    if best is not None and error <= settings.field_error < best.own.simulated:
+        again = fitted(data, by_scale=True)
+        if again is not None and again.own.simulated < best.own.simulated:
+            best = again
+    return best, 0.0, data
+
+
+def regression_accuracy(
+    rollouts: Sequence[Measured],
+    n_s: int,
+    scale: Scale,
+    models: FieldModelSettings = MODEL_DEFAULTS,
+    noise: float = 0.0,
+    constant: bool = False,
+) -> Accuracy:
+    """The accuracy of a regression of this order, on rollouts or pieces that it was not fitted to."""
+    if len(rollouts) == 1:
+        rollouts = cut(rollouts[0], models.folds)
+    parts = []
+    for others, own in turns(rollouts, models.folds):
+        samples = Samples.of(others)
+        try:
+            U, _ = leading_modes(samples.after, n_s)
+            data = Steps(samples.before, samples.after, samples.actions)
+            model = _whole(fit(data, U, constant))
+        except ValueError:  # fewer modes than that, or numbers that overflow
+            return UNKNOWN
+        own = usable(own)
+        parts.append((model, own, predicted(model, own)))
+    return accuracy_of(parts, scale, models.worst, noise)
+
+
+def _whole(model: ReducedModel | ModelRows) -> LowRankModel:
+    """A reduced model as one of the whole state: what is outside of U is lost in a step."""
+    parts = model.U, model.A, model.B, np.zeros(len(model.A)) if model.d is None else model.d
+    return LowRankModel("regression", *(np.ascontiguousarray(part) for part in parts))
+
+
+def field_law(
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    other: ModelRows,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+    action_set: ActionSet = ANY_ACTION,
+    noise: float = 0.0,
+    settings: IdentificationSettings = DEFAULTS,
+    models: FieldModelSettings = MODEL_DEFAULTS,
+    axes: tuple[int, ...] = (),
+) -> FieldLaw:
+    """A law from a model of the whole field, with as many modes as another has.
+
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    target : (n_z,) array
+        z_r.
+    other : ModelRows
+        The law to compare with, and its model.
+    state_weight, action_weight : float
+        q and r.
+    cost : Cost, optional
+        In place of them.
+    action_set : ActionSet
+        Admissible actions, in the data and under both laws.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0: none.
+    settings : IdentificationSettings
+        Those whose names begin with `field_`. Errors are relative to the variation of the data.
+    models : FieldModelSettings
+        How models are fitted and one is chosen.
+    axes : tuple of int
+        Points of each axis of the fields; of one axis, or none, they need not be known.
+    """
+    fitted, found, rollouts = best_model(
+        trajectories, target, action_set, settings, noise, models, axes
+    )
+    if fitted is None or found:
+        return FieldLaw(fitted, noise=found)
+    n_s, scale = other.U.shape[1], variation(trajectories)
+    limits = [limited(rollout, action_set) for rollout in rollouts]
+    with one_thread():
+        regression = regression_accuracy(
+            limits, n_s, scale, models, noise, constant=other.d is not None
+        )
+    known = [(fitted.model, fitted.own), (_whole(other), regression)]
+    most = max(settings.field_error, NOISY) if noise else settings.field_error
+    accepted = _accepted(known, most, models.better)
+    report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
+    if fitted.error > settings.field_error:
+        return report
+    model = fitted.model
+    if not any(judge is model for judge in accepted):
+        return report
+    point, remark = linearisation_point(trajectories, target, fitted, models.reproduced)
+    A, B = model.linearise(point, np.zeros(model.n_a))
+    drift = model.step(point[None], np.zeros((1, model.n_a)))[0] - point
+    if not all(np.isfinite(part).all() for part in (A, B, drift)):
+        return report
+    horizon = max(len(actions) for _, actions in trajectories)
+    if cost is None and point is not target:
+        cost = Cost(
+            len(target),
+            model.n_a,
+            horizon,
+            state_weight=state_weight,
+            action_weight=action_weight,
+            target=target,
+        )
+    try:
+        if cost is None:
+            K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+        else:
+            K, b = finite_horizon_of(A, B, drift, cost, point)
+    except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
+        return report
+    if not (np.isfinite(K).all() and np.isfinite(b).all()):
+        return report
+    fields = [states[0] for states, _ in trajectories]
+    if noise:
+        fields = list(smoothed(np.stack(fields), noise))
+    best = saturated(affine_law(K, b - K @ point), action_set)
+    none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
+    visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
+    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, n_s)
+    K_a, s_r = K @ U, U.T @ target
+    # Of the K_b with the wanted constant part the least; none where the target is outside of U.
+    size = float(s_r @ s_r)
+    constant = b - K @ point
+    K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    d = U.T @ (point + drift - A @ point)
+    rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
+
+    def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
+        law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_set)
+        total = 0.0
+        for states in states_under(judge, law, fields, horizon):
+            if len(states) < horizon:
+                return np.inf
+            actions = law(0, states[:horizon])
+            if cost is not None:
+                total += sum_of(cost, states, actions)
+                continue
+            total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
+            total += action_weight * float(np.sum(actions**2))
+        return total / (horizon * len(fields))
+
+    worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
+    return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)
+
+
+def variation(trajectories: Sequence[Trajectory]) -> Scale:
+    """The mean state, and the standard deviation of every number of the state."""
+    states = np.concatenate([states for states, _ in trajectories])
+    spread = states.std(axis=0)
+    units = np.maximum(spread, max(LEAST * float(spread.max()), 1e-300))
+    return Scale(states.mean(axis=0), units)
+
+
+def _accepted(
+    models: Sequence[tuple[FieldModel, Accuracy]], most: float, better: float
+) -> list[FieldModel]:
+    """The models whose errors are small, and not several times as large as those of another one.
+
+    Errors of less than a millionth of the variation are equal.
+    """
+    simulated, once = (
+        better * max(min(own[i] for _, own in models), level)
+        for i, level in enumerate((EXACT, np.sqrt(EXACT)))
+    )
+    return [
+        model
+        for model, own in models
+        if own.simulated <= min(most, simulated) and own.one_step <= once
+    ]
+
+
+def linearisation_point(
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    fitted: FittedModel,
+    exact: float,
+) -> tuple[Array, str]:
+    """Where a model is linearised, and what to say of a target that is far outside of the data.
+
+    At the target, or, if it is outside, at the measured state nearest to it. A linear model is the same
+    everywhere. What reproduces the data, or is an equation whose coefficients all points share, says
+    something of other states as well.
+    """
+    states = np.concatenate([states for states, _ in trajectories])
+    mean, units = variation(trajectories)
+    away = np.linalg.norm((states - mean) / units, axis=1)
+    far = float(np.linalg.norm((target - mean) / units) / max(away.max(), 1e-300))
+    if far <= FAR or isinstance(fitted.model, LinearModel | LowRankModel):
+        return target, ""
+    where = (
+        f"the target is {far:.3g} times as far from the mean state as any measured state: the model"
+    )
+    if fitted.own.simulated <= exact or isinstance(fitted.model, SpectralModel):
+        return target, f"{where} is linearised there, where nothing was measured"
+    nearest = int(np.argmin(np.linalg.norm((states - target) / units, axis=1)))
+    return states[nearest], f"{where} is linearised at the measured state nearest to it"
+
+
+def sum_of(cost: Cost, states: Array, actions: Array) -> float:
+    """The stage costs of an episode, z_0 .. z_T and a_0 .. a_{T-1}, and the cost of its last state."""
+    total = np.zeros(1)
+    for k, a in enumerate(actions):
+        cost.add(total, states[k][None], a[None], k)
+    if len(states) > len(actions):
+        cost.add_terminal(total, states[-1][None])
+    return float(total[0])
+
+
+def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: int) -> list[Array]:
+    """z_0 .. z_T of the model under a law from each field, as long as they are finite."""
+    nothing = np.zeros((horizon, model.n_a))
+    return predicted(model, [Measured(z[None], nothing, law) for z in fields])
+
+
+def _basis(K: Array, states: Array, target: Array, n_s: int) -> Array:
+    """U (n_z, n_s): the rows of K, and POD modes of the states and the target, so that there is a b."""
+    n_a, n_z = K.shape
+    weighted = np.vstack([states, np.sqrt(len(states)) * target])
+    sensed = np.empty((n_z, 0))
+    if n_s >= _FIELD_ROOM * n_a:
+        _, values, rows = linalg.svd(K, full_matrices=False)
+        sensed = rows[values > 1e-12 * max(values[0], 1e-300)].T
+    left = weighted - weighted @ sensed @ sensed.T
+    modes = linalg.svd(left.T, full_matrices=True)[0][:, : n_s - sensed.shape[1]]
+    basis, triangle = linalg.qr(np.hstack([sensed, modes]), mode="economic")
+    signed: Array = basis * np.where(np.diag(triangle) < 0.0, -1.0, 1.0)
+    return signed

@@ -1,0 +1,284 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The steady-state Kalman filter of a linear model, and the noise that data show.
+
+    x_{k+1} = A x_k + B a_k + w_k,    cov w = W            y_k = C x_k + v_k,    cov v = V
+
+With P the stabilising solution of the filter's Riccati equation
+
+    P = W + A P A^T - A P C^T (C P C^T + V)^{-1} C P A^T,
+
+the estimate x_k = p_k + M (y_k - C p_k), M = P C^T (C P C^T + V)^{-1}, of the prediction p_{k+1} =
+A x_k + B a_k has the least covariance. With the tracking gains of `pdeloop.method.design.lqt`, which
+are designed as if the state were known, it is the optimal law: LQG, by the separation of estimation and
+control.
+
+References
+----------
+Anderson, Moore, "Optimal Filtering", 1979, sections 4.4 (steady state) and 8.2 (separation: "Optimal
+Control: Linear Quadratic Methods", 1990, chapter 8).
+Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic
+Control 15(2), 1970 (noise from the correlation of residuals).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.design.lqt import DesignError, track_outputs
+from pdeloop.method.reduce.reduced_model import Steps, repeated, steps_of
+from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
+from pdeloop.method.reduce.subspace import InnovationModel
+from pdeloop.process.one_thread import one_thread
+
+_SEEN = 1e-10
+"""A mode that the readings show by less than this, relative to the mode that they show best, counts as
+unseen."""
+_LEAST = 1e-6
+"""Least variance of a noise, relative to that of the residuals: Riccati needs some of both."""
+_EXACT = 1e-12
+"""The same relative to the mean square of the state."""
+
+
+class Filter(NamedTuple):
+    """A steady-state Kalman filter.
+
+    Attributes
+    ----------
+    M : (n_s, n_y) array
+        Gain: x_k = p_k + M (y_k - C p_k).
+    P : (n_s, n_s) array
+        Covariance of the error of the prediction p_k.
+    poles : (n_s,) complex array
+        Eigenvalues of A (I - M C), which the errors follow, all inside of the unit circle.
+    """
+
+    M: Array
+    P: Array
+    poles: NDArray[np.complex128]
+
+
+class Noise(NamedTuple):
+    """Covariances of the noise of a reduced model, (n_s, n_s) each.
+
+    Attributes
+    ----------
+    process, measurement : array
+        W, what moves the reduced state besides the model, and V, what a measured reduced state has in
+        it besides the state.
+    """
+
+    process: Array
+    measurement: Array
+
+
+def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: ArrayLike) -> Filter:
+    """The steady-state Kalman filter of a linear model.
+
+    Parameters
+    ----------
+    A, C : (n_s, n_s) and (n_y, n_s)
+        The model.
+    process, measurement : (n_s, n_s) and (n_y, n_y)
+        W and V, symmetric, V positive definite.
+
+    Raises
+    ------
+    DesignError
+        The readings do not see a mode that does not decay, or a mode on the unit circle gets no noise,
+        so that no steady filter exists.
+
+    Examples
+    --------
+    A random walk with as much noise in the steps as in the measurements:
+
+    >>> found = kalman_filter([[1.0]], [[1.0]], [[1.0]], [[1.0]])
+    >>> found.M.round(6), found.P.round(6)
+    (array([[0.618034]]), array([[1.618034]]))
+    """
+    A, C, W, V = (np.asarray(part, dtype=np.float64) for part in (A, C, process, measurement))
+    with one_thread():
+        require_detectable(A, C)
+        try:
+            P = linalg.solve_discrete_are(A.T, C.T, W, V)
+        except (linalg.LinAlgError, ValueError) as error:
+            raise DesignError(
+                f"the filter's Riccati equation has no stabilising solution ({error}): expected "
+                "process noise in each mode that does not decay; identify from more steps"
+            ) from error
+        M = linalg.solve(C @ P @ C.T + V, C @ P, assume_a="pos").T
+        poles = linalg.eigvals(A @ (np.eye(len(A)) - M @ C))
+    radius = float(np.abs(poles).max())
+    if not radius < 1.0:
+        raise DesignError(
+            f"the filter's errors must decay, but their spectral radius is {radius:.17g}: the "
+            "readings hardly observe a mode that does not decay; add sensors where it is large"
+        )
+    return Filter(M, P, poles)
+
+
+def require_detectable(A: Array, C: Array) -> None:
+    """DesignError where a mode that does not decay is not seen in y = C x.
+
+    Popov, Belevitch, Hautus: C v is not 0 for any eigenvector v of A with an eigenvalue of magnitude 1
+    or more, nor for any combination of those of one eigenvalue.
+    """
+    size, largest = float(linalg.norm(A, 2)), float(linalg.norm(C, 2))
+    # As large as A: the unit of the readings hides no mode.
+    scaled = C * (size / largest) if largest > 0.0 else C
+    for eigenvalue in linalg.eigvals(A):
+        growth = abs(eigenvalue)
+        if growth < 1.0 - _SEEN:
+            continue
+        pencil = np.vstack([eigenvalue * np.eye(len(A)) - A, scaled])
+        seen = float(linalg.svdvals(pencil)[-1])
+        if seen <= _SEEN * size:
+            turns = abs(np.angle(eigenvalue))
+            wave = f" and turns by {turns:.3g} rad" if 0.0 < turns < np.pi else ""
+            raise DesignError(
+                f"the readings do not observe a mode that grows by the factor {growth:.6g} a "
+                f"step{wave} (smallest singular value of [lambda I - A; C] {seen:.1e}), so no "
+                "filter can estimate it: move or add sensors so that at least one is where the "
+                "mode is not 0"
+            )
+
+
+def noise_of(
+    model: ModelRows,
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    sigma: float | None = None,
+    settings: IdentificationSettings = DEFAULTS,
+) -> Noise:
+    """The noise that the residuals of a reduced model show.
+
+    With r_k = s_{k+1} - A s_k - B a_k of measured s_k = U^T z_k, and noise of the variance sigma^2 in
+    every number of z_k,
+
+        E r_k r_k^T = W + V + A V A^T,        E r_{k+1} r_k^T = -A V,        V = sigma^2 U^T U.
+
+    Parameters
+    ----------
+    model : ModelRows
+        Its A, B and U.
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        What was measured.
+    sigma : float, optional
+        The noise of a number of z_k; estimated from the second equation if it is not given, and 0 where
+        that is not above 0 by more than chance.
+    settings : IdentificationSettings
+        `noise_evidence`: what counts as chance.
+    """
+    copies = repeated(trajectories)
+    steps = [steps_of([one]) for number, one in enumerate(trajectories) if number not in copies]
+    parts = [_residuals(model, own) for own in steps]
+    residuals, states = np.concatenate(parts), np.concatenate([own.before for own in steps])
+    both = residuals.T @ residuals / len(residuals)
+    gram, n_s = model.U.T @ model.U, len(model.A)
+    size = float(np.trace(both)) / n_s
+    least = max(_LEAST * size, _EXACT * float(np.mean((states @ model.U) ** 2)))
+    variance = (
+        sigma**2
+        if sigma is not None
+        else _measured_variance(model.A @ gram, parts, settings.noise_evidence)
+    )
+    V = max(variance, least / float(np.trace(gram)) * n_s) * gram
+    values, vectors = linalg.eigh(both - V - model.A @ V @ model.A.T)
+    W: Array = (vectors * np.maximum(values, least)) @ vectors.T
+    return Noise(W, 0.5 * (V + V.T))
+
+
+def with_filter(
+    rows: ModelRows,
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    settings: IdentificationSettings = DEFAULTS,
+) -> ModelRows:
+    """A reduced model with the gain of its Kalman filter; parameters as for `noise_of`."""
+    with one_thread():
+        noise = noise_of(rows, trajectories, settings=settings)
+    found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)
+    return replace(rows, L=found.M)
+
+
+def _residuals(model: ModelRows, steps: Steps) -> Array:
+    s, after = steps.before @ model.U, steps.after @ model.U
+    residuals: Array = after - s @ model.A.T - steps.inputs @ model.B.T
+    if model.d is not None:
+        residuals -= model.d
+    return residuals
+
+
+def _measured_variance(AV: Array, parts: Sequence[Array], standard_errors: float) -> float:
+    """sigma^2 of E r_{k+1} r_k^T = -sigma^2 A U^T U, by least squares; 0 where that may be chance."""
+    products = np.concatenate([np.einsum("ki,ij,kj->k", r[1:], AV, r[:-1]) for r in parts])
+    if len(products) < 2:
+        return 0.0
+    found = -float(np.mean(products))
+    error = float(np.std(products, ddof=1)) / np.sqrt(len(products))
+    weight = float(np.sum(AV * AV))
+    return found / weight if weight > 0.0 and found > standard_errors * error else 0.0
+
+
+def law_of_innovations(
+    model: InnovationModel,
+    target: Array,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+    or_no_control: bool = False,
+) -> ModelRows:
+    """The LQG law of a model in innovation form, for the cost of the measurements.
+
+    The gains K_a are those of the state x, of which y = U C x is the target. s = C^+ U^T z is the least
+    state with a measurement z; as A M = G gives the innovations' gain in the estimate after it,
+    L = M C lets L s = M U^T z.
+
+    Parameters
+    ----------
+    model : InnovationModel
+        Of the plant as it is measured.
+    target : (n_z,) array
+        z_r, of what is measured.
+    state_weight, action_weight : float
+        q and r.
+    cost : Cost, optional
+        In place of them.
+    or_no_control : bool
+        Gains of 0, with the filter, where there are no stabilising ones.
+
+    Raises
+    ------
+    DesignError
+        The actuators do not reach a mode that does not decay, or the measurements do not see one.
+    """
+    A, B, C = model.A, model.B, model.C
+    n_z, n_a = len(model.U), B.shape[1]
+    if cost is None or cost.plain:
+        cost = Cost(
+            n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
+        )
+    with one_thread():
+        require_detectable(A, C)
+        seen = model.U @ C
+        try:
+            gains = track_outputs(A, B, seen, cost, 0.0 if model.d is None else model.d)
+            K_a, b = gains.K_a, gains.K_b @ (seen.T @ cost.field_target)
+        except DesignError:
+            if not or_no_control:
+                raise
+            K_a, b = np.zeros_like(B.T), np.zeros(n_a)
+        back = linalg.pinv(C)
+        M = linalg.lstsq(A, model.G)[0]
+        U = model.U @ back.T
+        s_r = U.T @ target
+        size = float(s_r @ s_r)
+        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d)

@@ -1,0 +1,248 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Linear-quadratic tracking gains of a reduced model.
+
+For s_{k+1} = A s_k + B a_k + d and the stage cost (s - s_r)^T Q (s - s_r) + a^T R a with a constant
+target s_r, let P be the stabilising solution of the discrete algebraic Riccati equation
+
+    P = Q + A^T P A - A^T P B (R + B^T P B)^{-1} B^T P A,        S = R + B^T P B.
+
+The law a = K_a s + K_b s_r + b with
+
+    K_a = -S^{-1} B^T P A,        K_b = S^{-1} B^T (I - (A + B K_a)^T)^{-1} Q,
+    b = -S^{-1} B^T (I - (A + B K_a)^T)^{-1} P d
+
+is optimal over an infinite horizon. The weights are multiples of the identity on the full state and
+the actions, so Q = U^T (state_weight I) U = state_weight I, as U has orthonormal columns, and R =
+action_weight I.
+
+References
+----------
+Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005.
+Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
+"""
+
+from numbers import Real
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.reduce.reduced_model import ReducedModel
+from pdeloop.process.one_thread import one_thread
+
+# A direction that the inputs move by less than this, relative to what they move at most, counts as out
+# of reach.
+_REACH = 1e-12
+# I - (A + B K_a)^T with a smaller reciprocal condition number has no usable inverse.
+_RECIPROCAL_CONDITION = 1e-14
+
+
+# How many times as large inputs' effects may be as the model's own, or as small, before their unit is
+# changed for the computation.
+_ALIKE = 1e6
+
+
+class DesignError(ValueError):
+    """The reduced model admits no tracking law."""
+
+
+class Gains(NamedTuple):
+    """The gains of a = K_a s + K_b s_r + b, and the quantities they follow from.
+
+    Attributes
+    ----------
+    K_a : (n_a, n_s) array
+        Feedback of the reduced state.
+    K_b : (n_a, n_s) array
+        Feedforward of the reduced target.
+    P : (n_s, n_s) array
+        Solution of the Riccati equation: s^T P s is the cost of regulating s to 0.
+    poles : (n_s,) complex array
+        Eigenvalues of the closed loop A + B K_a, all inside of the unit circle.
+    b : (n_a,) array
+        What K_b s_r does not have of the constant part: against the model's drift d.
+    """
+
+    K_a: Array
+    K_b: Array
+    P: Array
+    poles: NDArray[np.complex128]
+    b: Array
+
+    def __repr__(self) -> str:
+        n_a, n_s = self.K_a.shape
+        radius = np.abs(self.poles).max()
+        return f"Gains(K_a and K_b of {n_a} x {n_s}, closed loop of spectral radius {radius:.4g})"
+
+    @property
+    def policy(self) -> Array:
+        """[K_a K_b], shape (n_a, 2 n_s)."""
+        return np.hstack([self.K_a, self.K_b])
+
+
+def track(
+    model: ReducedModel,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+) -> Gains:
+    """Design the tracking gains of a reduced model.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        Must be stabilisable; unstable modes are allowed if the actuators reach them.
+    state_weight, action_weight : float
+        Positive; Q = state_weight I on the full state and R = action_weight I.
+    cost : Cost, optional
+        Any quadratic cost, in place of the weights. K_b is then the smallest one for which K_b s_r
+        is the best constant part of the law, s_r = U^T z_r with the cost's ``field_target``; for a
+        target over time, the best one for its mean.
+
+    Returns
+    -------
+    Gains
+        K_a, K_b, P and the poles of the closed loop.
+
+    Raises
+    ------
+    ValueError
+        A weight that is not positive and finite, or no model.
+    DesignError
+        A mode on or outside the unit circle that no actuator reaches, or a Riccati equation or a
+        steady-state map without a usable solution.
+
+    See Also
+    --------
+    scipy.linalg.solve_discrete_are : the Riccati equation.
+
+    Examples
+    --------
+    An unstable mode that one actuator reaches; with costly actions its pole is mirrored into the
+    unit circle:
+
+    >>> model = ReducedModel(A=[[2.0]], B=[[1.0]], U=[[1.0]])
+    >>> gains = track(model, state_weight=1e-9, action_weight=1.0)
+    >>> gains.poles.round(6)
+    array([0.5+0.j])
+    >>> gains.K_a.round(6)
+    array([[-1.5]])
+    """
+    if not isinstance(model, ReducedModel):
+        raise ValueError(f"model is {model!r}; expected a ReducedModel")
+    if cost is not None and not cost.plain:
+        return track_outputs(model.A, model.B, model.U, cost, model.d)
+    for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
+        if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
+            raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
+    # One thread: a threaded LAPACK rounds differently for another number of threads.
+    with one_thread():
+        unit, level = _units(model, state_weight)
+        B = model.B * unit
+        Q = state_weight / level * np.eye(model.n_s)
+        R = action_weight / level * unit**2 * np.eye(model.n_a)
+        P, S, K_a, poles = _feedback(model.A, model.B, B, Q, R)
+        closed_loop = model.A + B @ K_a
+        ahead = _steady_state_map(closed_loop)
+        K_b = linalg.solve(S, B.T @ ahead @ Q, assume_a="pos")
+        b = -linalg.solve(S, B.T @ (ahead @ (P @ model.d)), assume_a="pos")
+    return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles, b=unit * b)
+
+
+def track_outputs(A: Array, B: Array, U: Array, cost: Cost, d: ArrayLike = 0.0) -> Gains:
+    """The gains of any quadratic cost; see `pdeloop.method.design.tracking` for its terms.
+
+    U is what the state looks like, z = U s, and its columns need not be orthonormal.
+    """
+    with one_thread():
+        E, R = cost.residual(U), cost.action_matrix
+        P, S, K_a, poles = _feedback(A, B, B, E.T @ E, R)
+        # The steady state of p and b of the tracking over a horizon.
+        pushed = P @ (B @ cost.action_target + np.asarray(d, dtype=np.float64))
+        closed_loop = A + B @ K_a
+        w = cost.residual_target().mean(axis=0)
+        p = _steady_state_map(closed_loop) @ (E.T @ w - closed_loop.T @ pushed)
+        b = cost.action_target + linalg.solve(S, B.T @ (p - pushed), assume_a="pos")
+        s_r = U.T @ cost.field_target
+        size = float(s_r @ s_r)
+        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if size > 0.0 else b)
+
+
+def _feedback(
+    A: Array, inputs: Array, B: Array, Q: Array, R: Array
+) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
+    """P, S, K_a and the poles; DesignError where there is no stabilising feedback.
+
+    B: the matrix `inputs`, in the units of R.
+    """
+    _require_stabilisable(A, inputs)
+    try:
+        P = linalg.solve_discrete_are(A, B, Q, R)
+    except (linalg.LinAlgError, ValueError) as error:
+        raise DesignError(
+            f"the Riccati equation of the reduced model has no stabilising solution ({error}); "
+            f"its spectral radius is {np.abs(linalg.eigvals(A)).max():.6g}, so identify with "
+            "another seed or another n_s."
+        ) from error
+    S = R + B.T @ P @ B
+    K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
+    poles = linalg.eigvals(A + B @ K_a)
+    radius = float(np.abs(poles).max())
+    if not radius < 1.0:
+        raise DesignError(
+            f"the closed loop must have a spectral radius below 1, but it is "
+            f"{radius:.17g}; the reduced model is barely stabilisable, "
+            "so identify with another seed or another n_s."
+        )
+    return P, S, K_a, poles
+
+
+def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:
+    """Units of the inputs and of the cost in which the Riccati solver has numbers of one size.
+
+    1 each where they have that already, so that the bits are those of the model as it is.
+    """
+    ratio = float(linalg.norm(model.B, 2)) / max(float(linalg.norm(model.A, 2)), 1e-300)
+    if 1.0 / _ALIKE < ratio < _ALIKE or ratio == 0.0:
+        return 1.0, 1.0
+    return 1.0 / ratio, state_weight
+
+
+def _require_stabilisable(A: Array, B: Array) -> None:
+    # Popov-Belevitch-Hautus: [lambda I - A, B] keeps full row rank at every eigenvalue with
+    # |lambda| >= 1.
+    size, largest = float(linalg.norm(A, 2)), float(linalg.norm(B, 2))
+    # As large as A: the unit of the inputs does not move a mode out of reach, or into it.
+    scaled = B * (size / largest) if largest > 0.0 else B
+    for eigenvalue in linalg.eigvals(A):
+        if abs(eigenvalue) < 1.0 - _REACH:
+            continue
+        pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, scaled])
+        reach = float(linalg.svdvals(pencil)[-1])
+        if reach <= _REACH * size:
+            raise DesignError(
+                f"the reduced model is not stabilisable: no actuator reaches the mode with "
+                f"eigenvalue magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I "
+                f"- A, B] {reach:.1e}); place actuators that reach it or identify with another "
+                "seed or n_s."
+            )
+
+
+def _steady_state_map(closed_loop: Array) -> Array:
+    """(I - (A + B K_a)^T)^{-1}."""
+    matrix = np.eye(len(closed_loop)) - closed_loop.T
+    reciprocal = 1.0 / float(np.linalg.cond(matrix))
+    if reciprocal < _RECIPROCAL_CONDITION:
+        raise DesignError(
+            f"I - (A + B K_a)^T is singular (reciprocal condition number {reciprocal:.1e}): the "
+            "closed loop has a mode at 1 and no steady state, so raise state_weight or identify "
+            "with another seed."
+        )
+    inverse: Array = linalg.inv(matrix)
+    return inverse

@@ -1,0 +1,342 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Plans of actions on a model of the plant: their cost, its exact gradient, and a search.
+
+At step k a plan v_0 .. v_{H-1} from the state z_k costs
+
+    J(v) = sum_{i < H} l_{k+i}(z_i, a_i) + V(z_H),
+    z_{i+1} = f(z_i, a_i),        a_i = P(K z_i + b + v_i),
+
+with f the model, l the stage cost, P(a) the nearest admissible action, and V the cost to go of the
+linear-quadratic problem at the target, or nothing. K and b are those of an affine law, from which v is
+then the deviation, or zero. The gradient is the adjoint of all of it, about three times as much work:
+
+    eta_H = dV/dz,    g_i = P'^T ((df/da)^T eta_{i+1} + dl/da),
+    eta_i = (df/dz)^T eta_{i+1} + dl/dz + K^T g_i,    dJ/dv_i = g_i.
+
+The search is L-BFGS in the metric of R + B^T P B, with a projected backtracking line search and a fixed
+number of iterations. A spectral model carries out both ways over all steps in one compiled call
+(`pdeloop.solver.polynomial_sweep`).
+
+All functions take M plans side by side, each with the same result as alone.
+
+References
+----------
+Nocedal, Wright, "Numerical Optimization", 2nd ed., algorithm 7.4 (L-BFGS). Griewank, Walther,
+"Evaluating Derivatives", SIAM 2008, chapter 3. Bertsekas, IEEE Trans. Automatic Control 21(2), 1976
+(projected line search). Rawlings, Mayne, Diehl, "Model Predictive Control", 2nd ed., chapter 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.design.finite_horizon import cost_to_go
+from pdeloop.method.models.base import FieldModel
+from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
+
+MEMORY = 10
+"""Pairs of L-BFGS."""
+ARMIJO, SHORTER, TRIALS = 1e-4, 0.3, 8
+"""Of the line search: the share of the slope that a step must gain, the factor of the next trial, and
+trials at most."""
+WAVES = 5
+"""Cosines of a plan that is drawn."""
+BEFORE = 15
+"""Iterations after which the best of several starts goes on alone."""
+FLAT = 1e-6
+"""Share of its cost that an iteration has to gain, or a plan counts as found."""
+LARGEST = 512
+"""Numbers of a state up to which V is worked out; its work grows with their third power."""
+_CLOSE = 1e-9
+"""Relative distance at which an action counts as the one that was requested."""
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """Receding-horizon control on a model.
+
+    Attributes
+    ----------
+    model : FieldModel
+        f.
+    cost : Cost
+        Of an episode of T steps.
+    action_set : ActionSet
+        What actuators can take.
+    K, b : (n_a, n_z) and (n_a,) arrays
+        The affine law a = K z + b.
+    around : bool
+        Whether a plan is a deviation from that law; else it is the actions themselves.
+    steps : int
+        H.
+    terminal : bool
+        Whether V is the cost to go at the target, where that exists.
+    iterations, first : int
+        Of the search at each step, and at the first.
+    starts : int
+        Plans that the first search begins from: no action, the affine law, and drawn ones.
+    """
+
+    model: FieldModel
+    cost: Cost
+    action_set: ActionSet
+    K: Array
+    b: Array
+    around: bool
+    steps: int
+    terminal: bool
+    iterations: int = 2
+    first: int = 60
+    starts: int = 5
+
+    def length(self, k: int) -> int:
+        """Steps of a plan that is made at step k: an episode ends after T, whoever goes on does not."""
+        left = self.cost.horizon - k
+        return min(self.steps, left) if left > 0 else self.steps
+
+    def begin(self, z: Array, k: int = 0) -> tuple[Array, Array]:
+        """The cheapest plan (M, H, n_a) from states z (M, n_z) of those from all starts, and J."""
+        M, H = len(z), self.length(k)
+        affine = self._affine_plan(z, H)
+        own = self.actions_of(affine, z)
+        size = np.sqrt((own**2).mean(axis=(1, 2)))[:, None, None]
+        starts = [np.zeros_like(affine)] if self.around else [np.zeros_like(affine), affine]
+        rng = np.random.default_rng(0)
+        waves = np.cos(np.pi * np.outer(np.arange(H) + 0.5, np.arange(WAVES)) / H)
+        while len(starts) < self.starts:
+            drawn = np.einsum("iw,wj->ij", waves, rng.standard_normal((WAVES, own.shape[2])))
+            starts.append(size * drawn)
+        best, least = affine, np.full(M, np.inf)
+        for start in starts[: self.starts]:
+            found, J = self.improved(start, z, k, min(self.first, BEFORE))
+            best = np.where((least > J)[:, None, None], found, best)
+            least = np.minimum(J, least)
+        return self.improved(best, z, k, self.first - BEFORE)
+
+    def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array, Flags]:
+        """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan.
+
+        plan (M, H, n_a): that of the step before without its first action; at k = 0 it does not count.
+        Where the affine law's own plan is cheaper on the model, the search begins from that.
+
+        Returns
+        -------
+        (M, n_a), (M, H, n_a), (M,) bool
+            The last: where the affine law's plan was the cheaper one, or none is finite and the affine
+            law acts.
+        """
+        H = self.length(k)
+        if k == 0:
+            plan, J = self.begin(z)
+            fell = np.zeros(len(z), dtype=np.bool_)
+        else:
+            affine = self._affine_plan(z, H)
+            of_affine = self.costs(affine, z, k)
+            J, g, kept = self.gradient(self._extended(plan[:, :H], z), z, k)
+            fell = ~(of_affine >= J)
+            plan = np.where(fell[:, None, None], affine, kept)
+            if fell.any():
+                J, g, plan = self.gradient(plan, z, k)
+            plan, J = self.improved(plan, z, k, self.iterations, (J, g))
+        lost = ~np.isfinite(J)
+        of_law = self._affine(z)
+        base = of_law if self.around else 0.0
+        a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]))
+        plan = np.where(lost[:, None, None], 0.0, plan)
+        return a, plan, fell | lost
+
+    def shifted(self, plan: Array) -> Array:
+        """A plan (M, H, n_a) without its first action, and with a zero at the end."""
+        return np.concatenate([plan[:, 1:], np.zeros_like(plan[:, :1])], axis=1)
+
+    def _extended(self, plan: Array, z: Array) -> Array:
+        """The plan (M, H, n_a) that ends as the affine law acts."""
+        if self.around:
+            return plan
+        found, states = plan.copy(), self._rolled(z, plan)[0]
+        with np.errstate(all="ignore"):
+            found[:, -1] = self.action_set.project(self._affine(states[:, -2]))
+        return found
+
+    def costs(self, v: Array, z: Array, k: int) -> Array:
+        """J (M,) of plans v (M, H, n_a) from states z (M, n_z) at step k; infinite if not finite."""
+        states, actions = self._rolled(z, v)
+        with np.errstate(all="ignore"):
+            J, _, _ = self.cost.along(states[:, :-1], actions, k)
+            J = J + self._at_end(states[:, -1], k + v.shape[1])[0]
+        return np.where(np.isfinite(J), J, np.inf)
+
+    def gradient(self, v: Array, z: Array, k: int) -> tuple[Array, Array, Array]:
+        """J (M,), its gradient (M, H, n_a), and the plans such that no action has to be projected.
+
+        Infinite, with a gradient of zero, where J or the gradient is not finite. Zero, too, for an
+        action at a bound that it could only leave outwards.
+        """
+        J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
+        K, b = self._feedback
+        self._to_go  # noqa: B018 - known before several threads ask
+
+        def work(sweep: Sweep, rows: slice) -> None:
+            with np.errstate(all="ignore"):
+                states, requested, actions = sweep.roll(z[rows], v[rows], K, b)
+                costs, on_states, on_actions = self.cost.along(states[:, :-1], actions, k)
+                of_end, eta = self._at_end(states[:, -1], k + v.shape[1])
+                J[rows] = costs + of_end
+                kept[rows] = v[rows] + (actions - requested)
+                close = np.abs(requested - actions) <= _CLOSE * (1.0 + np.abs(actions))
+                seen = np.where(close, actions, requested)
+                own = sweep.roll_back(seen, on_states, on_actions, K, eta)
+                g[rows] = np.where(self._leaves(actions, own), 0.0, own)
+
+        self._sweep.each(len(z), work)
+        lost = ~(
+            np.isfinite(J) & np.isfinite(g).all(axis=(1, 2)) & np.isfinite(kept).all(axis=(1, 2))
+        )
+        J[lost], g[lost], kept[lost] = np.inf, 0.0, v[lost]
+        return J, g, kept
+
+    def _leaves(self, actions: Array, g: Array) -> Flags:
+        """Which actions are at a bound that the descent -g would leave the set at."""
+        low, high = self.action_set.low, self.action_set.high
+        down = actions <= low + _CLOSE * (1.0 + np.abs(low))
+        up = actions >= high - _CLOSE * (1.0 + np.abs(high))
+        held: Flags = (down & (g > 0.0)) | (up & (g < 0.0))
+        return held
+
+    def improved(
+        self,
+        v: Array,
+        z: Array,
+        k: int,
+        iterations: int,
+        known: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Plans after so many steps of L-BFGS from v (M, H, n_a), and J.
+
+        known: J and gradient of v, which no action of has to be projected.
+        """
+        if known is None:
+            J, g, v = self.gradient(v, z, k)
+        else:
+            J, g = known
+        pairs, going = list[tuple[Array, Array, Array]](), np.ones(len(z), dtype=np.bool_)
+        for _ in range(iterations):
+            # Two-metric projection: what is held at a bound does not move.
+            d = np.where(g != 0.0, self._direction(g, pairs), 0.0)
+            t, todo = np.ones(len(z)), np.flatnonzero(going & np.isfinite(J) & g.any(axis=(1, 2)))
+            if not len(todo):
+                break
+            new_v, new_J, new_g = v.copy(), J.copy(), g.copy()
+            for _ in range(TRIALS):
+                if not len(todo):
+                    break
+                trial = v[todo] - t[todo, None, None] * d[todo]
+                J_t, g_t, trial = self.gradient(trial, z[todo], k)
+                gained = (g[todo] * (v[todo] - trial)).sum(axis=(1, 2))
+                good = (J_t <= J[todo] - ARMIJO * gained) & (J_t < J[todo])
+                done = todo[good]
+                new_v[done], new_J[done], new_g[done] = trial[good], J_t[good], g_t[good]
+                todo = todo[~good]
+                t[todo] *= SHORTER
+            s, y = new_v - v, new_g - g
+            product = (s * y).sum(axis=(1, 2))
+            curved = product > 1e-14 * np.maximum((g * g).sum(axis=(1, 2)), 1e-300)
+            pairs = [*pairs[1 - MEMORY :], (s, y, np.where(curved, product, np.inf))]
+            going = J - new_J > FLAT * np.abs(J)
+            v, J, g = new_v, new_J, new_g
+        return v, J
+
+    def _direction(self, g: Array, pairs: list[tuple[Array, Array, Array]]) -> Array:
+        """The inverse Hessian of L-BFGS times g."""
+        d, alphas = g.copy(), list[Array]()
+        for s, y, product in reversed(pairs):
+            alpha = (s * d).sum(axis=(1, 2)) / product
+            alphas.append(alpha)
+            d -= alpha[:, None, None] * y
+        scale = np.full(len(g), 0.5)
+        if pairs:
+            s, y, product = pairs[-1]
+            size = (y * np.einsum("mij,jl->mil", y, self._metric)).sum(axis=(1, 2))
+            known = np.isfinite(product) & (size > 0.0)
+            scale = np.where(known, product / np.where(known, size, 1.0), scale)
+        d[...] = scale[:, None, None] * np.einsum("mij,jl->mil", d, self._metric)
+        for (s, y, product), alpha in zip(pairs, reversed(alphas), strict=True):
+            beta = (y * d).sum(axis=(1, 2)) / product
+            d += (alpha - beta)[:, None, None] * s
+        return d
+
+    def actions_of(self, v: Array, z: Array) -> Array:
+        """The actions (M, H, n_a) of plans on the model, zero where they are not finite."""
+        return np.nan_to_num(self._rolled(z, v)[1], nan=0.0, posinf=0.0, neginf=0.0)
+
+    def _affine_plan(self, z: Array, H: int) -> Array:
+        """The plans (M, H, n_a) with which the affine law acts on the model."""
+        none = np.zeros((len(z), H, len(self.b)))
+        if self.around:
+            return none
+        found = rolled(self._sweep, len(self.b), z, none, self.K, self.b)[2]
+        found[~np.isfinite(found).all(axis=(1, 2))] = 0.0
+        return found
+
+    def _rolled(self, z: Array, v: Array) -> tuple[Array, Array]:
+        """States (M, H + 1, n_z) and applied actions of plans."""
+        states, _, actions = rolled(self._sweep, len(self.b), z, v, *self._feedback)
+        return states, actions
+
+    def _affine(self, z: Array) -> Array:
+        a: Array = np.einsum("mi,ji->mj", z, self.K) + self.b
+        return a
+
+    @cached_property
+    def _feedback(self) -> tuple[Array, Array]:
+        if self.around:
+            return self.K, self.b
+        return np.zeros_like(self.K), np.zeros_like(self.b)
+
+    @cached_property
+    def _sweep(self) -> Sweep:
+        return sweep_of(self.model, self.action_set, min(self.steps, self.cost.horizon))
+
+    @cached_property
+    def _to_go(self) -> Array | None:
+        """P of [z - z_r; 1]^T P [z - z_r; 1], the cost to go; None where there is none."""
+        if self.model.n_z > LARGEST:
+            return None
+        point, a_r = self.cost.field_target, self.cost.action_target
+        with np.errstate(all="ignore"):
+            try:
+                A, B = self.model.linearise(point, a_r)
+                drift = self.model.step(point[None], a_r[None])[0] - point
+                P = cost_to_go(A, B, drift - B @ a_r, self.cost, point)
+            except (np.linalg.LinAlgError, ValueError):
+                return None
+        return 0.5 * (P + P.T) if np.isfinite(P).all() else None
+
+    @cached_property
+    def _metric(self) -> Array:
+        """(R + B^T P B)^-1, or R^-1 where there is no cost to go."""
+        R = self.cost.action_matrix
+        if self.terminal and self._to_go is not None:
+            _, B = self.model.linearise(self.cost.field_target, self.cost.action_target)
+            R = R + B.T @ self._to_go[:-1, :-1] @ B
+        found: Array = linalg.inv(0.5 * (R + R.T))
+        return found
+
+    def _at_end(self, z: Array, k: int) -> tuple[Array, Array]:
+        """V (M,) of states (M, n_z) at step k, and dV/dz."""
+        if k == self.cost.horizon:
+            return self.cost.at_end(z)
+        if not self.terminal or self._to_go is None:
+            return np.zeros(len(z)), np.zeros_like(z)
+        e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
+        on_e = np.einsum("mi,ij->mj", e, self._to_go)
+        return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]

@@ -1,0 +1,205 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law that plans its actions on a model of the plant: receding-horizon control."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from threading import get_ident
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
+from pdeloop.method.laws.affine import Affine
+from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.plans import Planner
+from pdeloop.method.models.base import Arrays, FieldModel
+from pdeloop.method.models.files import model_of, packed, unpacked
+from pdeloop.method.settings import Settings, setting
+
+LONGEST = 80
+"""Steps of a plan, at most, unless the settings ask for more."""
+MOST_NUMBERS = 50_000
+"""Numbers of a model that a theta has room for: messages carry one for each environment."""
+_MODEL = "model."
+_KEPT_PLANS, _KEPT_PLANNERS = 4096, 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictiveSettings(Settings):
+    """Constants of the law `predictive`."""
+
+    steps: int = setting(
+        0,
+        "steps H of a plan; 0: the shortest of 20, 40 and 80 that suffices on the model",
+        0,
+        LONGEST,
+    )
+    iterations: int = setting(2, "iterations of the search at a step", 0, 100)
+    first_iterations: int = setting(60, "iterations of the first search from each start", 0, 1000)
+    starts: int = setting(5, "plans that the first search begins from", 1, 100)
+
+
+class Predictive(Law):
+    """The first action of a plan that is improved at every step on a model of the field:
+
+        a_k = P(K z_k + b + v_0),        v_0 .. v_{H-1} = argmin of the cost of the next H steps
+
+    (`pdeloop.method.laws.plans`). It begins as the affine law, without a model. An optimiser that
+    identifies one writes it into theta, with the cost, the admissible actions, H and the constants of
+    the search: `model_based` does. theta is then longer than `size`; zeros at its end mean nothing.
+
+    Its memory is the plan for the next steps, and how often the affine law's plan was the cheaper one
+    on the model, so that the search began with that.
+
+    Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd ed., 2017, chapter 2.
+    """
+
+    name = "predictive"
+    extends = True
+    needs_model = True
+    Settings = PredictiveSettings
+    settings: ClassVar[PredictiveSettings] = PredictiveSettings()
+
+    def __init__(self, model: Any, horizon: int) -> None:
+        super().__init__(model, horizon)
+        self._affine = Affine(model, horizon)
+        self._planners: OrderedDict[tuple[int, bytes], Planner] = OrderedDict()
+        self._plans: OrderedDict[bytes, tuple[Array, Array, bool]] = OrderedDict()
+
+    @property
+    def longest(self) -> int:
+        """Steps of a plan in the memory."""
+        return max(min(LONGEST, self.horizon), 1)
+
+    @property
+    def memory_size(self) -> int:  # type: ignore[override]
+        return self.longest * self.n_a + 1
+
+    def start(self) -> Parts:
+        """K_a and K_b of the model, (n_a, n_s) each, and no plan."""
+        return {**self._affine.start(), "plan": np.zeros(0)}
+
+    def parts(self, theta: Array) -> Parts:
+        """K_a and K_b stand side by side in the rows of its beginning; the rest is `plan`."""
+        size = self._affine.size
+        return {**self._affine.parts(theta[:size]), "plan": theta[size:]}
+
+    def vector(self, parts: Parts) -> Array:
+        return np.concatenate([self._affine.vector(parts), parts["plan"]])
+
+    def theta_of(self, gains: Array, planner: Planner) -> Array:
+        """Theta of plans on a model; gains (n_a, 2 n_s): [K_a K_b] of the affine law.
+
+        ValueError for a model of too many numbers.
+        """
+        arrays: Arrays = {_MODEL + name: own for name, own in planner.model.arrays().items()}
+        cost, actions = planner.cost, planner.action_set
+        if self.cost is None:
+            arrays |= {
+                "weights": np.array([float(cost.state_weight), float(cost.action_weight)]),
+                "target": cost.target,
+            }
+        n_a = self.n_a
+        arrays |= {
+            "bounds": np.stack([np.broadcast_to(x, n_a) for x in (actions.low, actions.high)]),
+            "zero_mean": np.array(actions.zero_mean),
+            "around": np.array(planner.around),
+            "terminal": np.array(planner.terminal),
+            "search": np.array([planner.steps, planner.iterations, planner.first, planner.starts]),
+        }
+        numbers = packed(arrays)
+        if len(numbers) > MOST_NUMBERS:
+            raise ValueError(
+                f"its model has {len(numbers):,} numbers, and plans use at most {MOST_NUMBERS:,}"
+            )
+        return np.concatenate([np.ravel(gains), numbers])
+
+    def plans(self, theta: Array) -> bool:
+        """Whether this theta has a model to plan on."""
+        return bool(theta[self._affine.size :].any())
+
+    def planner(self, theta: Parts) -> Planner:
+        """The planner in theta; ValueError where its numbers are those of none."""
+        gains = np.ascontiguousarray(np.hstack([theta["K_a"], theta["K_b"]]))
+        # Its model may be used by one thread at a time.
+        key = get_ident(), gains.tobytes() + theta["plan"].tobytes()
+        known = self._planners.get(key)
+        if known is None:
+            known = self._planners[key] = self._made(theta, unpacked(theta["plan"]))
+            while len(self._planners) > _KEPT_PLANNERS:
+                self._planners.popitem(last=False)
+        return known
+
+    def _made(self, theta: Parts, arrays: Mapping[str, Any]) -> Planner:
+        n_z, n_a = self.model.U.shape[0], self.n_a
+        part = {name: own for name, own in arrays.items() if name.startswith(_MODEL)}
+        model: FieldModel = model_of({n.removeprefix(_MODEL): own for n, own in part.items()})
+        if (model.n_z, model.n_a) != (n_z, n_a):
+            raise ValueError(f"its model has sizes {model.n_z}, {model.n_a}; expected {n_z}, {n_a}")
+        cost = self.cost
+        if cost is None:
+            q, r = checked_array(arrays, "weights", "f", (2,)).tolist()
+            target = checked_array(arrays, "target", "f", (n_z,))
+            cost = Cost(n_z, n_a, self.horizon, state_weight=q, action_weight=r, target=target)
+        low, high = checked_array(arrays, "bounds", "f", (2, n_a), finite=False)
+        zero_mean = bool(checked_array(arrays, "zero_mean", "b", ()))
+        steps, iterations, first, starts = checked_array(arrays, "search", "i", (4,)).tolist()
+        if not (1 <= steps <= self.longest and iterations >= 0 and first >= 0 and starts >= 1):
+            raise ValueError(f"its plans have {steps} steps; expected 1 to {self.longest}")
+        return Planner(
+            model,
+            cost,
+            ActionSet(n_a, low, high, zero_mean),
+            *self._feedback(theta),
+            around=bool(checked_array(arrays, "around", "b", ())),
+            steps=steps,
+            terminal=bool(checked_array(arrays, "terminal", "b", ())),
+            iterations=iterations,
+            first=first,
+            starts=starts,
+        )
+
+    def _feedback(self, theta: Parts) -> tuple[Array, Array]:
+        """K and b of a = K z + b."""
+        K: Array = np.ascontiguousarray(theta["K_a"] @ self.model.U.T)
+        return K, theta["K_b"] @ self.model.s_r
+
+    def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+        if not theta["plan"].any():
+            return self._affine.action(theta, z, memory, k)
+        return self._planned(theta, z, memory, k)[0]
+
+    def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
+        if not theta["plan"].any():
+            return np.zeros(self.memory_size)
+        _, plan, fell = self._planned(theta, z, memory, k)
+        after = np.zeros(self.memory_size)
+        after[: plan[1:].size] = plan[1:].ravel()
+        after[-1] = memory[-1] + fell
+        return after
+
+    def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array, bool]:
+        """The action (n_a,), its plan (H, n_a), and whether that came from the affine law.
+
+        The same for the same arguments: it is kept for `memory_update` because it takes long.
+        """
+        seen = hashlib.blake2b(digest_size=16)
+        for part in (*theta.values(), z, memory, np.array(k)):
+            seen.update(np.ascontiguousarray(part).data)
+        key = seen.digest()
+        known = self._plans.get(key)
+        if known is None:
+            planner, H = self.planner(theta), self.longest
+            plan = memory[:-1].reshape(1, H, self.n_a)[:, : planner.steps]
+            a, plan, fell = planner.step(plan, z[None], k)
+            known = self._plans[key] = a[0], plan[0], bool(fell[0])
+            while len(self._plans) > _KEPT_PLANS:
+                self._plans.popitem(last=False)
+        return known

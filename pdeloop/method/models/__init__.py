@@ -1,0 +1,15 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models of the whole field of a plant, identified from its rollouts."""
+
+from pdeloop.method.models.base import FieldModel, Measured, affine_law
+from pdeloop.method.models.choice import FittedModel, fit_field_model
+from pdeloop.method.models.settings import FieldModelSettings
+
+__all__ = [
+    "FieldModel",
+    "FieldModelSettings",
+    "FittedModel",
+    "Measured",
+    "affine_law",
+    "fit_field_model",
+]

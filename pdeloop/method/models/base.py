@@ -1,0 +1,188 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models of the whole field, and the measured rollouts that they are fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+
+MAX_SUBSTEPS = 2000
+"""Most internal steps of a sampling time: twice what `FieldModelSettings` can ask for."""
+Arrays = dict[str, NDArray[np.generic]]
+Law = Callable[[int, Array], Array]
+"""(k, z_k of shape (M, n_z)) -> a_k of shape (M, n_a)."""
+
+
+class FieldModel(Protocol):
+    """A model z_{k+1} = step(z_k, a_k) of a plant, one sampling time a step.
+
+    All results are those of one row after the other: they do not depend on how many rows there are.
+
+    Attributes
+    ----------
+    kind : str
+        How it was identified, e.g. ``"poly3"``; see `pdeloop.method.models.choice`.
+    n_z, n_a : int
+        Sizes of state and action.
+    """
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def n_z(self) -> int: ...
+
+    @property
+    def n_a(self) -> int: ...
+
+    def step(self, states: Array, actions: Array) -> Array:
+        """The states (M, n_z) a sampling time later, under actions (M, n_a).
+
+        What the model makes of a state far from the data may be NaN or infinite.
+        """
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        """(d step/dz)^T y and (d step/da)^T y, (M, n_z) and (M, n_a), of covectors y (M, n_z).
+
+        The transpose of the derivative of `step` itself, not of an equation that it approximates.
+        """
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        """A (n_z, n_z) and B (n_z, n_a), the derivatives of `step` at one point."""
+
+    def arrays(self) -> Arrays:
+        """The model as arrays, from which `pdeloop.method.models.files.model_of` makes it again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A measured rollout.
+
+    Attributes
+    ----------
+    states : (L + 1, n_z) or (L, n_z) array
+        z_0 .. z_{L-1}, and z_L if it is known.
+    actions : (L, n_a) array
+        a_k, held from z_k to z_{k+1}.
+    law : callable, optional
+        (k, states (M, n_z)) -> actions (M, n_a), that the rollout was under. A model is then judged by
+        the closed loop that it predicts; without a law, as for an exploration, by what it predicts
+        under the measured actions.
+    clean : array, optional
+        The denoised states; none: there is no noise.
+    """
+
+    states: Array
+    actions: Array
+    law: Law | None = None
+    clean: Array | None = None
+
+    @property
+    def known(self) -> Array:
+        """The states as they are best known."""
+        return np.asarray(self.states if self.clean is None else self.clean)
+
+
+def affine_law(K: Array, b: Array) -> Law:
+    """The law a = K z + b; K (n_a, n_z), b (n_a,)."""
+
+    def law(_: int, states: Array) -> Array:
+        # einsum: of each row by itself, where a matrix product rounds by the number of rows.
+        actions: Array = np.einsum("mi,ji->mj", states, K) + b
+        return actions
+
+    return law
+
+
+def saturated(law: Law, action_set: ActionSet) -> Law:
+    """The law with the nearest admissible actions."""
+    if not action_set.bounded:
+        return law
+
+    def limited(k: int, states: Array) -> Array:
+        return action_set.project(law(k, states))
+
+    return limited
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Steps of the plant: z_k, a_k, z_{k+1}, a row each, (N, n_z), (N, n_a), (N, n_z)."""
+
+    before: Array
+    actions: Array
+    after: Array
+
+    def __len__(self) -> int:
+        return len(self.before)
+
+    @staticmethod
+    def of(rollouts: Sequence[Measured]) -> Samples:
+        """Those of rollouts that are finite, in their order."""
+        parts = []
+        for rollout in rollouts:
+            states, actions = rollout.known, np.asarray(rollout.actions)
+            n = min(len(actions), len(states) - 1)
+            if n < 1:
+                continue
+            finite = np.isfinite(states)
+            whole = np.hstack([finite[:n], finite[1 : n + 1], np.isfinite(actions[:n])])
+            kept = whole.all(axis=1)
+            parts.append((states[:n][kept], actions[:n][kept], states[1 : n + 1][kept]))
+        if not parts:
+            return Samples(*(np.empty((0, 0)) for _ in range(3)))
+        before, actions, after = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Samples(before, actions, after)
+
+    def thinned(self, most: int) -> Samples:
+        """At most this many of them, equally spaced."""
+        some = slice(None, None, max(-(-len(self) // most), 1))
+        return Samples(self.before[some], self.actions[some], self.after[some])
+
+    def weights(self) -> Array:
+        """1 / max(|Δz|, mean |Δz|): a step counts relative to how much changes in it.
+
+        Where the field rests, what is left is the error of the model's integration, which would
+        otherwise outweigh everything; so less than the mean change counts as the mean.
+        """
+        change = np.linalg.norm(self.after - self.before, axis=1)
+        size = np.maximum(change, change.mean())
+        weights: Array = 1.0 / np.where(size > 0.0, size, 1.0)
+        return weights
+
+
+def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, Array]:
+    """A and B of a model at a point, whose rows are pulled back unit vectors."""
+    eye = np.eye(model.n_z)
+    states = np.broadcast_to(state, eye.shape)
+    actions = np.broadcast_to(action, (model.n_z, model.n_a))
+    return model.pull_back(states, actions, eye)
+
+
+def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str, *shape: int | None) -> Array:
+    """Finite real numbers of this shape among arrays; ValueError for anything else.
+
+    What is compiled does not look where an array ends.
+    """
+    return checked_array(arrays, name, "f", shape)
+
+
+def steps_of(arrays: Mapping[str, NDArray[np.generic]], least: int = 1) -> int:
+    """The internal steps of a sampling time among arrays; ValueError for none or too many."""
+    steps = int(checked_array(arrays, "substeps", "i", ()))
+    if not least <= steps <= MAX_SUBSTEPS:
+        raise ValueError(f"a model has {steps} internal steps; expected {least} to {MAX_SUBSTEPS}")
+    return steps
+
+
+def text_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> str:
+    """A text among arrays."""
+    return str(arrays[name].item())

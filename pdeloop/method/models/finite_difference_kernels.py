@@ -1,0 +1,299 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The compiled steps of a `FiniteDifferenceModel`, their transposes, and the means of its features."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdeloop.jit.cache import cached_njit, jit
+from pdeloop.messages.arrays import Array
+
+MOST_FACTORS = 5
+Table = NDArray[np.int64]
+"""A feature a row: its number of factors, the factors, their shifts, and the order of its difference.
+
+A shift is 0 .. n_x - 1, counted on the ring.
+"""
+
+
+@jit
+def copy(source: Array, target: Array) -> None:
+    """Element by element: Numba compiles the text of an error for `target[:] = source`, a second."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@jit
+def forcing(action: Array, B: Array, constant: Array, force: Array) -> None:
+    """B a + c, as components by points."""
+    flat = force.reshape(force.size)
+    for i in range(flat.size):
+        total = constant[i]
+        for j in range(action.size):
+            total += B[i, j] * action[j]
+        flat[i] = total
+
+
+@jit
+def multiply(z: Array, row: Array, without: int, value: Array) -> None:
+    """Multiply by all factors of a monomial but one."""
+    n_x = z.shape[1]
+    for factor in range(row[0]):
+        if factor != without:
+            c, ahead = row[1 + factor], row[1 + MOST_FACTORS + factor]
+            # Slices: a computed index might be negative, and such loops are not vectorised.
+            front, back, end = z[c, ahead:], z[c, :ahead], value[n_x - ahead :]
+            for i in range(front.size):
+                value[i] *= front[i]
+            for i in range(back.size):
+                end[i] *= back[i]
+
+
+@jit
+def monomial(z: Array, row: Array, ring: Array) -> None:
+    """A monomial at the points 1 .. n_x of a ring, whose ends are repeated."""
+    n_x = z.shape[1]
+    c, ahead = row[1], row[1 + MOST_FACTORS]
+    copy(z[c, ahead:], ring[1 : 1 + n_x - ahead])
+    copy(z[c, :ahead], ring[1 + n_x - ahead : 1 + n_x])
+    multiply(z, row, 0, ring[1 : 1 + n_x])
+    ring[0], ring[n_x + 1] = ring[n_x], ring[1]
+
+
+@jit
+def difference_along(ring: Array, order: int, shape: Table, out: Array) -> None:
+    """`difference` on several axes, each of them a ring."""
+    axis = len(shape) - 1 - (order - 1) // 2
+    stride = 1
+    for other in range(axis + 1, len(shape)):
+        stride *= shape[other]
+    length = shape[axis]
+    for begin in range(0, out.size, length * stride):
+        for place in range(length):
+            here = begin + place * stride
+            before = here - stride if place > 0 else here + (length - 1) * stride
+            after = here + stride if place < length - 1 else begin
+            if order % 2 == 1:
+                for i in range(stride):
+                    out[here + i] = 0.5 * (ring[1 + after + i] - ring[1 + before + i])
+            else:
+                for i in range(stride):
+                    centre = 2.0 * ring[1 + here + i]
+                    out[here + i] = ring[1 + after + i] - centre + ring[1 + before + i]
+
+
+@jit
+def difference(ring: Array, order: int, shape: Table, out: Array) -> None:
+    """D^order at all points."""
+    n_x = out.size
+    if order == 0:
+        for i in range(n_x):
+            out[i] = ring[1 + i]
+    elif len(shape) > 1:
+        difference_along(ring, order, shape, out)
+    elif order == 1:
+        for i in range(n_x):
+            out[i] = 0.5 * (ring[2 + i] - ring[i])
+    else:
+        for i in range(n_x):
+            out[i] = ring[2 + i] - 2.0 * ring[1 + i] + ring[i]
+
+
+@jit
+def rate(
+    z: Array, table: Table, shape: Table, C: Array, force: Array, ring: Array, value: Array,
+    out: Array,
+) -> None:  # fmt: skip
+    """dz/dt, components by points."""
+    components, n_x = z.shape
+    for c in range(components):
+        for i in range(n_x):
+            out[c, i] = force[c, i]
+    for f in range(len(table)):
+        if table[f, -1] == 0:  # the first of its monomial
+            monomial(z, table[f], ring)
+        difference(ring, table[f, -1], shape, value)
+        for c in range(components):
+            for i in range(n_x):
+                out[c, i] += C[f, c, i] * value[i]
+
+
+@jit
+def transposed_rate(
+    z: Array, y: Array, table: Table, shape: Table, C: Array, ring: Array, value: Array,
+    on_m: Array, out: Array,
+) -> None:  # fmt: skip
+    """(d rate/dz)^T y."""
+    components, n_x = z.shape
+    out[:] = 0.0
+    on_m[:] = 0.0
+    for f in range(len(table)):
+        for i in range(n_x):
+            total = 0.0
+            for c in range(components):
+                total += C[f, c, i] * y[c, i]
+            ring[1 + i] = total
+        ring[0], ring[n_x + 1] = ring[n_x], ring[1]
+        order = table[f, -1]
+        difference(ring, order, shape, value)
+        sign = -1.0 if order % 2 == 1 else 1.0  # the transpose of a central difference
+        for i in range(n_x):
+            on_m[i] += sign * value[i]
+        if f + 1 < len(table) and table[f + 1, -1] != 0:
+            continue
+        for own in range(table[f, 0]):
+            for i in range(n_x):
+                value[i] = on_m[i]
+            multiply(z, table[f], own, value)
+            c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
+            front, back, end = out[c, ahead:], out[c, :ahead], value[n_x - ahead :]
+            for i in range(front.size):
+                front[i] += value[i]
+            for i in range(back.size):
+                back[i] += end[i]
+        on_m[:] = 0.0
+
+
+@jit
+def runge_kutta(
+    z: Array, table: Table, shape: Table, C: Array, force: Array, h: float, stages: Array, k: Array,
+    ring: Array, value: Array,
+) -> None:  # fmt: skip
+    """An internal step in place; stages (4, ..): where the rates k (4, ..) were taken."""
+    components, n_x = z.shape
+    for stage in range(4):
+        reach = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
+        before = k[max(stage - 1, 0)]
+        for c in range(components):
+            for i in range(n_x):
+                stages[stage, c, i] = z[c, i] + reach * before[c, i] if stage else z[c, i]
+        rate(stages[stage], table, shape, C, force, ring, value, k[stage])
+    for c in range(components):
+        for i in range(n_x):
+            z[c, i] += h / 6.0 * (k[0, c, i] + 2.0 * k[1, c, i] + 2.0 * k[2, c, i] + k[3, c, i])
+
+
+@jit
+def mapped(
+    z: Array, table: Table, shape: Table, C: Array, force: Array, ring: Array, value: Array,
+    change: Array,
+) -> None:  # fmt: skip
+    """The step of a map in place."""
+    components, n_x = z.shape
+    rate(z, table, shape, C, force, ring, value, change)
+    for c in range(components):
+        for i in range(n_x):
+            z[c, i] += change[c, i]
+
+
+@cached_njit()
+def advance(
+    states: Array, actions: Array, table: Table, axes: Table, C: Array, B: Array, constant: Array,
+    substeps: int, after: Array,
+) -> None:  # fmt: skip
+    """Write the states a sampling time later."""
+    components, n_x = C.shape[1], C.shape[2]
+    shape = (components, n_x)
+    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
+    for m in range(len(states)):
+        copy(states[m], after[m])
+        z = after[m].reshape(shape)
+        forcing(actions[m], B, constant, force)
+        if substeps == 0:
+            mapped(z, table, axes, C, force, ring, value, k[0])
+        for _ in range(substeps):
+            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
+
+
+@cached_njit()
+def pull_back(
+    states: Array, actions: Array, covectors: Array, table: Table, axes: Table, C: Array, B: Array,
+    constant: Array, substeps: int, on_states: Array, on_actions: Array,
+) -> None:  # fmt: skip
+    """Write the transposed products."""
+    components, n_x = C.shape[1], C.shape[2]
+    shape, h = (components, n_x), 1.0 / max(substeps, 1)
+    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    tape, k = np.empty((substeps, 4, components, n_x)), np.empty((4, components, n_x))
+    z, on_m, on_force = np.empty(shape), np.empty(n_x), np.empty(shape)
+    own, y, g = np.empty(shape), np.empty(shape), np.empty(shape)
+    total, flat, flat_own = np.empty(shape), z.reshape(z.size), own.reshape(own.size)
+    for m in range(len(states)):
+        copy(states[m], flat)
+        forcing(actions[m], B, constant, force)
+        for n in range(substeps):
+            runge_kutta(z, table, axes, C, force, h, tape[n], k, ring, value)
+        copy(covectors[m], flat_own)
+        on_force[:] = 0.0
+        if substeps == 0:
+            copy(flat_own, on_force.reshape(on_force.size))
+            transposed_rate(z, on_force, table, axes, C, ring, value, on_m, g)
+            for c in range(components):
+                for i in range(n_x):
+                    own[c, i] += g[c, i]
+        for n in range(substeps - 1, -1, -1):
+            g[:] = 0.0
+            copy(flat_own, total.reshape(total.size))
+            for stage in range(3, -1, -1):
+                weight = h / 6.0 if stage in (0, 3) else h / 3.0
+                reach = 0.0 if stage == 3 else (h if stage == 2 else 0.5 * h)
+                for c in range(components):
+                    for i in range(n_x):
+                        y[c, i] = weight * own[c, i] + reach * g[c, i]
+                        on_force[c, i] += y[c, i]
+                transposed_rate(tape[n, stage], y, table, axes, C, ring, value, on_m, g)
+                for c in range(components):
+                    for i in range(n_x):
+                        total[c, i] += g[c, i]
+            copy(total.reshape(total.size), flat_own)
+        copy(flat_own, on_states[m])
+        forces = on_force.reshape(on_force.size)
+        for j in range(B.shape[1]):
+            on_actions[m, j] = 0.0
+        for i in range(forces.size):
+            for j in range(B.shape[1]):
+                on_actions[m, j] += B[i, j] * forces[i]
+
+
+@cached_njit()
+def mean_features(
+    states: Array, actions: Array, after: Array, table: Table, axes: Table, C: Array, B: Array,
+    constant: Array, substeps: int, found: Array, miss: Array,
+) -> None:  # fmt: skip
+    """Write the features' means by the trapezoidal rule, and the misses."""
+    components, n_x = C.shape[1], C.shape[2]
+    shape = (components, n_x)
+    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
+    path, bent = np.empty((substeps + 1, components, n_x)), np.empty(shape)
+    z = np.empty(shape)
+    flat = z.reshape(z.size)
+    for m in range(len(states)):
+        copy(states[m], flat)
+        copy(flat, path[0].reshape(z.size))
+        forcing(actions[m], B, constant, force)
+        if substeps == 0:  # its features are those of its beginning
+            mapped(z, table, axes, C, force, ring, value, k[0])
+        for n in range(substeps):
+            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
+            copy(flat, path[n + 1].reshape(z.size))
+        end = after[m].reshape(shape)
+        for i in range(z.size):
+            miss[m, i] = after[m, i] - flat[i]
+        found[m] = 0.0
+        for n in range(substeps + 1):
+            weight, share = 1.0, 0.0
+            if substeps > 0:
+                weight = (0.5 if n in (0, substeps) else 1.0) / substeps
+                share = n / substeps
+            for c in range(components):
+                for i in range(n_x):
+                    bent[c, i] = path[n, c, i] + share * (end[c, i] - z[c, i])
+            for f in range(len(table)):
+                if table[f, -1] == 0:
+                    monomial(bent, table[f], ring)
+                difference(ring, table[f, -1], axes, value)
+                for i in range(n_x):
+                    found[m, f, i] += weight * value[i]

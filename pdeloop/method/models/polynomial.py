@@ -1,0 +1,312 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A polynomial model of a state that is no field on an axis, with products of state and action.
+
+With the components of the state scaled by their own standard deviations, y = (z - m) / s, orthonormal
+POD modes V of y, w = [V_q^T y; (a - m_a) / s_a] with the q leading ones, and all products of two of w,
+
+    z_{k+1} = z_k + s (c + A V^T y_k + B (a_k - m_a) / s_a + H (w_k x w_k)).
+
+A heater's I^2, a flow that carries a temperature, a conductance that a valve changes are such products.
+The scale makes the fit independent of units. The ridges of A and of H, and q, are those of the smallest
+error in predicting pieces of rollouts that were left out.
+
+References
+----------
+Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projection-based model
+reduction", CMAME 306, 2016.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement, product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array, read_only
+from pdeloop.method.models.base import Arrays, Samples, linearised, numbers_of, text_of
+from pdeloop.method.models.linear import add_products
+
+LARGEST_STATE = 256
+"""Numbers of a state up to which a polynomial is fitted."""
+LEADING = (4, 8, 12)
+"""Numbers q of modes in products that are tried."""
+LINEAR_RIDGES = (1e-8, 1e-5)
+PRODUCT_RIDGES = (1e-6, 1e-4, 1e-2)
+"""Relative to the mean squares of their columns."""
+_ACTION_RIDGE = 1e-8
+_PIECE, _PARTS = 25, 3
+"""Steps of a piece that is predicted, and parts of the rollouts, of which one is left out."""
+_ROUNDING = 1e-9
+"""Standard deviation of a component, relative to its mean, up to which it rests."""
+_FAR = 1e3
+"""Magnitude of a scaled state at which a prediction ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialModel:
+    """The model above.
+
+    Attributes
+    ----------
+    kind : str
+    V : (n_z, r) array
+        V^T diag(1/s): coordinates x = V^T (z - m).
+    centre : (n_z,) array
+        m.
+    action_centre, action_scale : (n_a,) arrays
+        m_a and s_a.
+    products : (p, 2) array of int
+        Pairs of numbers of [x; (a - m_a) / s_a] that are multiplied.
+    coefficients : (1 + r + n_a + p, n_z) array
+        Of [1; x; (a - m_a) / s_a; products], s included.
+    """
+
+    kind: str
+    V: Array
+    centre: Array
+    action_centre: Array
+    action_scale: Array
+    products: NDArray[np.int64]
+    coefficients: Array
+
+    @property
+    def n_z(self) -> int:
+        return len(self.centre)
+
+    @property
+    def n_a(self) -> int:
+        return len(self.action_scale)
+
+    def features(self, states: Array, actions: Array) -> Array:
+        """[1; x; (a - m_a) / s_a; products] of each row, (M, 1 + r + n_a + p)."""
+        r, n_a = self.V.shape[1], self.n_a
+        found = np.zeros((len(states), len(self.coefficients)))
+        found[:, 0] = 1.0
+        x = np.zeros((len(states), r))
+        add_products(read_only(states - self.centre), read_only(self.V), x)
+        found[:, 1 : 1 + r] = x
+        found[:, 1 + r : 1 + r + n_a] = (actions - self.action_centre) / self.action_scale
+        w = found[:, 1 : 1 + r + n_a]
+        found[:, 1 + r + n_a :] = w[:, self.products[:, 0]] * w[:, self.products[:, 1]]
+        return found
+
+    def step(self, states: Array, actions: Array) -> Array:
+        after = np.array(states, dtype=np.float64)
+        features = read_only(self.features(states, actions))
+        add_products(features, read_only(self.coefficients), after)
+        return after
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        r, n_a = self.V.shape[1], self.n_a
+        on_features = np.zeros((len(states), len(self.coefficients)))
+        add_products(read_only(covectors), read_only(self.coefficients.T), on_features)
+        w = self.features(states, actions)[:, 1 : 1 + r + n_a]
+        on_w = on_features[:, 1 : 1 + r + n_a].copy()
+        add_slopes(read_only(w), read_only(on_features[:, 1 + r + n_a :]), self.products, on_w)
+        on_states = np.array(covectors, dtype=np.float64)
+        add_products(read_only(on_w[:, :r]), read_only(self.V.T), on_states)
+        return on_states, on_w[:, r:] / self.action_scale
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        return linearised(self, state, action)
+
+    def arrays(self) -> Arrays:
+        names = ("V", "centre", "action_centre", "action_scale", "products", "coefficients")
+        texts = {"form": np.array("polynomial"), "kind": np.array(self.kind)}
+        return texts | {name: getattr(self, name) for name in names}
+
+    @staticmethod
+    def from_arrays(arrays: Arrays) -> PolynomialModel:
+        """The model of `arrays`."""
+        centre, scale = numbers_of(arrays, "centre", None), numbers_of(arrays, "action_scale", None)
+        V = numbers_of(arrays, "V", len(centre), None)
+        count = V.shape[1] + len(scale)
+        products = checked_array(arrays, "products", "i", (None, 2))
+        if products.size and not (products.min() >= 0 and products.max() < count):
+            raise ValueError(f"a model has products of numbers beyond its {count}")
+        if not (scale > 0.0).all():
+            raise ValueError("a model has a scale of actions that is not positive")
+        rows = 1 + count + len(products)
+        return PolynomialModel(
+            text_of(arrays, "kind"),
+            V,
+            centre,
+            numbers_of(arrays, "action_centre", len(scale)),
+            scale,
+            products,
+            numbers_of(arrays, "coefficients", rows, len(centre)),
+        )
+
+
+@cached_njit()
+def add_slopes(w: Array, on_products: Array, products: NDArray[np.int64], totals: Array) -> None:
+    """totals += (d products/dw)^T on_products, one row after the other."""
+    for m in range(len(w)):
+        for p in range(len(products)):
+            i, j = products[p, 0], products[p, 1]
+            totals[m, i] += on_products[m, p] * w[m, j]
+            totals[m, j] += on_products[m, p] * w[m, i]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled:
+    """Samples with their scales and modes, of which models of several ridges are made."""
+
+    samples: Samples
+    centre: Array
+    scale: Array
+    modes: Array
+    action_centre: Array
+    action_scale: Array
+
+    @staticmethod
+    def of(samples: Samples) -> _Scaled:
+        centre, action_centre = samples.before.mean(axis=0), samples.actions.mean(axis=0)
+        scale, action_scale = samples.before.std(axis=0), samples.actions.std(axis=0)
+        scale[scale <= _ROUNDING * np.abs(centre)] = np.inf  # a component that rests
+        action_scale[action_scale == 0.0] = 1.0
+        y = (samples.before - centre) / scale
+        values, vectors = linalg.eigh(y.T @ y)
+        kept = values[::-1] > 1e-12 * values[-1]
+        modes = np.ascontiguousarray(vectors[:, ::-1][:, kept])
+        return _Scaled(samples, centre, scale, modes, action_centre, action_scale)
+
+    def empty(self, kind: str, leading: int) -> PolynomialModel:
+        """The model without coefficients."""
+        r, n_a = self.modes.shape[1], len(self.action_scale)
+        numbers = [*range(min(leading, r)), *range(r, r + n_a)]
+        pairs = list(combinations_with_replacement(numbers, 2))
+        return PolynomialModel(
+            kind,
+            np.ascontiguousarray(self.modes / self.scale[:, None]),
+            self.centre,
+            self.action_centre,
+            self.action_scale,
+            np.array(pairs, dtype=np.int64).reshape(-1, 2),
+            np.zeros((1 + r + n_a + len(pairs), len(self.centre))),
+        )
+
+    def fits(
+        self, model: PolynomialModel, ridges: Sequence[tuple[float, float]]
+    ) -> list[PolynomialModel]:
+        """The model fitted with each pair of ridges, of the state and of products."""
+        r, n_a = model.V.shape[1], model.n_a
+        features = model.features(self.samples.before, self.samples.actions)
+        size = np.sqrt(np.mean(features**2, axis=0))
+        size[1 : 1 + r] = np.sqrt(np.mean(features[:, 1 : 1 + r] ** 2))  # small modes are held back
+        size[size == 0.0] = 1.0
+        features /= size
+        gram = features.T @ features / len(features)
+        change = (self.samples.after - self.samples.before) / self.scale
+        moment = features.T @ change / len(features)
+        found = []
+        for linear, of_products in ridges:
+            penalty = np.full(len(size), of_products)
+            penalty[0], penalty[1 : 1 + r], penalty[1 + r : 1 + r + n_a] = (
+                0.0,
+                linear,
+                _ACTION_RIDGE,
+            )
+            matrix = gram.copy()
+            matrix[np.diag_indices(len(size))] += penalty + 1e-13
+            solved = linalg.solve(matrix, moment, assume_a="pos") / size[:, None]
+            solved *= np.where(np.isfinite(self.scale), self.scale, 0.0)
+            found.append(
+                PolynomialModel(
+                    model.kind,
+                    model.V,
+                    model.centre,
+                    model.action_centre,
+                    model.action_scale,
+                    model.products,
+                    np.ascontiguousarray(solved),
+                )
+            )
+        return found
+
+
+def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
+    """The polynomial that predicts pieces of rollouts best that it was not fitted to."""
+    n_z = samples.before.shape[1]
+    if n_z > LARGEST_STATE or len(samples) < 4 * _PARTS:
+        return None
+    cuts = _pieces(samples)
+    ridges = list(product(LINEAR_RIDGES, PRODUCT_RIDGES))
+    leading = [q for i, q in enumerate(LEADING) if not i or LEADING[i - 1] < n_z]
+    errors = np.zeros((len(leading), len(ridges)))
+    for part in range(_PARTS):
+        own = [cut for i, cut in enumerate(cuts) if i % _PARTS == part]
+        others = [cut for i, cut in enumerate(cuts) if i % _PARTS != part]
+        if not own or not others:
+            return None
+        rest = np.concatenate([np.arange(begin, end) for begin, end in others])
+        data = _Scaled.of(_rows(samples, rest))
+        pieces = _Pieces.of(samples, own, data.scale)
+        for i, q in enumerate(leading):
+            for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
+                errors[i, j] += _error(model, pieces, data.scale)
+    i, j = divmod(int(np.argmin(errors)), len(ridges))
+    data = _Scaled.of(samples)
+    return data.fits(data.empty(kind, leading[i]), [ridges[j]])[0]
+
+
+def _rows(samples: Samples, rows: NDArray[np.int64]) -> Samples:
+    return Samples(samples.before[rows], samples.actions[rows], samples.after[rows])
+
+
+def _pieces(samples: Samples) -> list[tuple[int, int]]:
+    """Begin and end of rows that follow each other in time, at most `_PIECE` long."""
+    joined = (samples.after[:-1] == samples.before[1:]).all(axis=1)
+    cuts, begin = [], 0
+    for end in range(1, len(samples) + 1):
+        if end == len(samples) or not joined[end - 1] or end - begin == _PIECE:
+            cuts.append((begin, end))
+            begin = end
+    return cuts
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """What is measured along pieces of rollouts that models predict.
+
+    first: their beginnings (n, n_z); steps: for each the pieces that are as long, their actions and the
+    states after it; size: the sum of their mean squared scaled changes (n,).
+    """
+
+    first: Array
+    steps: list[tuple[NDArray[np.int64], Array, Array]]
+    size: Array
+
+    @staticmethod
+    def of(samples: Samples, cuts: Sequence[tuple[int, int]], scale: Array) -> _Pieces:
+        begins, ends = np.array(cuts).T
+        first, size = samples.before[begins], np.zeros(len(cuts))
+        steps = []
+        for k in range(int((ends - begins).max())):
+            alive = np.flatnonzero(begins + k < ends)
+            after = samples.after[begins[alive] + k]
+            steps.append((alive, samples.actions[begins[alive] + k], after))
+            with np.errstate(all="ignore"):
+                size[alive] += np.mean(((after - first[alive]) / scale) ** 2, axis=1)
+        return _Pieces(first, steps, size)
+
+
+def _error(model: PolynomialModel, pieces: _Pieces, scale: Array) -> float:
+    """Mean square of the scaled error over pieces, relative to their change; at most 1 a piece."""
+    z, error = pieces.first.copy(), np.zeros(len(pieces.first))
+    with np.errstate(all="ignore"):
+        for alive, actions, measured in pieces.steps:
+            after = model.step(z[alive], actions)
+            error[alive] += np.mean(((after - measured) / scale) ** 2, axis=1)
+            z[alive] = after
+            far = ~(np.abs(z / scale).max(axis=1) < _FAR)
+            if far.any():
+                error[far], z[far] = np.inf, pieces.first[far]
+        relative = np.nan_to_num(error / pieces.size, nan=1.0, posinf=1.0)
+    return float(np.minimum(relative, 1.0).mean())

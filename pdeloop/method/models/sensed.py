@@ -1,0 +1,397 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A partial differential equation of a field of which a few points are measured.
+
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a
+            + sum_{p = 1}^3 r_p(x) z^p + d(w(x) z)/dx + d(D(x) dz/dx)/dx,
+                    B_i(x) = (b + b_i) 1[|x - x_i| < w_i/2],
+                    x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a,    w_i = q_i + w / n_a
+
+on a periodic domain of length 1, with time in sampling times and the declared centres p_i and widths
+q_i of the actuators. r_p, w and D are sums of the first two cosines and sines, and zero where constant
+coefficients reproduce the readings. There are a few dozen unknowns and one for each actuator, however
+fine the grid. `pdeloop.method.models.sensed_fit` finds them.
+
+A sampling time has internal steps, the more the larger the field: a front moves through several grid
+points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import scipy  # whose transforms, a tenth of a start, load when they are used
+from numpy.typing import NDArray
+
+from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.base import Arrays, numbers_of
+from pdeloop.method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    EQUATION,
+    SHARED,
+    TERMS,
+    VARIATIONS,
+    unknowns_of,
+)
+from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.models.spectral_fit import fewer_of, substeps_of
+from pdeloop.method.models.symbols import ORDERS
+from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
+
+Spectrum = NDArray[np.complex128]
+
+KIND = "sensed"
+# The wavenumber and the number of samples that give the coefficients and actuators their units.
+_WAVENUMBER = 2.0 * np.pi * 8
+_TIME = 100.0
+# The size of the field that does so above the third power.
+_SIZE = 4.0
+WAVES = 16
+"""Cosines and sines of an initial field, in addition to its mean."""
+# The least number of grid points.
+_POINTS = 64
+
+
+def grid_points(sensors: int) -> int:
+    """Number of grid points of the field, so that the sensors at (j + 1/2) / n_y are among them."""
+    return 2 * sensors * max(1, -(-_POINTS // (2 * sensors)))
+
+
+def interpolated(readings: Array) -> Array:
+    """The field (n,) of lowest wavenumbers with these readings (n_y,)."""
+    sensors = len(readings)
+    n = grid_points(sensors)
+    spectrum = scipy.fft.rfft(readings)
+    if sensors % 2 == 0:  # half of its last wavenumber is that of minus the wavenumber
+        spectrum[-1] *= 0.5
+    field: Array = scipy.fft.irfft(spectrum / (sensors / n), n=n)
+    return np.roll(field, n // (2 * sensors))
+
+
+@dataclass(frozen=True, eq=False)
+class Actuators:
+    """What is declared of the actuators.
+
+    Attributes
+    ----------
+    centres : (n_a,) array
+        p_i, as shares of the domain.
+    widths : (n_a,) array
+        q_i, as shares of the domain; 0: not declared, and half of the domain divided among them.
+        Readings hardly tell it, as an actuator between two sensors looks weaker as well as narrower.
+    """
+
+    centres: Array
+    widths: Array
+
+    @property
+    def declared(self) -> bool:
+        """True if all widths are."""
+        return bool(self.widths.all())
+
+    @property
+    def known_widths(self) -> Array:
+        """q_i, also where it is not declared."""
+        return np.where(self.widths > 0.0, self.widths, 0.5 / len(self.centres))
+
+
+@dataclass(frozen=True, eq=False)
+class SensedModel(SpectralModel):
+    """The equation on a grid of which every so many points are sensors.
+
+    Attributes
+    ----------
+    shared : (44 + n_a,) array
+        Its unknowns, in their units.
+    actuators : Actuators
+        What is declared of them.
+    sensors : int
+        n_y.
+    noise : float
+        Standard deviation of the unpredicted part of a reading, including noise.
+    spread : (33,) array
+        Standard deviations of the Fourier coefficients of an initial field: its mean, cosines, sines.
+    largest : float
+        Largest |z| that is simulated.
+    """
+
+    shared: Array = field(kw_only=True)
+    actuators: Actuators = field(kw_only=True)
+    sensors: int = field(kw_only=True)
+    noise: float = field(default=0.0, kw_only=True)
+    spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
+    largest: float = field(default=0.0, kw_only=True)
+
+    @property
+    def seen(self) -> slice:
+        """The grid points that are sensors."""
+        every = self.n_z // self.sensors
+        return slice(every // 2, None, every)
+
+    def at_sensors(self, rows: Array) -> Array:
+        """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
+        found = np.zeros((self.n_z, rows.shape[1]))
+        found[self.seen] = rows
+        return found
+
+    def arrays(self) -> Arrays:
+        own = {
+            "form": np.array("sensed"),
+            "shared": self.shared,
+            "centres": self.actuators.centres,
+            "widths": self.actuators.widths,
+            "sensors": np.array(self.sensors),
+            "noise": np.array(self.noise),
+            "spread": self.spread,
+            "largest": np.array(self.largest),
+        }
+        return super().arrays() | own
+
+    @staticmethod
+    def from_arrays(arrays: Arrays) -> SensedModel:
+        """The model of `arrays`."""
+        whole = SpectralModel.from_arrays(arrays)
+        sensors = int(checked_array(arrays, "sensors", "i", ()))
+        if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
+            raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
+        return SensedModel(
+            **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
+            shared=unknowns_of(arrays, "shared", whole.n_a),
+            actuators=Actuators(
+                numbers_of(arrays, "centres", whole.n_a), _widths_of(arrays, whole.n_a)
+            ),
+            sensors=sensors,
+            noise=float(checked_array(arrays, "noise", "f", ())),
+            spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
+            largest=float(checked_array(arrays, "largest", "f", ()))
+            if "largest" in arrays
+            else 0.0,
+        )
+
+
+def _widths_of(arrays: Arrays, n_a: int) -> Array:
+    """The widths of `arrays`; older ones have one for all actuators, or none."""
+    if "widths" in arrays:
+        widths = numbers_of(arrays, "widths", n_a)
+    else:
+        width = float(checked_array(arrays, "width", "f", ())) if "width" in arrays else 0.0
+        widths = np.full(n_a, width)
+    if (widths < 0.0).any():
+        raise ValueError(
+            f"a model has actuators of the width {widths.min():g}; expected at least 0"
+        )
+    return widths
+
+
+def sensed_model(
+    shared: Array,
+    sensors: int,
+    actuators: Actuators,
+    largest: float,
+    settings: FieldModelSettings = DEFAULTS,
+    noise: float = 0.0,
+) -> SensedModel:
+    """The equation on the grid for this many sensors.
+
+    Parameters
+    ----------
+    shared : (44 + n_a,) array
+        The unknowns that all rollouts share, in their units.
+    sensors : int
+        n_y.
+    actuators : Actuators
+        What is declared of them.
+    largest : float
+        Largest |z| that is simulated; the internal steps follow it.
+    settings : FieldModelSettings
+        How they do.
+    noise : float
+        As for `SensedModel`.
+    """
+    n = grid_points(sensors)
+    equation = SensedEquation(shared, n, actuators, settings)
+    symbols, followed = equation.symbols, equation.followed(largest)
+    substeps = substeps_of(followed, largest, settings)
+    fewer = fewer_of(followed, largest, substeps, settings)
+    if equation.coefficients is not None:
+        rates = equation.varying_rates(np.append(fewer[:, 0], largest)) / settings.reach
+        most = settings.substeps
+        more = np.ceil(np.minimum(np.nan_to_num(rates, nan=most), most))
+        substeps = min(substeps + int(more[-1]), settings.substeps)
+        fewer = np.column_stack([fewer[:, 0], fewer[:, 1] + more[:-1]])
+        fewer = fewer[fewer[:, 1] < substeps]
+    return SensedModel(
+        KIND,
+        symbols[0],
+        symbols[1:],
+        np.eye(len(symbols) - 1),
+        equation.supports * equation.strengths,
+        np.full(n, equation.constant),
+        substeps=substeps,
+        fewer=fewer,
+        factors=equation.factors,
+        coefficients=equation.coefficients,
+        shared=shared,
+        actuators=actuators,
+        sensors=sensors,
+        noise=noise,
+        largest=largest,
+    )
+
+
+class SensedEquation:
+    """The equation in Fourier space, for unknowns (44 + n_a,)."""
+
+    def __init__(
+        self,
+        shared: Array,
+        n: int,
+        actuators: Actuators,
+        settings: FieldModelSettings = DEFAULTS,
+    ) -> None:
+        derivatives, self._settings = _derivatives(n), settings
+        used = [i for i in range(len(TERMS)) if shared[i]]
+        degree = max(3, *(TERMS[i][0] for i in used), 0)
+        self.symbols: Spectrum = np.zeros((degree, n // 2 + 1), dtype=np.complex128)
+        """Of the powers 1, 2, ... of the field."""
+        for i in used:
+            p, j = TERMS[i]
+            wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
+            unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
+            self.symbols[p - 1] += unit * shared[i] * derivatives[j]
+        of_x = shared[len(TERMS) : EQUATION]
+        self.factors: Spectrum | None = None
+        self.coefficients: Array | None = None
+        """Of terms whose coefficients depend on x, (3, modes) and (3, degree, n); None: without."""
+        if of_x.any():
+            self.factors = np.stack(derivatives[:3])
+            self.coefficients = _coefficients(n, degree, of_x.tobytes())
+        self._fourth = bool(shared[TERMS.index((1, 4))])
+        # What grows faster would overflow within an episode.
+        grown = self.symbols[0]
+        self.symbols[0] = np.minimum(grown.real, settings.sensed_growth) + 1j * grown.imag
+        self.constant = float(shared[COEFFICIENTS - 1]) / _TIME
+        b, x_0, s, w = shared[COEFFICIENTS:SHARED] / _TIME
+        self.strengths: Array = b + shared[SHARED:] / _TIME
+        centres = np.asarray(actuators.centres, dtype=np.float64)
+        where = centres.tobytes(), actuators.known_widths.tobytes()
+        self.supports: Array = _supports(n, *where, float(x_0), float(s), float(w))
+        """Of actuators of strength 1, (n, n_a)."""
+
+    def substeps(self, sizes: Array) -> NDArray[np.int64]:
+        """Internal steps for fields of these sizes."""
+        symbols = self.followed(float(sizes.max()))[1:, : 2 * self.symbols.shape[1] // 3]
+        rates = _rates(symbols, sizes).max(axis=1) + self.varying_rates(sizes)
+        most = self._settings.substeps
+        steps = np.nan_to_num(np.ceil(rates / self._settings.reach), nan=most)
+        return np.asarray(np.clip(steps, 1, most), dtype=np.int64)
+
+    def varying_rates(self, sizes: Array) -> Array:
+        """How fast the terms whose coefficients depend on x act on fields of these sizes, at most."""
+        if self.factors is None or self.coefficients is None:
+            return np.zeros(len(sizes))
+        waves = np.abs(self.factors[:, : 2 * self.symbols.shape[1] // 3]).max(axis=1)
+        rates, z = waves @ np.abs(self.coefficients).max(axis=2), np.abs(sizes)
+        found: Array = sum(
+            p * rate * z ** (p - 1) for p, rate in enumerate(rates.tolist(), start=1)
+        )
+        return found
+
+    def followed(self, size: float) -> Spectrum:
+        """The symbols whose rates, for fields of this size, the internal steps follow.
+
+        Short waves that a fourth derivative damps faster than the powers drive them follow long ones.
+        """
+        if not self._fourth:
+            return self.symbols
+        damped = _rates(self.symbols[1:], np.array([size]))[0] <= -self.symbols[0].real
+        found: Spectrum = np.where(damped, 0.0, self.symbols)
+        found[0] = self.symbols[0]
+        return found
+
+    def compiled(self, substeps: int, supports: Array, clip: float = np.inf) -> PolynomialStep:
+        """The step, with these internal steps and supports, and a constant forcing of 1.
+
+        clip: z is cut to it in powers above the first, and where coefficients depend on x, so that a
+        wrong equation is far off but finite.
+        ValueError if the unknowns are not finite.
+        """
+        equation = Polynomials(
+            self.symbols[0],
+            self.symbols[1:],
+            np.eye(len(self.symbols) - 1),
+            supports,
+            np.ones(len(supports)),
+            substeps,
+            clip,
+            self.factors,
+            self.coefficients,
+        )
+        return PolynomialStep(equation)
+
+
+# A fit varies one unknown after the other, most of which do not move the actuators.
+@lru_cache(maxsize=16)
+def _supports(n: int, centres: bytes, widths: bytes, x_0: float, s: float, w: float) -> Array:
+    """Of actuators of strength 1, (n, n_a), with these declared centres and widths."""
+    waves, declared = np.arange(n // 2 + 1), np.frombuffer(centres)
+    n_a = len(declared)
+    places = declared + x_0 + (np.arange(n_a) - 0.5 * (n_a - 1)) * s / n_a
+    width = (np.frombuffer(widths) + w / n_a)[:, None]
+    # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
+    shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
+    shifted = n * shape * np.exp(-2j * np.pi * waves * places[:, None])
+    found: Array = np.fft.irfft(shifted, n).T
+    found.setflags(write=False)  # it is shared
+    return found
+
+
+@lru_cache(maxsize=64)
+def _coefficients(n: int, degree: int, of_x: bytes) -> Array:
+    """Those that depend on x, of d^j(z^p)/dx^j on the grid, (3, degree, n), j = 0, 1, 2.
+
+    d(D dz/dx)/dx = d^2(D z)/dx^2 - d(D' z)/dx.
+    """
+    x, found = 2.0 * np.pi * np.arange(n) / n, np.zeros((3, degree, n))
+    for (p, j, m, sine), own in zip(VARIATIONS, np.frombuffer(of_x), strict=True):
+        size = own / (_TIME * _WAVENUMBER**j)
+        found[j, p - 1] += size * (np.sin(m * x) if sine else np.cos(m * x))
+        if j == 2:
+            slope = np.cos(m * x) if sine else -np.sin(m * x)
+            found[1, p - 1] -= 2.0 * np.pi * m * size * slope
+    found.setflags(write=False)  # it is shared
+    return found
+
+
+@lru_cache(maxsize=16)
+def _derivatives(n: int) -> list[Spectrum]:
+    """The symbols of the derivatives of all orders that a term may have."""
+    waves = np.arange(n // 2 + 1)
+    first = 2j * np.pi * waves
+    first[waves == n // 2] = 0.0
+    return [np.asarray(first**j, np.complex128) for j in range(max(ORDERS) + 1)]
+
+
+def _rates(symbols: Spectrum, sizes: Array) -> Array:
+    """How fast powers of these symbols, above the first, act on each wave of fields of these sizes."""
+    z, found = sizes[:, None], np.zeros((len(sizes), symbols.shape[1]))
+    for p, own in enumerate(symbols, start=2):
+        found += np.abs(p * z ** (p - 1) * own)
+    return found
+
+
+def field_of(coefficients: Array, n: int) -> Array:
+    """The fields on n points of Fourier coefficients (..., 33)."""
+    z = np.zeros((*coefficients.shape[:-1], n // 2 + 1), dtype=np.complex128)
+    z[..., : WAVES + 1] = coefficients[..., : WAVES + 1]
+    z[..., 1 : WAVES + 1] += 1j * coefficients[..., WAVES + 1 :]
+    return n * np.fft.irfft(z, n)
+
+
+def coefficients_of(fields: Array) -> Array:
+    """The Fourier coefficients (..., 33) of fields (..., n) on a grid."""
+    z = np.fft.rfft(fields)[..., : WAVES + 1] / fields.shape[-1]
+    return np.concatenate([z.real, z.imag[..., 1:]], axis=-1)

@@ -1,0 +1,144 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The constants of the models of the whole field: how they are fitted, and how a kind is chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pdeloop.method.settings import Settings, setting
+
+FIRST_SUBSTEPS = 6
+"""Internal steps of the first pass of a fit."""
+COEFFICIENT_RIDGE = 1e-9
+"""Ridge of the normal equations in normalised columns."""
+POINT_SAMPLES = 800
+"""Maximum number of data steps in a fit of finite differences."""
+SPARSE_TERMS = 8
+"""Maximum number of products for each number."""
+LEAST_CORRECTION = 0.02
+"""Minimum share of an innovation that corrects a filtered state."""
+FAR = 1e3
+"""Multiple of the largest measured value beyond which a prediction is discarded."""
+NOISE_MISJUDGED = 2.0
+"""Ratio of the noise in the data to the declared noise, or its inverse, from which they count as
+different."""
+SENSED_REPRODUCED = 0.05
+"""Maximum error of an equation that is used."""
+SENSED_HOPELESS = 0.1
+"""Error over any part of the rollouts at which a start of the fit is abandoned."""
+SENSED_ENOUGH = 1e-5
+"""Error at which no other dispersion is tried as a start."""
+SENSED_HELD_RIDGE = 0.1
+"""Ridge of the positions of actuators with measurement noise, until whole rollouts are fitted."""
+SENSED_ALIKE_CHI = 4.0
+"""Fall of an error, in standard deviations of the noise in it, from which a difference counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldModelSettings(Settings):
+    """Constants of fitting and choosing models of the whole field.
+
+    All are dimensionless: fields, inputs and time are scaled by the data. E is the squared error of
+    a simulated rollout over the sum of |z - z_r|^2.
+    """
+
+    # The choice of a kind.
+    reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
+    reproduced_noisy: float = setting(
+        0.05,
+        "its largest value with measurement noise, which leaves initial states uncertain",
+        0,
+        1,
+    )
+    better: float = setting(
+        3.0,
+        "how many times smaller the E of a kind with more unknowns must be for it to be selected",
+        1,
+        100,
+    )
+    folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
+    worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
+    dense: int = setting(
+        512,
+        "largest state for the kinds whose cost grows with its square, and for models of neighbours",
+        2,
+        65536,
+    )
+    largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
+    # Spectral models.
+    passes: int = setting(
+        12,
+        "number of times that an equation is refitted along the paths of the previous fit",
+        1,
+        20,
+    )
+    samples: int = setting(500, "maximum number of data steps in a fit", 50, 1_000_000)
+    substeps: int = setting(64, "maximum number of internal steps per sampling time", 1, 1000)
+    reach: float = setting(
+        1.5, "fastest nonlinear rate times the internal step; ETDRK4 is stable up to 2.8", 0.1, 2.8
+    )
+    clip: float = setting(
+        1.2, "bound on z in powers above the third, relative to the largest measured value", 1, 10
+    )
+    # Finite-difference, convolution and low-rank models.
+    point_substeps: int = setting(32, "as `substeps`, for finite-difference models", 2, 1000)
+    near_samples: int = setting(400, "as `samples`, for models of neighbours", 50, 1_000_000)
+    near_reach: float = setting(
+        0.5, "as `reach`, for models of neighbours, whose rule is of order 4", 0.1, 2.8
+    )
+    coarse_points: int = setting(
+        256,
+        "maximum number of grid points of finite-difference models on several axes; every n-th "
+        "point is used on finer grids",
+        16,
+        65536,
+    )
+    # The field between few sensors. "Error" is the squared error of simulated readings over their sum
+    # of squares, without the share of the noise.
+    sensed_most: int = setting(
+        32, "maximum number of point sensors between which a field is estimated", 1, 1000
+    )
+    sensed_unresolved: float = setting(
+        0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
+    )
+    sensed_varying: float = setting(
+        3e-4,
+        "error of an equation with constant coefficients, fitted from nothing, above which "
+        "coefficients that depend on x are tried",
+        0,
+        1,
+    )
+    sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
+    sensed_starts: int = setting(
+        8, "maximum number of sets of a few rollouts from which an equation is looked for", 1, 1000
+    )
+    sensed_again: int = setting(
+        2,
+        "further fits with measurement noise, each with the spread of waves that the last one implies",
+        0,
+        100,
+    )
+    sensed_iterations: int = setting(
+        20, "maximum number of iterations of a fit over a part of the rollouts", 1, 1000
+    )
+    sensed_last_iterations: int = setting(60, "the same over whole rollouts", 1, 1000)
+    sensed_compared: int = setting(
+        100, "maximum number of time steps whose readings are compared", 2, 1_000_000
+    )
+    sensed_growth: float = setting(
+        0.5, "maximum growth of a wave per sampling time, as an exponent of e", 0, 10
+    )
+    sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
+    sensed_alike_ridge: float = setting(
+        1e-2, "ridge of these differences while the actuators are held close to one strength", 0, 1
+    )
+    sensed_unequal: float = setting(
+        1.0, "prior standard deviation of the differences in strength between actuators", 1e-6, 1e12
+    )
+    sensed_alike_unequal: float = setting(0.1, "the same while they are held close", 1e-6, 1e12)
+    sensed_learning: int = setting(
+        5, "maximum number of iterations towards the most likely spread of waves", 0, 100
+    )
+
+
+DEFAULTS = FieldModelSettings()

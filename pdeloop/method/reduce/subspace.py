@@ -1,0 +1,385 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A model in innovation form from measurements: predictor-based subspace identification.
+
+    x_{k+1} = A x_k + B a_k + G e_k,        y_k = U (C x_k + e_k)
+
+U holds the first r POD modes of the measurements z_k, at most as many as the order n. The innovations
+e_k are the part of a measurement that the past does not predict, so the model is its own steady-state
+filter. The state is defined by the prediction of the future from the past:
+
+1. A vector ARX of p steps, by ridge regression whose weight generalised cross-validation chooses,
+
+       U^T z_k = sum_{i <= p} X_i [a_{k-i}; U^T z_{k-i}] + e_k,
+
+   has as coefficients the Markov parameters X_i = C (A - G C)^{i-1} [B G] of the predictor.
+2. They give the prediction of the next p measurements from the last p steps. Its leading n directions
+   over the data, by a singular value decomposition, are the state, with the second moment I.
+3. C, and A and B, by least squares on these states. G is the gain of the Kalman filter with the
+   covariances of both residuals; its Riccati equation makes it stable.
+
+p and n are those of the least error in predicting held-out measurements one step ahead.
+
+References
+----------
+Chiuso, "The role of vector autoregressive modeling in predictor-based subspace identification",
+Automatica 43(6), 2007 (1 to 3). Golub, Heath, Wahba, Technometrics 21(2), 1979 (generalised
+cross-validation).
+Van der Veen, van Wingerden, Bergamasco, Lovera, Verhaegen, "Closed-loop subspace identification
+methods: an overview", IET Control Theory & Applications 7(10), 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce.channels import NUMBERED, Channels
+from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
+from pdeloop.method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
+from pdeloop.process.one_thread import one_thread
+
+_SUBSPACE_TOLERANCE = 1.02
+"""Multiple of the least held-out error up to which a lower order is chosen."""
+
+PASTS = (1, 2, 3, 4, 6, 8)
+"""Steps p of the vector ARX that are tried."""
+LONGER = (12, 16)
+"""Those that are tried as well for more than `MANY` states, or where no order is given.
+
+Waves that hardly decay need many states, and a long past to tell them from noise."""
+ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Orders that are tried where none is given."""
+MANY = 48
+"""The order above which `LONGER` pasts are tried."""
+FOLDS = 4
+"""Parts of the trajectories, each held out once."""
+RESOLVED = 1e-10
+"""Least singular value of the prediction from the past, relative to the largest."""
+LEAST = 1e-8
+"""Least variance of an innovation, relative to that of the measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class InnovationModel:
+    """A model in innovation form.
+
+    Attributes
+    ----------
+    A, B, C, G : (n, n), (n, n_a), (r, n) and (n, r) arrays
+    U : (n_z, r) array
+        Orthonormal columns; U^T z is predicted by C x.
+    innovations : (r, r) array
+        Covariance of e.
+    past : int
+        p.
+    error : float
+        Of predicting held-out measurements one step ahead, relative to their changes in a step; NaN
+        where past and order were given.
+    d : (n,) array or None
+        The constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data.
+    tried : tuple of (p, n, error)
+        Those among which it was chosen.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    G: Array
+    U: Array
+    innovations: Array
+    past: int
+    error: float = np.nan
+    d: Array | None = None
+    tried: tuple[tuple[int, int, float], ...] = ()
+
+
+def subspace_model(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    order: int = 0,
+    past: int = 0,
+    channels: Channels = NUMBERED,
+    constant: bool = False,
+) -> InnovationModel:
+    """Identify a model in innovation form.
+
+    Parameters
+    ----------
+    trajectories : sequence of (measurements (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}. All numbers of z may be of a few points only.
+    order : int
+        n, or less where the data do not determine as many; 0: that of the least error on held-out data.
+    past : int
+        p; 0: that of the least error.
+    channels : Channels
+        Names of states and inputs in error messages.
+    constant : bool
+        Identify the model about the means of measurements and inputs, from which its constant term
+        follows: degrees and per cent of a machine at rest are then no mode that never decays.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity, or data that do not determine a model.
+    """
+    data = steps_of(trajectories)
+    copies = repeated(trajectories)
+    known = [
+        (np.asarray(z, dtype=np.float64), np.asarray(a, dtype=np.float64))
+        for number, (z, a) in enumerate(trajectories)
+        if number not in copies
+    ]
+    means = np.zeros(data.after.shape[1]), np.zeros(data.inputs.shape[1])
+    if constant:
+        means = data.after.mean(axis=0), data.inputs.mean(axis=0)
+        known = [(z - means[0], a - means[1]) for z, a in known]
+    with one_thread():
+        few = 0 < order <= MANY
+        pasts = (past,) if past else PASTS if few else PASTS + LONGER
+        # The data may not determine as many states as were asked for.
+        asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)] or [ORDERS]
+        for asked in asked_for:
+            if tried := [(p, n) for p in pasts for n in asked if _determined(p, n, known)]:
+                break
+        else:
+            n_a = data.inputs.shape[1]
+            raise NotIdentifiableError(
+                f"{len(data.inputs)} steps do not determine a model with {n_a} inputs in innovation "
+                f"form: expected more than {n_a + 1} after the first ones of every part, while a "
+                "quarter is held out; take a longer horizon, or add a log"
+            )
+        if len(tried) == 1:
+            (p, n), errors = tried[0], [np.nan]
+        else:
+            p, n, errors = _choose(tried, known)
+        error = errors[tried.index((p, n))]
+        found = _fitted(known, p, n, channels, error, constant=constant)
+        table = tuple((*sizes, own) for sizes, own in zip(tried, errors, strict=True))
+        found = replace(found, tried=table)
+        if found.d is None:
+            return found
+        # The state of the mean measurement is the least one.
+        x = linalg.pinv(found.C) @ (found.U.T @ means[0])
+        return replace(found, d=found.d + x - found.A @ x - found.B @ means[1])
+
+
+def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
+    """True if p steps can show n states, and there are more samples than unknowns in a row.
+
+    They are those after p steps, while a quarter of the data is held out.
+    """
+    n_z, n_a = known[0][0].shape[1], known[0][1].shape[1]
+    parts = _parts(known)
+    held = max(sum(max(len(a) - p, 0) for _, a in parts[i::FOLDS]) for i in range(FOLDS))
+    samples = sum(max(len(a) - p, 0) for _, a in parts) - held
+    return bool(n <= p * min(n, n_z) and n + n_a < samples)
+
+
+def _choose(
+    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory]
+) -> tuple[int, int, list[float]]:
+    """p and n with the least error on parts that were held out, and the errors of all."""
+    parts = _parts(known)
+    totals, changes = np.zeros(len(tried)), np.zeros(len(tried))
+    for fold in range(FOLDS):
+        others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
+        own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
+        made, predictor = (0, 0), None
+        for i, (p, n) in enumerate(tried):
+            if not np.isfinite(totals[i]):
+                continue
+            # More states than there are readings have one predictor in common, one after the other.
+            size = p, min(n, parts[0][0].shape[1])
+            try:
+                if size != made or predictor is None:
+                    made, predictor = size, _predictor(others, *size, NUMBERED)
+                model = _fitted(others, p, n, NUMBERED, np.nan, check=False, predictor=predictor)
+            except (linalg.LinAlgError, ValueError):
+                totals[i] = np.inf
+                continue
+            for z, a in own:
+                wrong, moved = _missed(model, z, a)
+                totals[i], changes[i] = totals[i] + wrong, changes[i] + moved
+    ratios = np.divide(totals, changes, out=np.full(len(tried), np.inf), where=changes > 0.0)
+    errors = np.sqrt(ratios)
+    if not np.isfinite(errors).any():
+        return (*tried[0], [np.nan] * len(tried))
+    good = [i for i in range(len(tried)) if errors[i] <= _SUBSPACE_TOLERANCE * errors.min()]
+    least = min(tried[i][1] for i in good)
+    best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
+    return (*tried[best], errors.tolist())
+
+
+def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
+    """At least as many as there are folds, of one trajectory its quarters."""
+    if len(known) >= FOLDS:
+        return list(known)
+    cut: list[Trajectory] = []
+    for z, a in known:
+        edges = np.linspace(0, len(a), FOLDS + 1).astype(int)
+        cut += [(z[b : e + 1], a[b:e]) for b, e in pairwise(edges) if e > b]
+    return cut
+
+
+def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
+    """Sums of squares of the filter's one-step errors, and of the changes in a step.
+
+    The first steps, eight at most, are the filter's to find the state.
+    """
+    begin = min(max(PASTS), len(a) // 2)
+    y = z @ model.U
+    outside = z - y @ model.U.T
+    x = linalg.pinv(model.C) @ y[0]
+    wrong = moved = 0.0
+    for k in range(len(a)):
+        x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x)
+        if k >= begin:
+            e = y[k + 1] - model.C @ x
+            wrong += float(e @ e) + float(outside[k + 1] @ outside[k + 1])
+            change = z[k + 1] - z[k]
+            moved += float(change @ change)
+    return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
+
+
+@dataclass(frozen=True, eq=False)
+class _Predictor:
+    """The vector ARX of p steps of trajectories, and the states that its past gives.
+
+    U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last ones of each trajectory; last
+    (N,), which are the last of a trajectory; future (N, p r), the next p measurements that the past
+    predicts, and their directions over the data with their singular values.
+    """
+
+    U: Array
+    y: Array
+    inputs: Array
+    last: NDArray[np.bool_]
+    future: Array
+    directions: Array
+    values: Array
+
+    def states(self, n: int) -> Array:
+        """The leading n states, of second moment I; at least r, and no more than are determined."""
+        known = int(np.count_nonzero(self.values > RESOLVED * self.values[0]))
+        kept = max(self.U.shape[1], min(n, known))
+        found: Array = self.future @ (self.directions[:, :kept] / self.values[:kept])
+        return found
+
+
+def _predictor(known: Sequence[Trajectory], p: int, r: int, channels: Channels) -> _Predictor:
+    """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread."""
+    after = np.concatenate([z[1:] for z, _ in known])
+    values = linalg.svdvals(after)
+    floor = max(after.shape) * np.finfo(np.float64).eps * values[0]
+    r = min(r, int(np.count_nonzero(values > floor)))
+    U, _ = leading_modes(after, max(r, 1), channels)
+    regressors, targets, firsts = [], [], []
+    for z, a in known:
+        if len(a) < p:
+            continue
+        w = np.hstack([a, z[:-1] @ U])
+        rows = np.stack([w[k - p : k].ravel() for k in range(p, len(a) + 1)])
+        regressors.append(rows)
+        targets.append(z[p:] @ U)
+        firsts.append(a[p:])
+    if not regressors:
+        raise ValueError(f"no trajectory has {p} steps")
+    past, y = np.concatenate(regressors), np.concatenate(targets)
+    unit = np.sqrt(np.mean(past**2, axis=0))
+    unit[unit == 0.0] = 1.0
+    markov = _ridge(past / unit, y).T / unit
+    last = np.zeros(len(past), dtype=bool)
+    last[np.cumsum([len(rows) for rows in regressors]) - 1] = True
+    return _Predictor(U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
+
+
+def _fitted(
+    known: Sequence[Trajectory],
+    p: int,
+    n: int,
+    channels: Channels,
+    error: float,
+    *,
+    check: bool = True,
+    constant: bool = False,
+    predictor: _Predictor | None = None,
+) -> InnovationModel:
+    """The model of given sizes. Call it with one LAPACK thread.
+
+    predictor: that of these trajectories, p and r, if it is known.
+    """
+    if predictor is None:
+        predictor = _predictor(known, p, n, channels)
+    y, last = predictor.y, predictor.last
+    if len(y) <= n:
+        raise ValueError(f"{len(y)} samples do not determine {n} states")
+    states, r = predictor.states(n), y.shape[1]
+    kept = states.shape[1]
+    # What begins or ends away from the mean drifts on average, so the means are not enough.
+    one = np.ones((len(y), int(constant)))
+    C, e = _regressed(np.hstack([states, one]), y)
+    before, next_ = states[~last], states[1:][~last[:-1]]
+    inputs = predictor.inputs
+    if check:
+        examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
+    joint, w = _regressed(np.hstack([before, inputs, one[: len(next_)]]), next_)
+    A, B, d = joint[:, :kept], joint[:, kept : kept + inputs.shape[1]], None
+    if constant:
+        C, shift = C[:, :kept], linalg.pinv(C[:, :kept]) @ C[:, kept]
+        d = joint[:, -1] + shift - A @ shift
+    e = e[~last]
+    count = len(e)
+    V, W, S = e.T @ e / count, w.T @ w / count, w.T @ e / count
+    level = LEAST * float(np.trace(y.T @ y)) / len(y) / r
+    V[np.diag_indices(r)] += level
+    W[np.diag_indices(kept)] += LEAST
+    try:
+        P = linalg.solve_discrete_are(A.T, C.T, W, V, s=S)
+    except (linalg.LinAlgError, ValueError) as failed:
+        raise NotIdentifiableError(
+            f"the measurements do not determine a stable filter of order {kept} ({failed}): take a "
+            "lower order, or excite more"
+        ) from failed
+    innovations = C @ P @ C.T + V
+    G = linalg.solve(innovations, (A @ P @ C.T + S).T, assume_a="pos").T
+    return InnovationModel(A, B, C, G, predictor.U, innovations, p, error, d)
+
+
+def _ridge(X: Array, y: Array) -> Array:
+    """Ridge regression whose weight has the least generalised cross-validation error, (d, r)."""
+    left, s, right = linalg.svd(X, full_matrices=False)
+    projected = left.T @ y
+    outside = float(np.sum(y * y) - np.sum(projected * projected))
+    least, chosen = np.inf, 0.0
+    for weight in s[0] ** 2 * np.logspace(-14, 0, 29):
+        shrunk = weight / (s * s + weight)
+        free = len(X) - float(np.sum(1.0 - shrunk))
+        if free <= 0.0:
+            continue
+        error = (max(outside, 0.0) + float(np.sum((shrunk[:, None] * projected) ** 2))) / free**2
+        if error < least:
+            least, chosen = error, weight
+    found: Array = right.T @ ((s / (s * s + chosen))[:, None] * projected)
+    return found
+
+
+def _future(past: Array, markov: Array, p: int, r: int) -> tuple[Array, Array, Array]:
+    """The next p measurements that the past predicts (N, p r), their directions and singular values."""
+    block = past.shape[1] // p
+    rows = np.zeros((p * r, past.shape[1]))
+    for j in range(p):
+        rows[j * r : (j + 1) * r, j * block :] = markov[:, : (p - j) * block]
+    left, s, _ = linalg.svd(rows @ past.T / np.sqrt(len(past)), full_matrices=False)
+    return past @ rows.T, left, s
+
+
+def _regressed(X: Array, y: Array) -> tuple[Array, Array]:
+    """Coefficients (of y, of X) by least squares, and residuals."""
+    found = linalg.lstsq(X, y)[0]
+    return found.T, y - X @ found
