@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import itertools
 import os
 import re
 import shlex
+import subprocess
 import sys
 import threading
 import time
@@ -28,6 +30,7 @@ from pdeloop.given_model import FILE as GIVEN
 from pdeloop.given_model import file_of_gains, with_gains
 from pdeloop.in_process import LocalPair, train
 from pdeloop.interruption import Interruption, interruptible
+from pdeloop.jit.cache import is_on_disk
 from pdeloop.live import announced
 from pdeloop.messages.files import FileError, make_own_folder, write_atomically
 from pdeloop.messages.frames import MAX_VALUES
@@ -37,7 +40,9 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
 from pdeloop.problem_values import problem_values
-from pdeloop.solver import polynomial_step
+from pdeloop.process.module_path import safe_children
+from pdeloop.process.start import die_with
+from pdeloop.solver import polynomial, polynomial_step, polynomial_sweep
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from pdeloop.unused import refuse_unused
 from tuner_node import narration
@@ -92,17 +97,42 @@ def load_compiled(values: Mapping[str, Any], *, fits: bool = False) -> None:
     notice = threading.Timer(4.0, print, ["compiling, once ..."], {"file": sys.stderr})
     notice.daemon = True
     notice.start()
+    beside = None
     try:
+        if fits and not is_on_disk(polynomial.advance):
+            beside = _begin_compiling(polynomial_step.__name__)
         plant = build_plant(values)
-        if fits and _fits_circles(values, plant):
-            polynomial_step.load_compiled()
+        circles = fits and _fits_circles(values, plant)
+        if beside and not circles:
+            beside.kill()
         controller_node.law.load_compiled()
         if importlib.util.find_spec("pdeloop.fast_path"):
             compiled = ["pde_sim_node"] * (plant.parallel is not None)
             for node in ("controller_node", *compiled):
                 importlib.import_module(f"{node}.fast_path").load_compiled()
+        if circles:
+            polynomial_sweep.load_compiled()
+            if beside:
+                beside.wait()
+            polynomial_step.load_compiled()
     finally:
         notice.cancel()
+        if beside:
+            beside.kill()
+            beside.wait()
+
+
+def _begin_compiling(module: str) -> subprocess.Popen[bytes] | None:
+    """A process that compiles what a module's `load_compiled` loads; None where there can be none.
+
+    Numba compiles one function at a time in a process, and keeps each on disk.
+    """
+    words = "from {0} import load_compiled as l; from {1} import die_with as d; d({2}); l()"
+    code = words.format(module, die_with.__module__, os.getpid())
+    none = subprocess.DEVNULL
+    with safe_children(), contextlib.suppress(OSError):
+        return subprocess.Popen([sys.executable, "-c", code], stdin=none, stdout=none, stderr=none)
+    return None
 
 
 def _fits_circles(values: Mapping[str, Any], plant: Plant) -> bool:

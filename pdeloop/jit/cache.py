@@ -107,6 +107,12 @@ def kept_on_disk(compile_with_cache: Callable[[], Any]) -> Any:
         return compile_with_cache()
 
 
+def is_on_disk(function: Any) -> bool:
+    """Whether something of a function of `cached_njit` is kept on disk."""
+    folder, name = Path(function.stats.cache_path), function.py_func.__qualname__
+    return any(name in index.name for index in folder.glob("*.nbi"))
+
+
 def cached_njit(*sources: ModuleType | Callable[..., Any]) -> Callable[[F], F]:
     """Compile, keep on disk, and run without the interpreter's lock; sources: what it calls."""
 

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.jit.cache import cached_njit
-from pdeloop.jit.simd import read, splat, write
+from pdeloop.jit.simd import WIDTH, read, splat, write
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.solver import polynomial
 from pdeloop.solver.kernel import force
 from pdeloop.solver.memory import aligned
 from pdeloop.solver.polynomial import PLAN, SOURCES, integrate, pull_back_internal
-from pdeloop.solver.polynomial_step import PolynomialStep
+from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 from pdeloop.solver.spectra import analyse, get, put, synthesise
 
 
@@ -206,3 +206,13 @@ class PolynomialSweep:
             *slopes, read_only(feedback), read_only(B), self._plans, self._levels, last, found
         )
         return found
+
+
+def load_compiled() -> None:
+    """Load both ways, or compile them."""
+    n_x = 2 * WIDTH  # the least size whose spectra are compiled
+    none, z, a = np.zeros(n_x // 2 + 1, dtype=np.complex128), np.zeros(n_x), np.zeros((1, 1))
+    equation = Polynomials(none, none[None], np.ones((1, 1)), np.zeros((n_x, 1)), z, 1, np.inf)
+    sweep, feedback = PolynomialSweep([PolynomialStep(equation)], np.zeros(0), 1), z[None]
+    sweep.roll(z, a, feedback, a[0], np.zeros((2, 1)))
+    sweep.roll_back(a, feedback, a, feedback, z)

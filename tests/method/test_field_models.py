@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import read_only
 from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.files import model_of
@@ -24,8 +25,9 @@ from pdeloop.method.models.finite_difference_kernels import advance
 from pdeloop.method.models.linear import LinearModel, add_products
 from pdeloop.method.models.prediction import errors, pieces, predicted
 from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.models.sweep import sweep_of
 from pdeloop.solver import polynomial as compiled
-from pdeloop.solver import polynomial_integrals, polynomial_step
+from pdeloop.solver import polynomial_integrals, polynomial_step, polynomial_sweep
 from pdeloop.training_run import load_compiled, resolve
 from tests.support.small import SMALL
 
@@ -264,6 +266,12 @@ def test_what_is_compiled_for_a_small_grid_serves_every_other() -> None:
     model.step(z, a)
     model.pull_back(z, a, z)
     model.compiled.integrals(z, a, z)
+    polynomial_sweep.load_compiled()
+    sweep = sweep_of(model, ActionSet(low=-1.0), 3, np.ones((1, 2)))
+    given = np.ones((1, 33)), np.ones((1, 3, 3)), np.ones((3, 33)), np.ones(3)
+    states, requested, actions = sweep.roll(*given, np.ones((1, 3, 32)))
+    sweep.roll_back(requested[..., :2], states[:, :-1], actions, np.ones((3, 33)), states[:, -1])
     kernels = compiled.advance, compiled.analysed, compiled.synthesised
-    for kernel in (*kernels, polynomial_integrals.integrals, compiled.pull_back):
+    both_ways: Any = polynomial_sweep.roll, polynomial_sweep.roll_back
+    for kernel in (*kernels, *both_ways, polynomial_integrals.integrals, compiled.pull_back):
         assert len(kernel.signatures) == 1
