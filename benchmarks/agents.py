@@ -13,18 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from stable_baselines3 import PPO, SAC
 
 import pdeloop
 from benchmarks.processes import markdown, shown
 from pde_sim_node.build import build_plant
-from pdeloop.environments import warm_start
-from pdeloop.environments.stable_baselines import VecEnvironment
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.arrays import Array
 
-ALGORITHMS = {"ppo": PPO, "sac": SAC}
 STARTS = ("cold", "path", "frozen", "cloned")
 """Without a law; with a linear path that learns, or does not; with the network fitted to rollouts."""
 
@@ -52,6 +47,8 @@ def run(
     seeds
         Number of agents of each kind.
     """
+    import torch  # of the extra rl, as the imports below
+
     torch.set_num_threads(1)
     law = pdeloop.load_run(folder)
     rows = []
@@ -69,13 +66,19 @@ def _learn(
     law: FinishedRun, algorithm: str, start: str, rollouts: Sequence[int], seed: int
 ) -> list[float]:
     """Costs at the beginning and after each number of rollouts."""
+    from stable_baselines3 import PPO, SAC
+
+    from pdeloop.environments import warm_start
+    from pdeloop.environments.stable_baselines import VecEnvironment
+
+    algorithms = {"ppo": PPO, "sac": SAC}
     plant = build_plant(law.values)
     batch = 4 if algorithm == "ppo" else 1
     env = VecEnvironment(plant, num_envs=batch)
     own = {"n_steps": plant.horizon} if algorithm == "ppo" else {}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You have specified a mini-batch size")
-        agent: Any = ALGORITHMS[algorithm]("MlpPolicy", env, seed=seed, device="cpu", **own)
+        agent: Any = algorithms[algorithm]("MlpPolicy", env, seed=seed, device="cpu", **own)
     if start in ("path", "frozen"):
         warm_start(agent, law)
     if start == "frozen":
@@ -103,6 +106,8 @@ def _cost(agent: Any, law: FinishedRun) -> float:
 
 def _clone(agent: Any, law: FinishedRun, steps: int = 3000) -> None:
     """Fit the mean actions to the law's on four of its rollouts, by least squares."""
+    import torch
+
     episode = pdeloop.rollout(build_plant(law.values), law.law(), range(4))
     states = episode.states[:-1].reshape(-1, episode.states.shape[-1])
     actions = agent.policy.scale_action(episode.actions.reshape(len(states), -1))

@@ -124,12 +124,14 @@ def test_a_cost_is_that_of_the_whole_states(given: dict[str, Any]) -> None:
         whole.add_terminal(wanted, states)
         own.add_terminal(found, x)
         np.testing.assert_allclose(found, wanted, rtol=1e-9)
-        on_z, on_a = whole.slopes(states, actions, 3)
-        on_x, also_on_a = own.slopes(x, actions, 3)
+        J, on_z, on_a = (x[0] for x in whole.along(states[None], actions[None], 3))
+        also_J, on_x, also_on_a = (part[0] for part in own.along(x[None], actions[None], 3))
+        np.testing.assert_allclose(also_J, J, rtol=1e-9)
         np.testing.assert_allclose(on_x, basis.coordinates(on_z), atol=1e-8 * abs(on_z).max())
         np.testing.assert_allclose(also_on_a, on_a)
-        last = basis.coordinates(whole.terminal_slope(states))
-        np.testing.assert_allclose(own.terminal_slope(x), last, atol=1e-8)
+        (J, last), (also_J, also_last) = whole.at_end(states), own.at_end(x)
+        np.testing.assert_allclose(also_J, J, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(also_last, basis.coordinates(last), atol=1e-8)
 
 
 def test_an_optimiser_in_coordinates_finds_what_it_finds_in_the_space_of_the_states() -> None:

@@ -329,15 +329,15 @@ def test_rollouts_have_a_noise_of_their_own_and_the_evaluation_one_for_all_contr
     noise: dict[str, Any] = {kind: 0.05}
     values = parameters(**noise, iterations=4, seeds=2, evaluation_fields=3)
     training, seen = build_training(values), []
-    original = training.next_batch
+    original = training.finish
 
-    def watched() -> Any:
-        batch = original()
-        if batch is not None:
-            seen.append((training.phase, batch.rows.copy()))
-        return batch
+    def watched(result: Any) -> Any:
+        batch = training.next_batch()
+        assert batch is not None
+        seen.append((training.phase, batch.rows.copy()))
+        return original(result)
 
-    training.next_batch = watched  # type: ignore[method-assign]
+    training.finish = watched  # type: ignore[method-assign]
     train(training, LocalPair(values), lambda row: None)
     adapt = np.concatenate([rows for phase, rows in seen if phase != "evaluate"])
     assert len(np.unique(adapt[:, StartColumn.NOISE])) == len(adapt)

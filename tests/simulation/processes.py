@@ -84,7 +84,7 @@ def remembering() -> Iterator[None]:
 
     Nearly all histories compute the same, and it is not what they are about.
     """
-    own_design = identification.design
+    own_design = identification.designed
     own_begin, own_tell = ModelBased.__init__, ModelBased.tell
     begun: WeakKeyDictionary[ModelBased, Any] = WeakKeyDictionary()
 
@@ -104,7 +104,7 @@ def remembering() -> Iterator[None]:
         return row
 
     with (
-        mock.patch.object(identification, "design", design),
+        mock.patch.object(identification, "designed", design),
         mock.patch.object(ModelBased, "__init__", begin),
         mock.patch.object(ModelBased, "tell", tell),
     ):

@@ -109,7 +109,8 @@ def test_after_a_checkpoint_it_goes_on_to_the_same_bits() -> None:
 def test_a_file_alone_does_not_run_it(tmp_path: Path, capsys, monkeypatch) -> None:
     (tmp_path / "own.py").write_text(FILE.read_text())
     problem = tmp_path / "own.yaml"
-    problem.write_text(SMALL.read_text() + "    optimizer: own.py:RandomSearch\n")
+    own = "optimizer: own.py:RandomSearch"
+    problem.write_text(SMALL.read_text().replace("optimizer: two_point", own))
     out = tmp_path / "run"
     words = ["train", str(problem), "--rollouts", "9", "--in-process", "--out", str(out)]
     assert main(words) == 1

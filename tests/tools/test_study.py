@@ -314,7 +314,7 @@ def test_a_continued_study_never_mixes_two_problems(
     with pytest.raises(KeyboardInterrupt):
         run(study, out, here, tell=stop_after_one)
     before = contents(out)
-    file.write_text(SMALL.read_text() + "    reduced_order: 3\n")
+    file.write_text(SMALL.read_text().replace("reduced_order: 4", "reduced_order: 3"))
     assert main(["study", "--out", str(out)]) == 1
     told = capsys.readouterr().err
     assert "reduced_order: 4 there, 3 now" in told and "--again" in told and len(told) < 500
