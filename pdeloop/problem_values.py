@@ -11,7 +11,7 @@ from pde_sim_node.plant import Plant
 from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.problem import find_problem
 from pdeloop.messages.spec import flatten
-from pdeloop.method.method_settings import field_model_settings
+from pdeloop.method.models.settings import SENSED_MOST
 from tuner_node.build import few_sensors
 from tuner_node.optimizer_parameters import training_parameters
 
@@ -43,6 +43,6 @@ def _is_order_sought(
     file = read_problem(find_problem(name)) if name else {}
     if not few_sensors(values) or file.get("identification") == "subspace":
         return False
-    grid, most = plant.grid, field_model_settings(values).sensed_most
+    grid, most = plant.grid, SENSED_MOST
     between = grid.is_circle and len(grid.components) == 1
     return not (between and values["sensors"] <= most and values["sensor_delays"] == 1)

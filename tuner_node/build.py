@@ -24,6 +24,7 @@ from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.predictive import Predictive
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
+from pdeloop.method.models.settings import SENSED_MOST
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
@@ -179,7 +180,7 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
 def remarks_on(values: Mapping[str, Any]) -> list[str]:
     """What to say before a training with these parameters begins."""
     grid = Grid.parse(values["grid"]) if values["grid"] else None
-    few = 0 < values["sensors"] <= field_model_settings(values).sensed_most
+    few = 0 < values["sensors"] <= SENSED_MOST
     if grid is None or not few or values["sensors"] >= values["n_z"]:
         return []
     models = kind_of(values).needs_trajectories

@@ -17,7 +17,7 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
 from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.adapt.replayed_loop import ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import BELIEVED_NOISY, ImprovementSettings
 from pdeloop.method.adapt.trajectories import within
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
@@ -158,7 +158,7 @@ def believe(
 
 def largest_error(context: Context, settings: ImprovementSettings) -> float:
     """The largest E of a model that laws are improved on."""
-    return settings.believed_noisy if context.noise else settings.believed
+    return BELIEVED_NOISY if context.noise else settings.believed
 
 
 def also_in_pieces(

@@ -58,7 +58,7 @@ from pdeloop.method.adapt.replay import (
 )
 from pdeloop.method.adapt.schedule import Schedule
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records, cleaned
 from pdeloop.method.adapt.undeclared_noise import believe_in_noise
 from pdeloop.method.adapt.verdict import (
@@ -378,7 +378,7 @@ class ModelBased(Optimizer):
         improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
         data = self._data()
-        states = measured_states(data, self._settings.chaotic_fields)
+        states = measured_states(data, CHAOTIC_FIELDS)
         if not belief.whole or any_state_serves(loop, base, fields, states):
             row["chaotic"] = True
             found = renew_from_states(loop, base, improved, data, rng, self._settings, final=final)

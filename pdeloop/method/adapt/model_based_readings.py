@@ -18,6 +18,7 @@ from pdeloop.method.adapt.base import Record, Row
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.replay import best_measured, step
+from pdeloop.method.adapt.settings import READINGS_TRUST
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 
 
@@ -61,7 +62,7 @@ class ModelBasedReadings(ModelBased):
             self._progress.policy = best.copy()
         loop = belief.loop(self._context)
         fields = loop.beginnings(own)
-        found = step(loop, fields, best, self._settings, self._settings.readings_trust)
+        found = step(loop, fields, best, self._settings, READINGS_TRUST)
         if found is None:
             row["reason"] = "the improved law does not stay finite on the model; the law is kept"
         else:

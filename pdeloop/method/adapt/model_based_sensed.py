@@ -34,7 +34,7 @@ from pdeloop.method.adapt.observer_design import compensators
 from pdeloop.method.adapt.progress import JUDGING, RENEWING
 from pdeloop.method.adapt.replay import FEWEST
 from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.settings import FIRST_GAIN, ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -265,7 +265,7 @@ def _observers(
     whole = whole_field_law(loop, fields, weights, settings, len(loop.law.model.A))
     laws += [] if whole is None else compensators(loop, whole, longer if final else None)
     start = cheapest(loop, laws, fields, weights)
-    gain = longer.least_gain if final else longer.first_gain
+    gain = longer.least_gain if final else FIRST_GAIN
     found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
     return ([], 0) if found is None else ([start, found.theta], found.steps)
 

@@ -29,7 +29,7 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve
 from pdeloop.method.adapt.initial_fields import measured_states, mixtures, weighted
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ImprovementSettings
 
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
@@ -114,7 +114,7 @@ def renew(
     Renewal or None
         None where no law is finite on the model.
     """
-    least_gain = settings.least_gain if final else settings.first_gain
+    least_gain = settings.least_gain if final else FIRST_GAIN
     descend = _descent(loop, rng, settings, components, periodic, least_gain)
     few = settings.mixtures // 2
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
@@ -154,7 +154,7 @@ def is_overfitted(
 ) -> bool:
     """True if fields that were left out confirm too little of what a law gains on its own."""
     gain = _own_gain(loop, first, found, fields, settings)
-    return gain > 0.0 and -found.change.value < settings.confirmed * gain
+    return gain > 0.0 and -found.change.value < CONFIRMED * gain
 
 
 def _own_gain(
@@ -166,7 +166,7 @@ def _own_gain(
     if not known.any():
         return 0.0
     gain = float(np.sum(before[known] - after[known])) / len(fields)
-    return gain if gain > settings.first_gain * float(before[known].mean()) else 0.0
+    return gain if gain > FIRST_GAIN * float(before[known].mean()) else 0.0
 
 
 def renew_from_states(
@@ -187,7 +187,7 @@ def renew_from_states(
     records: all rollouts, denoised.
     """
     settings, found = replace(settings, mixtures=0, most_mixtures=0), None
-    for count in (settings.chaotic_fields, _CHAOTIC_MOST):
+    for count in (CHAOTIC_FIELDS, _CHAOTIC_MOST):
         fields = measured_states(records, count)
         # Others than last time, so that the laws of the parts may know those of their own part.
         found = renew(loop, first, improved, [], fields, rng, settings, final=final)

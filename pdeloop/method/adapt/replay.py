@@ -25,7 +25,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
 
 FEWEST = 2
 """Rollouts of a law with which its mean cost counts."""
@@ -103,7 +103,7 @@ def step(
         weights,
         curvature_of(loop),
         settings,
-        settings.first_gain,
+        FIRST_GAIN,
         trust,
     )
     return None if found is None else (loop.policy(found.theta, law), found.steps)

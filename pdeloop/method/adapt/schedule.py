@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.settings import FIRST_RENEWAL, ModelBasedSettings
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Schedule:
 
     def doubled(self, own: int) -> int:
         """The next renewal where each one comes after twice as many rollouts, known ones included."""
-        at = self.settings.first_renewal
+        at = FIRST_RENEWAL
         while at - self.known <= own:
             at *= 2
         # One is only worth it if as many rollouts again come before the last one.
@@ -47,6 +47,6 @@ class Schedule:
 
     def often(self, own: int) -> int:
         """The next renewal where a law is rolled out no more often than judges it."""
-        first = max(self.settings.first_renewal - self.known, 1)
+        first = max(FIRST_RENEWAL - self.known, 1)
         every = range(first, max(self.last, first) + 1, self.settings.judging)
         return next((n for n in every if own < n <= self.last), self.last)

@@ -26,6 +26,7 @@ from pdeloop.method.models.sensed_smoothing import Smoothing, settled
 from pdeloop.method.models.settings import (
     DEFAULTS,
     SENSED_ALIKE_CHI,
+    SENSED_MOST,
     SENSED_REPRODUCED,
     FieldModelSettings,
 )
@@ -157,7 +158,7 @@ def fit_rollouts(
 
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring."""
-    sensors, most = context.sensors, context.field_models.sensed_most
+    sensors, most = context.sensors, SENSED_MOST
     return context.periodic and sensors == len(context.target) and 0 < sensors <= most
 
 

@@ -7,6 +7,22 @@ from dataclasses import dataclass
 
 from pdeloop.method.settings import Settings, setting
 
+BELIEVED_NOISY = 0.3
+"""Largest error E at which a model is used with measurement noise."""
+CONFIRMED = 0.5
+"""Share of the gain on its own fields that a law must reach on those left out; otherwise it is made
+again on more drawn fields."""
+CHAOTIC_FIELDS = 32
+"""Measured states used as initial fields of a chaotic plant, for which no fields are drawn."""
+FIRST_GAIN = 2e-2
+"""`least_gain` before the last renewal."""
+FIRST_RENEWAL = 6
+"""Rollouts before the first improvement, explorations included; then at least twice as many each
+time."""
+READINGS_TRUST = 1.0
+"""Weight of the distance from the start of a step on a model of readings: for a linear plant the step
+is 1/(1 + weight) of the full one."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImprovementSettings(Settings):
@@ -19,12 +35,6 @@ class ImprovementSettings(Settings):
     believed: float = setting(
         0.05,
         "largest error E at which a model is used; above it, laws are steps along measured rollouts",
-        0.0,
-        1.0,
-    )
-    believed_noisy: float = setting(
-        0.3,
-        "the same with measurement noise",
         0.0,
         1.0,
     )
@@ -42,19 +52,6 @@ class ImprovementSettings(Settings):
         0,
         1000,
     )
-    confirmed: float = setting(
-        0.5,
-        "share of the gain on its own fields that a law must reach on those left out; otherwise "
-        "it is made again on more drawn fields",
-        0.0,
-        1.0,
-    )
-    chaotic_fields: int = setting(
-        32,
-        "measured states used as initial fields of a chaotic plant, for which no fields are drawn",
-        4,
-        1000,
-    )
     iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
     least_gain: float = setting(
         1e-3,
@@ -62,7 +59,6 @@ class ImprovementSettings(Settings):
         0.0,
         1.0,
     )
-    first_gain: float = setting(2e-2, "the same before the last renewal", 0.0, 1.0)
     folds: int = setting(
         2,
         "parts of the fields, each held out once to choose how far the law moves",
@@ -89,13 +85,6 @@ class ImprovementSettings(Settings):
 class ModelBasedSettings(ImprovementSettings):
     """The constants of `model_based`."""
 
-    first_renewal: int = setting(
-        6,
-        "rollouts before the first improvement, explorations included; then at least twice as many "
-        "each time",
-        2,
-        1_000_000,
-    )
     enough_fields: int = setting(
         48, "number of measured fields at which improvements stop", 2, 1_000_000
     )
@@ -118,11 +107,4 @@ class ModelBasedSettings(ImprovementSettings):
         "equation less is still used",
         0.0,
         1.0,
-    )
-    readings_trust: float = setting(
-        1.0,
-        "weight of the distance from the start of a step on a model of readings; for a linear "
-        "plant the step is 1/(1 + weight) of the full one",
-        0.0,
-        1e6,
     )

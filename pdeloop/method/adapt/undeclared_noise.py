@@ -9,7 +9,7 @@ import numpy as np
 
 from pdeloop.method.adapt.base import Context, Record
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import BELIEVED_NOISY, ImprovementSettings
 from pdeloop.method.models import Measured
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
 
@@ -31,7 +31,7 @@ def believe_in_noise(
         [Measured(record.states, record.actions) for record in records if len(record.actions)],
         context.target,
         settings=context.field_models,
-        most=settings.believed_noisy,
+        most=BELIEVED_NOISY,
         # E without another noise is no measure for E with it.
         better_than=np.inf if declared else error,
         declared=declared,

@@ -15,7 +15,7 @@ from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models.sensed import WAVES, Actuators, grid_points, sensed_model
 from pdeloop.method.models.sensed_filter import SensedFilter
 from pdeloop.method.models.sensed_unknowns import unknowns
-from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.settings import DEFAULTS, SENSED_MOST, FieldModelSettings
 
 FIELD_COEFFICIENTS = 1 + 2 * WAVES
 """Fourier coefficients of an initial field."""
@@ -46,7 +46,7 @@ class ExtendedKalman(Observer):
     def points(self) -> int:
         """n; 0 of a law of more readings than a field is estimated from."""
         readings = len(self.model.U)
-        return grid_points(readings) if readings <= DEFAULTS.sensed_most else 0
+        return grid_points(readings) if readings <= SENSED_MOST else 0
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]

@@ -29,7 +29,7 @@ from pdeloop.method.models.prediction import (
     predicted,
     usable,
 )
-from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.settings import DEFAULTS, REPRODUCED_NOISY, FieldModelSettings
 from pdeloop.process.one_thread import one_thread
 
 _HOPELESS = 20.0
@@ -136,7 +136,7 @@ def fit_field_model(
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
         enough = _GROWN * _share_of_noise(rollouts, target, noise)
-        enough = min(enough, settings.reproduced_noisy)
+        enough = min(enough, REPRODUCED_NOISY)
         settings = replace(settings, reproduced=max(settings.reproduced, enough))
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
     if knows_noise:

@@ -18,7 +18,7 @@ from pdeloop.method.models.low_rank import fit_low_rank
 from pdeloop.method.models.neighbour_fit import fit_neighbours
 from pdeloop.method.models.noisy_fit import fit_noisy
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
-from pdeloop.method.models.settings import SPARSE_TERMS, FieldModelSettings
+from pdeloop.method.models.settings import DENSE, SPARSE_TERMS, FieldModelSettings
 from pdeloop.method.models.sparse_fit import fit_sparse
 from pdeloop.method.models.spectral_fit import fit_spectral
 from pdeloop.method.models.symbols import Form
@@ -97,7 +97,7 @@ def kinds_of(
     of each axis, where there are several and the states are fields on them.
     """
     kinds: list[Kind] = []
-    if not line or n_z > settings.dense:
+    if not line or n_z > DENSE:
         kinds = [
             Kind(
                 name,
@@ -140,7 +140,7 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
 
 
 def _linear(n_z: int, settings: FieldModelSettings) -> list[Kind]:
-    if n_z > settings.dense:
+    if n_z > DENSE:
         return []
     return [
         Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0))
@@ -155,7 +155,7 @@ def _several_fields(
     if n_z % components or n_z // components < 3:
         return []
     kinds: list[Kind] = []
-    if components > 1 and n_z <= settings.dense:
+    if components > 1 and n_z <= DENSE:
         name = f"{prefix}convolution"
         convolution = partial(
             fit_convolution, kind=name, ridge=_CONVOLUTION_RIDGE, components=components
@@ -169,7 +169,7 @@ def _neighbours(
 ) -> list[Kind]:
     """Products of neighbours, for states that are no fields; arguments: as for `_several_fields`."""
     count = components * len(neighbour_features(components))
-    if n_z % components or n_z // components < 5 or n_z > settings.dense:
+    if n_z % components or n_z // components < 5 or n_z > DENSE:
         return []
     kinds = []
     for name, ridge in NEAR_RIDGES.items():

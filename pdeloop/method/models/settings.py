@@ -32,6 +32,12 @@ SENSED_HELD_RIDGE = 0.1
 """Ridge of the positions of actuators with measurement noise, until whole rollouts are fitted."""
 SENSED_ALIKE_CHI = 4.0
 """Fall of an error, in standard deviations of the noise in it, from which a difference counts."""
+REPRODUCED_NOISY = 0.05
+"""Largest E at which a kind is selected with measurement noise: initial states are uncertain then."""
+DENSE = 512
+"""Largest state for the kinds whose cost grows with its square, and for models of neighbours."""
+SENSED_MOST = 32
+"""Maximum number of point sensors between which a field is estimated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +50,6 @@ class FieldModelSettings(Settings):
 
     # The choice of a kind.
     reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
-    reproduced_noisy: float = setting(
-        0.05,
-        "its largest value with measurement noise, which leaves initial states uncertain",
-        0,
-        1,
-    )
     better: float = setting(
         3.0,
         "how many times smaller the E of a kind with more unknowns must be for it to be selected",
@@ -58,12 +58,6 @@ class FieldModelSettings(Settings):
     )
     folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
     worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
-    dense: int = setting(
-        512,
-        "largest state for the kinds whose cost grows with its square, and for models of neighbours",
-        2,
-        65536,
-    )
     largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
     # Spectral models.
     passes: int = setting(
@@ -95,9 +89,6 @@ class FieldModelSettings(Settings):
     )
     # The field between few sensors. "Error" is the squared error of simulated readings over their sum
     # of squares, without the share of the noise.
-    sensed_most: int = setting(
-        32, "maximum number of point sensors between which a field is estimated", 1, 1000
-    )
     sensed_unresolved: float = setting(
         0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
     )
