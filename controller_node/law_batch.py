@@ -108,6 +108,7 @@ class LawBatch:
         """
         if self.compiled is not None:
             return self.compiled.actions(states)
+        states = np.ascontiguousarray(states)  # sums over a state round by its strides
         if not self.remembers:
             with arithmetic_of_laws():
                 return self._computed(step, states)

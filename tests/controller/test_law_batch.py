@@ -47,6 +47,17 @@ def episode(kind: type[Law], M: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
+def test_the_layout_of_states_changes_no_bit(kind: type[Law]) -> None:
+    """A node has them from a message, row by row, and a plant in this process in any order."""
+    policies, index, states = episode(kind, 5)
+    one, other = made(kind), made(kind)
+    for law in (one, other):
+        law.set(policies, index)
+    for k, z in enumerate(states):
+        assert same_bits(one.actions(k, z), other.actions(k, np.asfortranarray(z)))
+
+
+@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
 def test_an_environment_is_bit_identical_in_any_batch_and_is_the_law(kind: type[Law]) -> None:
     policies, index, states = episode(kind, 5)
     whole = made(kind, limit=2.0)

@@ -131,7 +131,6 @@ FILES = [
     "/**:\n  a: 1\n",
     "/**:\n  ros__parameters:\n",
     "/**:\n  ros__parameters: {}\n",
-    "/**:\n  ros__parameters: {a: 1, a: 2}\n",
     "/**:\n  ros__parameters: &x {a: 1}\n/lab: *x\n",
     "/**: {ros__parameters: {a: 1, b: 1}}\n/pde_sim_node: {ros__parameters: {a: 2}}\n",
     "/pde_sim_node: {ros__parameters: {a: 2}}\n/**: {ros__parameters: {a: 1, b: 1}}\n",
