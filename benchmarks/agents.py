@@ -20,6 +20,8 @@ from pde_sim_node.build import build_plant
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.arrays import Array
 
+STD = 0.05
+"""Exploration of the cloned agents, the default of `warm_start`."""
 STARTS = ("cold", "path", "frozen", "cloned")
 """Without a law; with a linear path that learns, or does not; with the network fitted to rollouts."""
 
@@ -133,10 +135,6 @@ def _clone(agent: Any, law: FinishedRun, steps: int = 3000) -> None:
             agent.learning_starts = 0
         else:
             agent.policy.log_std.fill_(float(np.log(STD * (space.high - space.low).max() / 2)))
-
-
-STD = 0.05
-"""Exploration of the cloned agents, the default of `warm_start`."""
 
 
 def text(result: dict[str, Any]) -> str:

@@ -257,6 +257,18 @@ def from_scratch(spectrum: Any, x: int, w: int, d: int) -> None:
         spectrum[1, k] = read(w, x + k + d)
 
 
+@jit
+def by_action(j: int, w: int, d: int, plan: Any, c: int, e: int) -> float:
+    """The derivative by action j, of that by the forcing in the scratch."""
+    at, total = plan.supports + j * plan.modes, 0.0
+    for k in range(plan.n_x // 2 + 1):
+        own = read(w, plan.on_force + k) * read(c, at + k)
+        own += read(w, plan.on_force + d + k) * read(c, at + e + k)
+        total += own if k == 0 else 2.0 * own
+    found: float = plan.n_x * total
+    return found
+
+
 SOURCES = (cache, simd, fft, spectra, kernel, adjoint)
 
 
@@ -313,9 +325,4 @@ def pull_back(
             pull_back_internal(w, d, plan, c, e, plan.tape + n * block)
         from_scratch(covectors[i], plan.covector, w, d)
         for j in range(plan.n_a):
-            at, total = plan.supports + j * plan.modes, 0.0
-            for k in range(plan.n_x // 2 + 1):
-                own = read(w, plan.on_force + k) * read(c, at + k)
-                own += read(w, plan.on_force + d + k) * read(c, at + e + k)
-                total += own if k == 0 else 2.0 * own
-            on_actions[i, j] = plan.n_x * total
+            on_actions[i, j] = by_action(j, w, d, plan, c, e)

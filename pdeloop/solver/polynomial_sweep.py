@@ -27,7 +27,7 @@ from pdeloop.messages.arrays import Array, read_only
 from pdeloop.solver import polynomial
 from pdeloop.solver.kernel import force
 from pdeloop.solver.memory import aligned
-from pdeloop.solver.polynomial import PLAN, SOURCES, integrate, pull_back_internal
+from pdeloop.solver.polynomial import PLAN, SOURCES, by_action, integrate, pull_back_internal
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 from pdeloop.solver.spectra import analyse, get, put, synthesise
 
@@ -109,12 +109,7 @@ def roll_back(
         if even:
             write(w, plan.x + last, 2.0 * read(w, plan.x + last))
         for j in range(n_a):
-            at, total = plan.supports + j * plan.modes, 0.0
-            for k in range(last + 1):
-                own = read(w, plan.on_force + k) * read(c, at + k)
-                own += read(w, plan.on_force + d + k) * read(c, at + apart + k)
-                total += own if k == 0 else 2.0 * own
-            total = n_x * total + on_actions[i, j]
+            total = by_action(j, w, d, plan, c, apart) + on_actions[i, j]
             for m in range(n_p):
                 total += B[m, j] * eta[n_x + m]
             found[i, j] = total * free[i, j]

@@ -175,15 +175,16 @@ class ClosedLoop(ClosedLoopProblem):
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         """Roll theta (n_a + n_p, n_s + n_p + constants) out from the fields (F, n_z)."""
         n_z, n_a = self.model.n_z, self.model.n_a
-        states, _, actions = rolled(self._sweep, n_a, *self._rolled(theta, fields))
+        offsets = self._offsets(fields)
+        states, _, actions = rolled(self._sweep, n_a, *self._rolled(theta, fields, offsets))
         known = np.isfinite(states).all(axis=2)
         with np.errstate(all="ignore"):
-            costs = self._slopes(states, actions, fields)[0]
+            costs = self._cost_and_slopes(states, actions, fields)[0]
         costs[~(np.all(known, axis=1) & np.isfinite(costs))] = np.inf
         known = np.logical_and.accumulate(known, axis=1)
         states[~known], actions[~known[:, 1:]] = 0.0, 0.0
         features = np.empty((*actions.shape[:2], states.shape[2] - n_z + self.U.shape[1] + 1))
-        features[..., :-1] = self._features(states, self._offsets(fields)) * known[:, :-1, None]
+        features[..., :-1] = self._features(states, offsets) * known[:, :-1, None]
         features[..., -1] = self.constant_feature
         states, actions, features = (x.swapaxes(0, 1) for x in (states, actions, features))
         return Simulation(states[..., :n_z], actions, costs, features)
@@ -211,14 +212,17 @@ class ClosedLoop(ClosedLoopProblem):
 
         added: (F, T, n_a + n_p).
         """
-        begin, v, K, b, e = self._rolled(theta, fields)
-        v, offsets, n_f = v + added, self._offsets(fields), theta.shape[1] - self.constants
+        offsets, n_f = self._offsets(fields), theta.shape[1] - self.constants
+        begin, v, K, b, e = self._rolled(theta, fields, offsets)
+        v = v + added
         costs, g, features = np.empty(len(v)), np.empty(v.shape), np.empty((*v.shape[:2], n_f))
 
         def work(own: Sweep, rows: slice) -> None:
             with np.errstate(all="ignore"):
                 states, requested, actions = own.roll(begin[rows], v[rows], K, b, _of(e, rows))
-                costs[rows], on_states, on_a, eta = self._slopes(states, actions, fields[rows])
+                costs[rows], on_states, on_a, eta = self._cost_and_slopes(
+                    states, actions, fields[rows]
+                )
                 g[rows] = own.roll_back(requested[..., : on_a.shape[2]], on_states, on_a, K, eta)
                 features[rows] = self._features(states, _of(offsets, rows))
 
@@ -244,7 +248,7 @@ class ClosedLoop(ClosedLoopProblem):
         )
 
     def _rolled(
-        self, theta: Array, fields: Array
+        self, theta: Array, fields: Array, offsets: Array | None
     ) -> tuple[Array, Array, Array, Array, Array | None]:
         """[z_0; p_0], v, K, b and e of `Sweep.roll`."""
         (n_p, _), n_s = self.memory_input.shape, self.U.shape[1]
@@ -253,7 +257,7 @@ class ClosedLoop(ClosedLoopProblem):
         v = np.zeros((len(fields), self.horizon, len(theta)))
         if self.constants > 1:
             v += constants.T
-        offsets, begin = self._offsets(fields), self._start(fields)
+        begin = self._start(fields)
         first = self._outputs(begin) @ self.U
         if offsets is not None:
             v += offsets @ gains.T
@@ -261,7 +265,7 @@ class ClosedLoop(ClosedLoopProblem):
         b = constants[:, 0] if self.constants == 1 else np.zeros(len(theta))
         return np.hstack([begin, first[:, :n_p]]), v, K, b, self._disturbances(fields)
 
-    def _slopes(
+    def _cost_and_slopes(
         self, states: Array, actions: Array, fields: Array
     ) -> tuple[Array, Array, Array, Array]:
         """J of rows (M,), and its derivatives by [z; p] and a of each step, and by the last [z; p]."""
@@ -269,8 +273,8 @@ class ClosedLoop(ClosedLoopProblem):
         z, cost = states[:, :-1, :n_z], self._stage
         on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
         if self.cost is None:
-            unforeseen = self._unforeseen(fields)
-            outputs = self._outputs(z) if unforeseen is None else self._outputs(z) + unforeseen
+            innovations = self._innovations(fields)
+            outputs = self._outputs(z) if innovations is None else self._outputs(z) + innovations
             J, on_outputs, on_actions = cost.along(outputs, actions, 0)
             on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
         else:
@@ -324,8 +328,8 @@ class ClosedLoop(ClosedLoopProblem):
         """What U^T is applied to, and the target is of, for states (..., n_z)."""
         return z
 
-    def _unforeseen(self, fields: Array) -> Array | None:
-        """What is added to the outputs, (F, T, n_y); None: nothing is."""
+    def _innovations(self, fields: Array) -> Array | None:
+        """What is added to the outputs, (F, T, n_y): measured ones; None: nothing is."""
         return None
 
     def _pull_outputs(self, by_outputs: Array) -> Array:
@@ -334,8 +338,8 @@ class ClosedLoop(ClosedLoopProblem):
 
     def _offsets(self, fields: Array) -> Array | None:
         """What is added to s, (F, T, n_s); None: nothing is."""
-        unforeseen = self._unforeseen(fields)
-        found = None if unforeseen is None else unforeseen @ self.U
+        innovations = self._innovations(fields)
+        found = None if innovations is None else innovations @ self.U
         if self.noise:
             size = self.horizon, len(fields), self.U.shape[1]
             drawn = self._noise(np.random.default_rng(0).standard_normal(size)).swapaxes(0, 1)

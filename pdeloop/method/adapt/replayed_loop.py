@@ -62,12 +62,12 @@ class ReplayedLoop(ObservedLoop):
     def _start(self, fields: Array) -> Array:
         return fields[:, : self.model.n_z]
 
-    def _unforeseen(self, fields: Array) -> Array:
+    def _innovations(self, fields: Array) -> Array:
         """e of each step."""
         return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self._readings.C))
 
     def _disturbances(self, fields: Array) -> Array:
-        moved: Array = self._unforeseen(fields) @ self._readings.G.T
+        moved: Array = self._innovations(fields) @ self._readings.G.T
         return moved
 
     def _outputs(self, z: Array) -> Array:

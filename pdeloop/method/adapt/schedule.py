@@ -19,7 +19,7 @@ class Schedule:
     budget : int
         Rollouts in all, without those.
     settings : ModelBasedSettings
-        `first_renewal`, `enough_fields` and `judging`.
+        `enough_fields` and `judging`.
     """
 
     known: int

@@ -183,7 +183,7 @@ class Planner:
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
         K, b = self._feedback
-        self._to_go  # noqa: B018 - known before several threads ask
+        self._to_go  # noqa: B018 - works with the model, which one thread may use at a time
 
         def work(sweep: Sweep, rows: slice) -> None:
             with np.errstate(all="ignore"):
@@ -309,7 +309,7 @@ class Planner:
     @cached_property
     def _to_go(self) -> Array | None:
         """P of [z - z_r; 1]^T P [z - z_r; 1], the cost to go; None where there is none."""
-        if self.model.n_z > LARGEST:
+        if not self.terminal or self.model.n_z > LARGEST:
             return None
         point, a_r = self.cost.field_target, self.cost.action_target
         with np.errstate(all="ignore"):
@@ -325,7 +325,7 @@ class Planner:
     def _metric(self) -> Array:
         """(R + B^T P B)^-1, or R^-1 where there is no cost to go."""
         R = self.cost.action_matrix
-        if self.terminal and self._to_go is not None:
+        if self._to_go is not None:
             _, B = self.model.linearise(self.cost.field_target, self.cost.action_target)
             R = R + B.T @ self._to_go[:-1, :-1] @ B
         found: Array = linalg.inv(0.5 * (R + R.T))
@@ -335,7 +335,7 @@ class Planner:
         """V (M,) of states (M, n_z) at step k, and dV/dz."""
         if k == self.cost.horizon:
             return self.cost.at_end(z)
-        if not self.terminal or self._to_go is None:
+        if self._to_go is None:
             return np.zeros(len(z)), np.zeros_like(z)
         e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
         on_e = np.einsum("mi,ij->mj", e, self._to_go)

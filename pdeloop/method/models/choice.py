@@ -4,7 +4,7 @@
 Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
 from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
 share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
-ten times its share of the states up to `reproduced_noisy`, is selected; if there is none, the one with
+ten times its share of the states up to REPRODUCED_NOISY, is selected; if there is none, the one with
 the fewest unknowns that is not `better` times worse than the best. Squares alone are selected at a
 hundredth of that E, or if cubes as well are not `better`. It is then fitted to all rollouts.
 """

@@ -11,8 +11,9 @@ eta_k and mu_k those by z_k and p_k,
     g_k       = P'^T [ (df/da)^T eta_{k+1} + B^T mu_{k+1} + dJ/da_k ],        dJ/dv_k = [g_k; mu_{k+1}],
     [eta; mu]_k = [(df/dz)^T eta_{k+1}; 0] + dJ/d[z; p]_k + K^T [g_k; mu_{k+1}],
 
-about three simulations' work. This is the one simulation of a model: laws in a closed loop
-(`pdeloop.method.adapt.closed_loop`) and plans (`pdeloop.method.laws.plans`) give K, b, v and e.
+about three simulations' work. Laws in a closed loop (`pdeloop.method.adapt.closed_loop`) and plans
+(`pdeloop.method.laws.plans`) give K, b, v and e. Only a law whose memory is not linear in what it sees,
+the extended Kalman filter's, is simulated elsewhere (`pdeloop.method.adapt.estimated_loop`).
 
 All functions take M rows side by side, each with the same result as alone, and as with any number of
 threads.
@@ -39,8 +40,8 @@ from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.solver.polynomial_sweep import PolynomialSweep
 from pdeloop.solver.workers import solver_threads
 
-MOST_TAPE = 2**26
-"""Bytes of a tape up to which a simulation is compiled; beyond, stages are computed twice."""
+MOST_TAPE = 2**27
+"""Bytes of the tapes of all threads; a simulation that needs more for one is not compiled."""
 
 
 class Sweep(Protocol):
@@ -86,14 +87,12 @@ def sweep_of(
     horizon: most steps; B (n_p, n_a), or None: there is no memory.
     """
     B = np.zeros((0, model.n_a)) if B is None else B
-    if (
-        isinstance(model, SpectralModel)
-        and model.compiled.compiled_spectra
-        and not action_set.zero_mean
-    ):
+    separate = not action_set.zero_mean
+    if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
         plan = model.compiled.plan
-        if 64 * int(plan["steps"]) * int(plan["fine"]["m"]) * horizon <= MOST_TAPE:
-            return SpectralSweep(model, action_set, max(horizon, 1), B)
+        tape = 64 * int(plan["steps"]) * int(plan["fine"]["m"]) * max(horizon, 1)
+        if tape <= MOST_TAPE:
+            return SpectralSweep(model, action_set, max(horizon, 1), B, MOST_TAPE // tape)
     return ModelSweep(model, action_set, B)
 
 
@@ -143,10 +142,8 @@ class ModelSweep:
             z = self._model.step(states[:, k, :n_z], a)
             states[:, k + 1, :n_z] = z if e is None else z + e[:, k]
             states[:, k + 1, n_z:] = own[:, n_a:] + np.einsum("mi,ji->mj", a, self._B)
-            if not np.isfinite(
-                states[:, k + 1]
-            ).all():  # it goes on with numbers that models can take
-                diverged = ~np.isfinite(states[:, k + 1]).all(axis=1)
+            diverged = ~np.isfinite(states[:, k + 1]).all(axis=1)
+            if diverged.any():  # they go on with numbers that models can take
                 lost[diverged] = np.minimum(lost[diverged], k + 1)
                 states[diverged, k + 1] = 0.0
         for m in np.flatnonzero(lost <= H):
@@ -173,10 +170,13 @@ class ModelSweep:
 
 
 class SpectralSweep:
-    """Of a spectral model, compiled, row by row, in the threads of the solver."""
+    """Of a spectral model, compiled, row by row, in the threads of the solver: so many at most."""
 
-    def __init__(self, model: SpectralModel, action_set: ActionSet, horizon: int, B: Array) -> None:
-        self._made = model, action_set, horizon, B
+    def __init__(
+        self, model: SpectralModel, action_set: ActionSet, horizon: int, B: Array, threads: int
+    ) -> None:
+        self._made = model, action_set, horizon, B, 1
+        self._threads = threads
         self._compiled = PolynomialSweep(model.steps, model.fewer[:, 0], horizon)
         self._others = list[SpectralSweep]()
         self._B = B
@@ -185,7 +185,8 @@ class SpectralSweep:
         )
 
     def each(self, count: int, work: Callable[[Sweep, slice], None]) -> None:
-        helpers, rows = min(len(solver_threads.cores), count) - 1, iter(range(count))
+        rows = iter(range(count))
+        helpers = max(min(len(solver_threads.cores), self._threads, count) - 1, 0)
         while len(self._others) < helpers:
             self._others.append(SpectralSweep(*self._made))
 
@@ -193,9 +194,7 @@ class SpectralSweep:
             for m in rows:
                 work(own, slice(m, m + 1))
 
-        begun = [
-            solver_threads.pool().submit(share, own) for own in self._others[: max(helpers, 0)]
-        ]
+        begun = [solver_threads.pool().submit(share, own) for own in self._others[:helpers]]
         share(self)
         for part in begun:
             if not part.cancel():
