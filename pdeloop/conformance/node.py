@@ -36,6 +36,8 @@ CHECKS: dict[str, type[Check]] = {
 }
 KEPT = 200
 """Frames that wait to be looked at."""
+NAMING = 5.0
+"""Seconds within which a publisher that was discovered has a name."""
 DRAINING = 0.2
 """Seconds at most in which what has arrived is taken, without a wait."""
 
@@ -96,9 +98,10 @@ class RosTransport(EventLoop):
             served = self.serve_next(min(max(0.0, end - now), WAIT))
             idle = 0 if served else idle + 1
 
-    def disturbance(self) -> str:
+    def disturbance(self, seconds: float = 0.0) -> str:
+        began = self.now()
         while True:
-            self.introspection.look_at_publishers(self.now())
+            named = self.introspection.look_at_publishers(self.now())
             for topic, names in self.introspection.several_publishers.items():
                 return (
                     f"several nodes publish {topic}: {', '.join(names)}; stop all but the one to be "
@@ -108,7 +111,8 @@ class RosTransport(EventLoop):
                 return f"{text}; expected a publisher as in docs/protocol.md"
             if deaf := self._deaf():
                 return deaf
-            if not self.introspection.undecided:
+            end = began + (seconds if named else max(seconds, NAMING))
+            if self.now() >= end and not self.introspection.undecided:
                 return ""
             if self.stop_reason:
                 raise Interruption(self.stop_reason)

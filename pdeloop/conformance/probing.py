@@ -27,6 +27,8 @@ from pdeloop.problem_check import Finding
 
 ASK_AGAIN = 0.5
 """Seconds after which an unanswered message is sent again."""
+DISCOVERY = 2.0
+"""Seconds after a failed probe in which other publishers are looked for."""
 FAILED = Topic(MODEL_FAILED, (), latched=True)
 """Its messages are ModelFailure."""
 Message: TypeAlias = Any
@@ -63,8 +65,11 @@ class Transport(Protocol):
     def wait_delivered(self) -> None:
         """Wait until sent messages have arrived, for at most a second."""
 
-    def disturbance(self) -> str:
-        """Why no node can be checked here: others beside it, or a QoS that does not fit; or empty."""
+    def disturbance(self, seconds: float = 0.0) -> str:
+        """Why no node can be checked here: others beside it, or a QoS that does not fit; or empty.
+
+        seconds: for which it is looked at least. A message may come before its publisher is known.
+        """
 
 
 class Check(ABC):
@@ -102,7 +107,7 @@ class Check(ABC):
                 except NoteError as note:
                     yield Finding(name, True, str(note), note=True)
                 except UnexpectedError as error:
-                    if self.transport.disturbance():  # said below, and the cause
+                    if self.transport.disturbance(DISCOVERY):  # said below, and the cause
                         break
                     ends = isinstance(error, NoAnswerError)
                     rest = "; the rest is not checked" if ends else ""

@@ -97,7 +97,7 @@ class PureTransport:
     def wait_delivered(self) -> None:
         """Nothing is on its way."""
 
-    def disturbance(self) -> str:
+    def disturbance(self, seconds: float = 0.0) -> str:
         return ""
 
 

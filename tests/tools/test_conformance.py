@@ -84,7 +84,7 @@ class Flood:
     def wait_delivered(self) -> None:
         self.closed = True
 
-    def disturbance(self) -> str:
+    def disturbance(self, seconds: float = 0.0) -> str:
         return ""
 
 
