@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law for the environments of an episode, each with its own theta and model.
 
-A law with a compiled form is computed by it, any other by its object, environment by environment. A
-law's memory is a function of the states and actions of its episode. It is kept from one step to the
+A theta with a compiled form is computed by it, any other by the object of its law, one by one. A law's
+memory is a function of the states and actions of its episode. It is kept from one step to the
 next, as are the computed actions, so that a repeated request gets the same answer.
 """
 
@@ -52,9 +52,11 @@ class LawBatch:
         self, laws: Sequence[Law], target: ArrayLike, action_set: ActionSet = ANY_ACTION
     ) -> None:
         self._laws, self._action_set = list(laws), action_set
-        projected = ProjectedLaw([law.model.U for law in laws], target, action_set)
-        self.compiled = projected if self._laws[0].compiled else None
-        """The compiled form, if the law has one."""
+        self._projected = ProjectedLaw([law.model.U for law in laws], target, action_set)
+        self.compiled = self._projected if self._laws[0].compiled else None
+        """The compiled form, if all environments have one."""
+        self._by_gains = np.zeros(0, dtype=np.bool_)
+        """Which environments have one."""
         self._environments: list[tuple[Law, Parts]] = []
         self._memories: list[Array] = []
         self._next = 0
@@ -67,7 +69,7 @@ class LawBatch:
     @property
     def remembers(self) -> bool:
         """True if the law has a memory."""
-        return self._laws[0].memory_size > 0
+        return self._laws[0].memory_size > 0 and self.compiled is None
 
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take theta of each environment for the next episode.
@@ -90,15 +92,21 @@ class LawBatch:
         if not np.isfinite(theta).all():
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")
         index = checked_index(model_index, len(theta), len(self._laws))
-        laws = [self._laws[i] for i in index.tolist()]
-        if self.compiled is not None:
-            gains = [law.gains(own) for law, own in zip(laws, _vectors(theta), strict=True)]
-            self.compiled.set(np.stack(gains), index)
-            return
-        self._environments = [
-            (law, law.parts(own)) for law, own in zip(laws, _vectors(theta), strict=True)
+        laws = [
+            (self._laws[i], own) for i, own in zip(index.tolist(), _vectors(theta), strict=True)
         ]
-        self._begin()
+        by_gains = np.array([law.has_gains(own) for law, own in laws])
+        if by_gains.any():
+            none = np.zeros_like(laws[0][0].model.policy)
+            gains = [
+                law.gains(own) if has else none
+                for (law, own), has in zip(laws, by_gains, strict=True)
+            ]
+            self._projected.set(np.stack(gains), index)
+        self.compiled, self._by_gains = self._projected if by_gains.all() else None, by_gains
+        if self.compiled is None:
+            self._environments = [(law, law.parts(own)) for law, own in laws]
+            self._begin()
 
     def actions(self, step: int, states: Array) -> Array:
         """The actions (M, n_a) that answer the states (M, n_z) of a step.
@@ -161,7 +169,11 @@ class LawBatch:
                 )
             ]
         )
-        return self._action_set.project(found)
+        found = self._action_set.project(found)
+        if self._by_gains.any():  # as in a batch of their own
+            by_gains = self._by_gains[:, None]
+            found = np.where(by_gains, self._projected.actions(states), found)
+        return found
 
 
 def _vectors(theta: Array) -> list[Array]:

@@ -22,7 +22,7 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import CostColumn
 from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from pdeloop.output import aligned
-from tuner_node.batch import Batch
+from tuner_node.batch import Batch, stacked
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 
@@ -84,10 +84,10 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
             f"plant has {plant.state_size} and {plant.n_a}"
         )
     there = replace(run, values=values)
-    if (shape := there.laws[0].shape) != run.policies.shape[1:]:
+    if (shape := there.laws[0].shape) != run.warm.shape[1:]:
         raise ParameterError(
             f"the law '{values['law']}' has parameters of shape {shape} for the changed plant, but "
-            f"those of the run have shape {run.policies.shape[1:]}"
+            f"those of the run have shape {run.warm.shape[1:]}"
         )
     return there
 
@@ -157,7 +157,8 @@ def _costs(run: FinishedRun, pair: LocalPair, seeds: int, **fields: Any) -> dict
     """Costs (seeds, fields) of the first training seeds; fields: as for `mean_costs`."""
     warm, adapted = run.warm[:seeds], run.policies[:seeds]
     laws = dict(zip(EVALUATED, (np.zeros_like(warm), warm, adapted), strict=True))
-    policies, models = np.concatenate([*laws.values()]), np.tile(np.arange(seeds), len(laws))
+    policies = stacked([own for law in laws.values() for own in law])
+    models = np.tile(np.arange(seeds), len(laws))
     costs = mean_costs(pair, run.values, policies, models, **fields)
     return dict(zip(laws, np.split(costs, len(laws)), strict=True))
 

@@ -123,7 +123,7 @@ def law_of(
     model, law, limit = run.models[m], _loaded(run, m), ActionSet.of(run.values)
     step = float(run.values["sample_time"])
     name = f"the {which} law of {run.values['problem']}, seed {run.seeds[m]}"
-    if law is None or not law.compiled:
+    if law is None or not law.has_gains(policy.ravel()):
         return Parameters(str(run.values["law"]), policy.ravel(), model, law, limit, step, name)
     gains, n_s = law.gains(policy.ravel()), model.U.shape[1]
     own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())

@@ -24,9 +24,9 @@ from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import noisy
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED
-from pdeloop.method.laws import Law
+from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.laws.registry import OWN_LAWS, law_kind
 from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, model_of
@@ -95,6 +95,12 @@ class FinishedRun:
             self.values["horizon"],
             self.values.get("cost", ()),
         )
+
+    @property
+    def affine(self) -> bool:
+        """True if the laws are affine, or plan nowhere, so that `policies` are gains row after row."""
+        kind = OWN_LAWS.shipped.get(self.values["law"], Law)
+        return kind is Affine or (kind.extends and self.policies.shape == self.warm.shape)
 
     def index(self, seed: int | None = None) -> int:
         """The index of a training seed in the arrays.
@@ -178,11 +184,11 @@ class FinishedRun:
         theta, m = self.theta(which, seed), self.index(seed)
         law, model = self.laws[m], self.models[m]
         batch = LawBatch([law], self._target(model), ActionSet.of(self.values))
-        plants = 0
+        plants, forgets = 0, law.has_gains(theta.ravel()) or not batch.remembers
 
         def act(k: int, states: Array) -> Array:
             nonlocal plants
-            if k == 0 or (len(states) != plants and not batch.remembers):
+            if k == 0 or (len(states) != plants and forgets):
                 plants = len(states)
                 batch.set(np.repeat(theta[None], len(states), axis=0))
             return batch.actions(k, states)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller_node.law_batch import LawBatch
+from controller_node.policy import ProjectedLaw
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
@@ -69,12 +69,11 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
     """The matrices of a law; ParameterError for one that has none, or a seed that there is not."""
     theta, m = run.theta(which, seed).ravel(), run.index(seed)
     law, model = run.laws[m], run.models[m]
-    if law.compiled:
-        batch = LawBatch([law], run._target(model))
-        assert batch.compiled is not None
+    if law.has_gains(theta):
+        projected = ProjectedLaw([model.U], run._target(model))
         gains, n_s = law.gains(theta), model.U.shape[1]
         constant: Array = np.zeros(len(gains))
-        for j, number in enumerate(batch.compiled.reduced_targets[0]):  # as the loop adds them
+        for j, number in enumerate(projected.reduced_targets[0]):  # as the loop adds them
             constant += gains[:, n_s + j] * number
         kind, arrays = "affine", {"U": model.U, "K": gains[:, :n_s], "constant": constant}
         loop = model.A + model.B @ arrays["K"]

@@ -191,7 +191,7 @@ def plot_spectrum(run: FinishedRun) -> Figure:
 
 def _require_gains(run: FinishedRun) -> None:
     """ValueError if the run's law has other parameters than gains."""
-    if run.values["law"] != Affine.name:
+    if not run.affine:
         raise ValueError(
             f"the run has the law '{run.values['law']}', but this figure shows the gains of the "
             f"law '{Affine.name}'"

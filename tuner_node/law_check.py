@@ -39,7 +39,7 @@ def check_law(
         with np.errstate(over="ignore", invalid="ignore"):
             expected = _actions(law, theta, states, actions)
             allowed = np.zeros(len(actions))
-            if not law.compiled and not np.array_equal(expected, actions):
+            if not law.has_gains(theta) and not np.array_equal(expected, actions):
                 near = _actions(law, theta, (1.0 + NEARBY) * states, actions)
                 moved = np.abs(near - expected).max(axis=1, initial=0.0)
                 allowed = MARGIN * np.maximum.accumulate(moved)
@@ -47,7 +47,7 @@ def check_law(
         scale = np.maximum.accumulate(np.abs(actions).max(axis=1, initial=1.0))  # so far
         allowed += TOLERANCE * scale
         if not (np.abs(actions - expected) <= allowed[:, None]).all():
-            words = AFFINE if law.compiled else f"'{law.name}'"
+            words = AFFINE if law.has_gains(theta) else f"'{law.name}'"
             raise ValueError(
                 f"the actions are not those of the law {words}, which this optimizer needs; with a "
                 "controller of your own, choose an optimizer that learns from costs alone"
@@ -56,7 +56,7 @@ def check_law(
 
 def _actions(law: Law, theta: Array, states: Array, actions: Array) -> Array:
     """The law's actions along a trajectory."""
-    if not law.compiled:
+    if not law.has_gains(theta):
         return along(law, theta, states, actions)
     K_a, K_b = np.hsplit(law.gains(theta), 2)
     expected: Array = states @ law.model.U @ K_a.T + K_b @ law.model.s_r

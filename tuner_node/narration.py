@@ -79,6 +79,11 @@ class Narration:
                 "diverged"
             ):  # an optimiser of a user's own may tell neither
                 self._costs[seed] = row.get("cost")
+            if "could_save" in row:
+                share = f"{100 * row['could_save']:.2g} %"
+                lines.append(
+                    f"  seed {row['seed']}: another law could save {share} more on the model"
+                )
         elif event == "excitation":
             lines.append(f"  seed {row['seed']}: {row['remark']}")
         elif event == "diverged":
@@ -170,6 +175,7 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
     lines += [f"  {text}" for text in differences(summary)]
+    lines += _acting(summary)
     lines += reasons(summary)
     return [*lines, f"  results in {folder}"] if folder else lines
 
@@ -191,6 +197,25 @@ def differences(summary: Row) -> list[str]:
         f"adapted minus LQT on the same {own['fields']} fields: {own['change']:.4g} (95 % interval "
         f"{own['low']:.4g} to {own['high']:.4g})"
     ]
+
+
+def _acting(summary: Row) -> list[str]:
+    """Which law acts, what it saves, and what a step costs, where plans were possible."""
+    lines = []
+    every = list(zip(summary.get("acting", []), summary.get("outcome", []), strict=False))
+    for name in dict.fromkeys(own["law"] for own, _ in every):
+        known = [(own, outcome) for own, outcome in every if own["law"] == name]
+        first, step = (
+            f"{span((1e3 * own[key] for own, _ in known), '.2g')} ms"
+            for key in ("first_step", "step")
+        )
+        which = f" for {len(known)} of {len(every)} seeds" if len(every) > 1 else ""
+        (_, outcome), *others = known
+        told = outcome["verdict"] == "better" and not others and outcome["reason"]
+        why = f" ({told})" if told else ""
+        took = f"a step takes {step}, the first one {first}"
+        lines.append(f"  the law that acts is {name}{which}{why}; {took}")
+    return lines
 
 
 def reasons(summary: Row) -> list[str]:

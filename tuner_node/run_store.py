@@ -15,6 +15,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.files import FileError
 from pdeloop.messages.frames import MAX_ID
 from tuner_node import checkpoint, training_state
+from tuner_node.results import acting
 from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training
 
@@ -101,7 +102,9 @@ class RunWriter:
         """Write the results of the finished training. Raises OSError if they cannot be written."""
         self.keep(now=time.monotonic(), force=True)
         seconds = time.monotonic() - self._began
-        return self._folder.finish(self._training, {"seconds": seconds, **extra})
+        laws = acting(self._training)
+        extra = {"seconds": seconds, **({"acting": laws} if laws else {}), **extra}
+        return self._folder.finish(self._training, extra)
 
     def _restore(self) -> None:
         """Go on from the newest usable checkpoint, or begin again: both lead to the same result."""

@@ -23,7 +23,6 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array, unpack_arrays
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.laws import Affine
 from pdeloop.method.laws.calls import laws_of
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.reduce.order import OrderStudy, study_orders
@@ -110,7 +109,7 @@ class ProblemData:
     @property
     def affine(self) -> bool:
         """True if the parameters are gains [K_a K_b]."""
-        return bool(self.first.values["law"] == Affine.name)
+        return all(run.affine for run in self.runs.values())
 
     @property
     def models(self) -> list[ModelRows]:

@@ -114,8 +114,10 @@ def gains(problem: ProblemData) -> Figure:
 
     K_b is left out where it is zero, as its target is.
     """
-    policies = {name: own for name, own in problem.policies.items() if name != "none"}
     n_a, n_s = problem.models[0].B.T.shape
+    policies = {
+        name: own.reshape(n_a, 2 * n_s) for name, own in problem.policies.items() if name != "none"
+    }
     symbols = (
         ["$K_a$", "$K_b$"] if any(own[:, n_s:].any() for own in policies.values()) else ["$K_a$"]
     )
@@ -168,7 +170,7 @@ def spectrum(problem: ProblemData) -> Figure:
     """Eigenvalues of the reduced model, without control and with the gains of each controller."""
     groups: dict[str, list[Eigenvalues]] = {
         "none": [np.linalg.eigvals(model.A) for model in problem.models],
-        "lqt": [_closed_loop(model, model.K_a) for model in problem.models],
+        "lqt": [_closed_loop(model, model.policy) for model in problem.models],
     }
     for name, run in problem.runs.items():
         groups[name] = [_closed_loop(m, p) for m, p in zip(run.models, run.policies, strict=True)]
@@ -197,8 +199,9 @@ def spectrum(problem: ProblemData) -> Figure:
 
 
 def _closed_loop(model: ModelRows, policy: Array) -> Eigenvalues:
-    """Eigenvalues of A + B K_a with the gains of a policy [K_a K_b]."""
-    values: Eigenvalues = np.linalg.eigvals(model.A + model.B @ policy[:, : len(model.A)])
+    """Eigenvalues of A + B K_a with the gains of a policy [K_a K_b], or of its rows in a vector."""
+    K_a = policy.reshape(model.policy.shape)[:, : len(model.A)]
+    values: Eigenvalues = np.linalg.eigvals(model.A + model.B @ K_a)
     return values
 
 

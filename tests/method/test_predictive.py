@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pdeloop
 from controller_node.law_batch import LawBatch
+from pdeloop.evaluation import evaluate
+from pdeloop.export import law_of
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
@@ -18,12 +21,14 @@ from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajector
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.laws import Affine, Predictive
+from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.calls import action, updated
 from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.predictive import Auto
 from pdeloop.method.models.files import LARGEST, packed, unpacked
 from pdeloop.method.models.settings import FieldModelSettings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
+from tuner_node.narration import closing_lines
 
 RNG = np.random.default_rng(1)
 U = np.linalg.qr(RNG.standard_normal((N_Z, 3)))[0]
@@ -55,8 +60,8 @@ def theta(own: Predictive, **changed: object) -> np.ndarray:
     return own.theta_of(GAINS, replace(made, **changed))  # type: ignore[arg-type]
 
 
-def actions_of(own: Predictive, theta: np.ndarray, states: np.ndarray = STATES) -> np.ndarray:
-    batch = LawBatch([own], np.zeros(N_Z))
+def actions_of(own: Law, theta: np.ndarray, states: np.ndarray = STATES) -> np.ndarray:
+    batch = LawBatch([own], np.ones(N_Z))
     batch.set(theta[None])
     return np.stack([batch.actions(k, z[None])[0] for k, z in enumerate(states)])
 
@@ -65,7 +70,20 @@ def test_without_a_model_it_is_the_affine_law() -> None:
     own, affine = law(), Affine(ROWS, T)
     assert np.array_equal(own.theta_start, affine.theta_start)
     expected = STATES @ U @ GAINS[:, :3].T + GAINS[:, 3:] @ ROWS.s_r
-    np.testing.assert_allclose(actions_of(own, own.theta_start), expected, atol=1e-12)
+    acted = actions_of(own, own.theta_start)
+    np.testing.assert_allclose(acted, expected, atol=1e-12)
+    assert np.array_equal(acted, actions_of(affine, affine.theta_start.reshape(affine.shape)))
+
+
+def test_in_a_batch_with_plans_the_affine_law_acts_as_alone() -> None:
+    own, batch = law(), LawBatch([law()], np.ones(N_Z))
+    planned = theta(own)
+    affine = np.zeros_like(planned)
+    affine[: own.size] = own.theta_start
+    batch.set(np.stack([affine, planned, affine]))
+    together = np.stack([batch.actions(k, np.tile(z, (3, 1))) for k, z in enumerate(STATES)])
+    for m, one in enumerate((affine, planned, affine)):
+        assert np.array_equal(together[:, m], actions_of(own, one))
 
 
 def test_arrays_come_back_from_numbers_to_the_bit() -> None:
@@ -168,7 +186,52 @@ def test_the_law_of_a_run_acts_as_it_was_measured(run: pdeloop.FinishedRun) -> N
     assert np.array_equal(again.costs.mean, run.costs["adapted"][0])
 
 
-def optimizer(rollouts: int = 10) -> ModelBasedPredictive:
+LINEAR = {
+    "n_z": 32,
+    "horizon": 60,
+    "reduced_order": 6,
+    "rollouts": 15,
+    "evaluation_fields": 2,
+}
+CHAOTIC = LINEAR | {"horizon": 40, "reduced_order": 8}
+FEW_STARTS = {"first_iterations": 20, "starts": 2}
+
+
+def test_auto_is_the_affine_law_to_the_bit_where_the_model_has_no_more_to_give(
+    tmp_path: Path,
+) -> None:
+    """Of a linear plant whose horizon is long: only at its end inputs gain on the best affine law."""
+    problem, out = "convection-diffusion-reaction", tmp_path / "auto"
+    affine = pdeloop.train(problem, **LINEAR)
+    auto = pdeloop.train(problem, **LINEAR, law="auto", law_settings=FEW_STARTS, out=out)
+    shares = [row["could_save"] for row in auto.result["history"] if "could_save" in row]
+    assert shares and all(0.0 <= share <= Auto.worth for share in shares)
+    assert np.array_equal(auto.policies[0].ravel(), affine.policies[0].ravel())
+    assert all(np.array_equal(auto.costs[name], affine.costs[name]) for name in affine.costs)
+    assert auto.affine and law_of(auto).c() == law_of(affine).c()
+    assert [own["law"] for own in auto.result["acting"]] == ["affine"]
+    closing = "\n".join(closing_lines(problem, auto.result, out))
+    assert "the law that acts is affine" in closing and "% more" in closing
+    costs = evaluate(pdeloop.load_run(out), fields=2, seed=auto.values["evaluation_seed"])
+    assert np.array_equal(costs["adapted"], auto.costs["adapted"])
+
+
+def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
+    problem, out = "kuramoto-sivashinsky-22", tmp_path / "auto"
+    auto = pdeloop.train(problem, **CHAOTIC, law="auto", law_settings=FEW_STARTS, out=out)
+    *_, last = auto.result["history"]
+    assert last["rollouts"] == 15 and last["chosen"] == "predictive" and not auto.affine
+    shares = [row["could_save"] for row in auto.result["history"] if "could_save" in row]
+    assert len(shares) == 1 and shares[0] > Auto.worth
+    line = next(
+        line for line in closing_lines(problem, auto.result, out) if "the law that acts" in line
+    )
+    assert "predictive (the law that plans costs" in line and "ms" in line
+    costs = evaluate(pdeloop.load_run(out), fields=2, seed=auto.values["evaluation_seed"])
+    assert np.array_equal(costs["adapted"], auto.costs["adapted"])
+
+
+def optimizer(rollouts: int = 10, kind: type[Predictive] = Predictive) -> ModelBasedPredictive:
     """Of a plant that is the spectral model, judged by rollouts of it."""
     explored = [explored_trajectory(seed) for seed in range(2)]
     context = Context(
@@ -180,11 +243,11 @@ def optimizer(rollouts: int = 10) -> ModelBasedPredictive:
         exploration=explored[0],
         further=explored[1:],
         field_models=FieldModelSettings(folds=2, largest_degree=2),
-        law=type("Short", (Predictive,), {"settings": SHORT})(ROWS, T),
+        law=type("Short", (kind,), {"settings": SHORT})(ROWS, T),
     )
-    kind = ModelBased.for_context(context)
+    own = ModelBased.for_context(context)
     settings = ModelBasedSettings(judging=2, iterations=10)
-    made = kind(GAINS.ravel(), seed=3, rollouts=rollouts, settings=settings, context=context)
+    made = own(GAINS.ravel(), seed=3, rollouts=rollouts, settings=settings, context=context)
     assert isinstance(made, ModelBasedPredictive)
     return made
 
@@ -229,8 +292,17 @@ def measured(own: ModelBasedPredictive, rollout: Rollout) -> RolloutResult:
     return RolloutResult(total[0] / T, False, Trajectory(np.array(states), np.array(actions)))
 
 
-def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
-    own, other = optimizer(), None
+class Eager(Predictive):
+    """Keeps rollouts for plans as soon as a model promises any gain."""
+
+    worth = 1e-9
+
+
+@pytest.mark.parametrize(("rollouts", "kind"), [(10, Predictive), (14, Eager)])
+def test_an_optimiser_continues_from_its_state_to_the_bit(
+    rollouts: int, kind: type[Predictive]
+) -> None:
+    own, other = optimizer(rollouts, kind), None
     rows = []
     while not own.done:
         asked = own.ask()
@@ -240,10 +312,11 @@ def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
             )
         results = [measured(own, rollout) for rollout in asked]
         rows.append(own.tell(results))
-        other = optimizer()
+        other = optimizer(rollouts, kind)
         other.restore(own.state())
         assert np.array_equal(other.policy, own.policy) and other.done == own.done
-    assert rows[-1]["rollouts"] == 10 and rows[-1]["role"] == "judging"
+    assert sum("could_save" in row for row in rows) == (kind is Eager)
+    assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
 
 
@@ -271,3 +344,5 @@ def test_what_it_does_not_support_is_refused_in_a_sentence() -> None:
         pdeloop.train("burgers", law="predictive", sensors=8)
     with pytest.raises(ParameterError, match="choose model_based, or another law"):
         pdeloop.train("burgers", law="predictive", optimizer="two_point")
+    with pytest.raises(ParameterError, match="law 'auto' plans from the whole state, but 8"):
+        pdeloop.train("burgers", law="auto", sensors=8)

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The law that plans on a model, over topics: the bits of one process."""
+"""The law that plans on a model where that pays, over topics: the bits of one process."""
 
 from __future__ import annotations
 
@@ -17,18 +17,14 @@ pytestmark = pytest.mark.topics
 
 PARAMETERS = {
     "n_z": 32,
-    "n_a": 3,
-    "actuator_width": 0.1,
-    "horizon": 10,
-    "reduced_order": 4,
-    "rollouts": 9,
+    "horizon": 40,
+    "reduced_order": 8,
+    "rollouts": 15,
     "evaluation_fields": 2,
-    "law": "predictive",
+    "law": "auto",
 }
 SETTINGS = {
-    "optimizer_settings": {"judging": 2},
-    "law_settings": {"steps": 5, "first_iterations": 10, "starts": 2},
-    "field_model_settings": {"folds": 2},
+    "law_settings": {"first_iterations": 20, "starts": 2},
 }
 
 
@@ -39,7 +35,7 @@ def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_fro
     words = [f"{name}={value}" for name, value in PARAMETERS.items()]
     words += [f"{of}.{name}={value}" for of, own in SETTINGS.items() for name, value in own.items()]
     flags = [word for setting in words for word in ("--set", setting)]
-    problem = "allen-cahn-modes"
+    problem = "kuramoto-sivashinsky-22"
     loop.wait(loop.pdeloop("train", problem, *flags, "--record", "--out", str(out)), LIMIT)
     here = pdeloop.train(problem, **PARAMETERS, **SETTINGS)
     assert here.result["history"][-1]["role"] == "judging"

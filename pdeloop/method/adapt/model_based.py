@@ -109,7 +109,7 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
-    also_improves = ("observer", "extended_kalman", "feedforward", "predictive")
+    also_improves = ("observer", "extended_kalman", "feedforward", "predictive", "auto")
     in_coordinates = True
     judges_first_law = True
     explorations = 2
@@ -192,6 +192,13 @@ class ModelBased(Optimizer):
     def done(self) -> bool:
         """True once no further rollouts are needed."""
         return self._progress.stage == ENDED
+
+    def can_spare(self, rollouts: int) -> bool:
+        """Whether a model is there, and would be renewed once more with so many rollouts fewer."""
+        progress, budget = self._progress, self._budget - rollouts
+        schedule = Schedule(len(self._before), budget, self._settings)
+        renews = progress.stage == RENEWING and schedule.last > self._records.count
+        return renews and progress.belief is not None and not progress.replayed
 
     def ask(self) -> list[Rollout]:
         """The rollouts of the current stage, at once where they do not depend on each other."""

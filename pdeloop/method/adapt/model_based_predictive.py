@@ -6,6 +6,11 @@ steps are simulated in closed loop from a few measured initial fields, as action
 the affine law, whichever is cheaper there; the shortest within 2 % of the cheapest is taken. The last
 rollouts are of the law with that plan, from fresh fields. It replaces the affine law only if it is
 better by more than chance (`verdict`).
+
+The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
+the affine law but the last, the best inputs for an episode are searched on the model from several
+starts. If they save more than 3 % of the affine law's cost, the last rollouts are kept; else they are
+the affine law's, which is then that of `law: affine` to the bit.
 """
 
 from __future__ import annotations
@@ -95,17 +100,22 @@ class ModelBasedPredictive(Optimizer):
         measured = [self._matrix(record) for record in context.measured]
         self._context = replace(context, measured=measured, law=None)
         spare = rollouts - ModelBased.first_step(self._settings)
-        self._judging = max(min(self._settings.judging, spare), 0)
-        self._affine = ModelBased(
+        self._budget, self._judging = rollouts, max(min(self._settings.judging, spare), 0)
+        self._kept = 0 if self._law.worth else self._judging
+        self._affine = self._trained()
+        self._stage, self._tells, self._count, self._share = _TRAINING, 0, 0, np.inf
+        self._candidate: Candidate | None = None
+        self._chosen: Array | None = None
+
+    def _trained(self) -> ModelBased:
+        """The training of the affine law with all rollouts but those that are kept for plans."""
+        return ModelBased(
             self._first,
-            seed=seed,
-            rollouts=rollouts - self._judging,
+            seed=self._seed,
+            rollouts=self._budget - self._kept,
             settings=self._settings,
             context=self._context,
         )
-        self._stage, self._tells, self._count = _TRAINING, 0, 0
-        self._candidate: Candidate | None = None
-        self._chosen: Array | None = None
 
     @classmethod
     def first_step(cls, settings: ModelBasedSettings) -> int:
@@ -133,7 +143,7 @@ class ModelBasedPredictive(Optimizer):
             return self._affine.ask()
         if self._candidate is None:
             return []
-        numbers = range(self._count, self._count + self._judging)
+        numbers = range(self._count, self._count + self._left)
         return [Rollout(self._candidate.theta.copy(), field_seed(self._seed, n)) for n in numbers]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
@@ -144,8 +154,11 @@ class ModelBasedPredictive(Optimizer):
         self._tells += 1
         if self._stage == _TRAINING:
             row = self._affine.tell(results)
-            if self._affine.done:
-                self._begin_judging(row)
+            with one_thread():
+                if self._affine.done:
+                    self._begin_judging(row)
+                elif not self._kept and self._affine.can_spare(self._judging):
+                    self._look(row)
             return row
         diverged = sum(not result.usable for result in results)
         row = {"role": "judging", "rollouts": self._count, "diverged": diverged}
@@ -156,31 +169,66 @@ class ModelBasedPredictive(Optimizer):
         self._stage = _ENDED
         return row
 
+    @property
+    def _left(self) -> int:
+        """Rollouts of a law that plans, once the affine law is trained."""
+        return min(self._judging, self._budget - self._count)
+
+    def _look(self, row: Row) -> None:
+        """Keep rollouts for a law that plans, if another one could save enough on the model."""
+        belief = self._affine.belief
+        if belief is None or self._too_large or not self._judging:
+            return
+        fields, before = self._simulated(belief)
+        horizon = self._context.horizon
+        planner = replace(self._plain(belief.model, fields), around=True, steps=horizon)
+        least = np.minimum(planner.begin(fields)[1] / horizon, before)
+        share = 1.0 - float(np.sum(least) / np.sum(before))
+        row["could_save"] = self._share = share if np.isfinite(share) else 0.0
+        if self._share > self._law.worth and not self._affine.done:
+            self._kept, known = self._judging, self._affine.state()
+            self._affine = self._trained()
+            self._affine.restore(known)
+
+    @property
+    def _too_large(self) -> bool:
+        """Whether the affine law is adapted in coordinates of a large state."""
+        return len(self._context.U) != len(self._law.model.U)
+
+    def _simulated(self, belief: Belief) -> tuple[Array, Array]:
+        """A few measured initial fields, and the affine law's costs from them on the model."""
+        loop, every = belief.loop(self._context), self._affine.fields
+        fields = every[np.unique(np.linspace(0, len(every) - 1, FEW).round().astype(int))]
+        return fields, loop.costs(loop.theta(self._affine.policy), fields)
+
     def _begin_judging(self, row: Row) -> None:
         """Make the law that plans, or say why there is none."""
         self._stage = _ENDED
         belief = self._affine.belief
+        if not self._kept and self._left:  # which the affine law did not need
+            self._look(row)
         if belief is None:
             why = "no model of the whole field was accepted"
-        elif len(self._context.U) != len(self._law.model.U):
+        elif self._too_large:
             why = f"plans use states of at most {len(self._context.U)} numbers"
-        elif not self._judging:
+        elif self._share <= self._law.worth:
+            why = f"on the model another law saves at most {100 * self._share:.2g} % more"
+        elif not self._left:
             why = "too few rollouts are left to judge one that plans"
         else:
-            with one_thread():
-                made = self._made(belief, row)
+            made = self._made(belief, row)
             if isinstance(made, Candidate):
                 self._candidate, self._stage = made, _JUDGING
                 row.pop("early", None)
                 return
             why = made
+        if self._left:
+            row.setdefault("early", why)
         row["reason"] = f"{row.get('reason', '')}; the affine law stays: {why}".removeprefix("; ")
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law that plans on this model; or why there is none."""
-        loop, every = belief.loop(self._context), self._affine.fields
-        fields = every[np.unique(np.linspace(0, len(every) - 1, FEW).round().astype(int))]
-        before = loop.costs(loop.theta(self._affine.policy), fields)
+        fields, before = self._simulated(belief)
         planner, costs = self._planner(belief.model, fields)
         share = 1.0 - float(np.sum(costs) / np.sum(before))
         row["plan_steps"], row["plan_saves"] = planner.steps, share if np.isfinite(share) else 0.0
@@ -192,8 +240,8 @@ class ModelBasedPredictive(Optimizer):
             return str(error)
         return Candidate(theta, costs, before)
 
-    def _planner(self, model: FieldModel, fields: Array) -> tuple[Planner, Array]:
-        """The plans to use, and their costs from initial fields."""
+    def _plain(self, model: FieldModel, fields: Array) -> Planner:
+        """Plans of one step of actions."""
         context, settings = self._context, self._law.settings
         n_s, policy = context.U.shape[1], self._affine.policy
         cost = context.cost or Cost(
@@ -205,7 +253,7 @@ class ModelBasedPredictive(Optimizer):
             target=context.target,
         )
         s_r = np.sum(context.U * context.target[:, None], axis=0)
-        plain = Planner(
+        return Planner(
             model,
             cost,
             context.action_set,
@@ -218,6 +266,10 @@ class ModelBasedPredictive(Optimizer):
             first=settings.first_iterations,
             starts=settings.starts,
         )
+
+    def _planner(self, model: FieldModel, fields: Array) -> tuple[Planner, Array]:
+        """The plans to use, and their costs from initial fields."""
+        plain, settings = self._plain(model, fields), self._law.settings
         lengths = sorted({min(steps, self._law.longest) for steps in LENGTHS})
         if settings.steps:
             lengths = [settings.steps]
@@ -277,6 +329,8 @@ class ModelBasedPredictive(Optimizer):
             "stage": np.array(self._stage),
             "tells": np.array(self._tells),
             "count": np.array(self._count),
+            "kept": np.array(self._kept),
+            "share": np.array(self._share),
             "plans": np.array(self._chosen is not None),
         }
         if self._candidate is not None:
@@ -289,6 +343,9 @@ class ModelBasedPredictive(Optimizer):
         stage = str(checked_array(state, "stage", "U", ()))
         if stage not in (_TRAINING, _JUDGING, _ENDED):
             raise ValueError(f"its stage is {stage!r}")
+        self._kept = int(checked_array(state, "kept", "i", ()))
+        self._share = float(checked_array(state, "share", "f", (), finite=False))
+        self._affine = self._trained()
         self._affine.restore(part_of(state, _OWN))
         self._stage, self._candidate = stage, None
         self._tells = int(checked_array(state, "tells", "i", ()))

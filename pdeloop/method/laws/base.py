@@ -233,6 +233,20 @@ class Law(ABC):
         """
         raise NotImplementedError
 
+    def has_gains(self, theta: Array) -> bool:
+        """Whether a theta has the compiled form; by default, `compiled`.
+
+        Parameters
+        ----------
+        theta : (size,)
+            The whole vector, or a longer one if the law `extends`.
+
+        Returns
+        -------
+        bool
+        """
+        return self.compiled
+
     def parts(self, theta: Array) -> Parts:
         """The parts of a vector theta, as views of it.
 

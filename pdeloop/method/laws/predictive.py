@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from threading import get_ident
+from time import perf_counter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +28,8 @@ LONGEST = 80
 """Steps of a plan, at most, unless the settings ask for more."""
 MOST_NUMBERS = 50_000
 """Numbers of a model that a theta has room for: messages carry one for each environment."""
+TIMED = 12
+"""Steps that are timed."""
 _MODEL = "model."
 _KEPT_PLANS, _KEPT_PLANNERS = 4096, 8
 
@@ -66,6 +69,9 @@ class Predictive(Law):
     needs_model = True
     Settings = PredictiveSettings
     settings: ClassVar[PredictiveSettings] = PredictiveSettings()
+    worth: ClassVar[float] = 0.0
+    """Share of the affine law's cost that must be to be had on the model before rollouts are kept for a
+    law that plans; 0: they always are."""
 
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)
@@ -124,6 +130,13 @@ class Predictive(Law):
     def plans(self, theta: Array) -> bool:
         """Whether this theta has a model to plan on."""
         return bool(theta[self._affine.size :].any())
+
+    def has_gains(self, theta: Array) -> bool:
+        """Without a model it is the affine law, to the bit."""
+        return not self.plans(theta)
+
+    def gains(self, theta: Array) -> Array:
+        return self._affine.gains(theta[: self._affine.size])
 
     def planner(self, theta: Parts) -> Planner:
         """The planner in theta; ValueError where its numbers are those of none."""
@@ -185,6 +198,23 @@ class Predictive(Law):
         after[-1] = memory[-1] + fell
         return after
 
+    def step_times(self, theta: Array, z: Array, steps: int = TIMED) -> tuple[float, float]:
+        """Seconds of the first step from a state (n_z,), and of one of the next, in the median.
+
+        The state follows the law's own model; without one it stays.
+        """
+        own = type(self)(self.model, self.horizon)
+        own.cost = self.cost
+        parts, memory, took = own.parts(theta), own.memory_start(), list[float]()
+        model = own.planner(parts).model if own.plans(theta) else None
+        for k in range(max(min(steps, self.horizon), 2)):
+            began = perf_counter()
+            a = own.action(parts, z, memory, k)
+            memory = own.memory_update(parts, z, memory, a, k)
+            took.append(perf_counter() - began)
+            z = z if model is None else model.step(z[None], a[None])[0]
+        return took[0], float(np.median(took[1:]))
+
     def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array, bool]:
         """The action (n_a,), its plan (H, n_a), and whether that came from the affine law.
 
@@ -203,3 +233,10 @@ class Predictive(Law):
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
         return known
+
+
+class Auto(Predictive):
+    """`Predictive` where the model says that more than 3 % of the cost is to be had; else `Affine`."""
+
+    name = "auto"
+    worth = 0.03

@@ -18,14 +18,17 @@ from pdeloop.method.laws.base import Law
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.laws.predictive import Auto, Predictive
 from pdeloop.method.settings import settings_from
 
 OWN_LAWS = OwnCode(
     "law",
     "PDELOOP_LAWS",
     MappingProxyType(
-        {kind.name: kind for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive)}
+        {
+            kind.name: kind
+            for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive, Auto)
+        }
     ),
 )
 
