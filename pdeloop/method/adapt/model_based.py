@@ -200,6 +200,16 @@ class ModelBased(Optimizer):
         renews = progress.stage == RENEWING and schedule.last > self._records.count
         return renews and progress.belief is not None and not progress.replayed
 
+    def last_law(self) -> Array:
+        """The law that the last update would give on the present model; nothing changes."""
+        known = replace(self._progress)
+        try:
+            if known.belief is not None:
+                self._improve(known.belief, {}, final=True)
+            return self.policy
+        finally:
+            self._progress = known
+
     def ask(self) -> list[Rollout]:
         """The rollouts of the current stage, at once where they do not depend on each other."""
         own, progress = self._records.count, self._progress
@@ -377,6 +387,7 @@ class ModelBased(Optimizer):
             progress.policy, row["steps"] = found
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        """Take the law of least cost on a model; final: by the last update."""
         loop, fields = belief.loop(self._context), self._fields()
         first, none = loop.theta(self._first), loop.theta(self._none)
         safe = beats_no_control(loop, first, fields)

@@ -9,8 +9,9 @@ better by more than chance (`verdict`).
 
 The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
 the affine law but the last, the best inputs for an episode are searched on the model from several
-starts. If they save more than 3 % of the affine law's cost, the last rollouts are kept; else they are
-the affine law's, which is then that of `law: affine` to the bit.
+starts. If they save more than 3 % of the cost of the affine law, also once that is improved as far as
+at the last update, the last rollouts are kept; else they are the affine law's, which is then that of
+`law: affine` to the bit.
 """
 
 from __future__ import annotations
@@ -179,12 +180,15 @@ class ModelBasedPredictive(Optimizer):
         belief = self._affine.belief
         if belief is None or self._too_large or not self._judging:
             return
-        fields, before = self._simulated(belief)
+        fields, before = self._simulated(belief, self._affine.policy)
         horizon = self._context.horizon
         planner = replace(self._plain(belief.model, fields), around=True, steps=horizon)
         least = np.minimum(planner.begin(fields)[1] / horizon, before)
-        share = 1.0 - float(np.sum(least) / np.sum(before))
-        row["could_save"] = self._share = share if np.isfinite(share) else 0.0
+        self._share = share_saved(least, before)
+        if self._share > self._law.worth and not self._affine.done:  # is that of affine laws, too?
+            _, before = self._simulated(belief, self._affine.last_law())
+            self._share = share_saved(np.minimum(least, before), before)
+        row["could_save"] = self._share
         if self._share > self._law.worth and not self._affine.done:
             self._kept, known = self._judging, self._affine.state()
             self._affine = self._trained()
@@ -195,11 +199,11 @@ class ModelBasedPredictive(Optimizer):
         """Whether the affine law is adapted in coordinates of a large state."""
         return len(self._context.U) != len(self._law.model.U)
 
-    def _simulated(self, belief: Belief) -> tuple[Array, Array]:
-        """A few measured initial fields, and the affine law's costs from them on the model."""
+    def _simulated(self, belief: Belief, policy: Array) -> tuple[Array, Array]:
+        """A few measured initial fields, and an affine law's costs from them on the model."""
         loop, every = belief.loop(self._context), self._affine.fields
         fields = every[np.unique(np.linspace(0, len(every) - 1, FEW).round().astype(int))]
-        return fields, loop.costs(loop.theta(self._affine.policy), fields)
+        return fields, loop.costs(loop.theta(policy), fields)
 
     def _begin_judging(self, row: Row) -> None:
         """Make the law that plans, or say why there is none."""
@@ -228,10 +232,9 @@ class ModelBasedPredictive(Optimizer):
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law that plans on this model; or why there is none."""
-        fields, before = self._simulated(belief)
+        fields, before = self._simulated(belief, self._affine.policy)
         planner, costs = self._planner(belief.model, fields)
-        share = 1.0 - float(np.sum(costs) / np.sum(before))
-        row["plan_steps"], row["plan_saves"] = planner.steps, share if np.isfinite(share) else 0.0
+        row["plan_steps"], row["plan_saves"] = planner.steps, share_saved(costs, before)
         if not np.sum(costs) < np.sum(before):
             return "on the model no plan is better"
         try:
@@ -359,6 +362,13 @@ class ModelBasedPredictive(Optimizer):
         if (plans or stage == _JUDGING) and self._candidate is None:
             raise ValueError("it has no law that plans")
         self._chosen = self._candidate.theta if plans and self._candidate else None
+
+
+def share_saved(costs: Array, before: Array) -> float:
+    """The share of costs that others save; 0 where that cannot be told."""
+    with np.errstate(invalid="ignore"):
+        share = 1.0 - float(np.sum(costs) / np.sum(before))
+    return share if np.isfinite(share) else 0.0
 
 
 def simulated(planner: Planner, fields: Array) -> Array:
