@@ -344,7 +344,7 @@ def text(result: Mapping[str, Any]) -> str:
         budgets = list(dict.fromkeys(row["budget"] for row in rows))
         cells = {(row["method"], row["budget"]): cell(row) for row in rows}
         last = {row["method"]: row["cost"] for row in rows}
-        head = [problem, *(f"{budget} rollouts" for budget in budgets), "over the limit"]
+        head = [problem, *(f"{budget} rollouts" for budget in budgets), "over the best known"]
         lines += ["", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
         for method in sorted(last, key=lambda name: last[name]):
             shown = [method, *(cells.get((method, budget), "") for budget in budgets)]
@@ -352,7 +352,9 @@ def text(result: Mapping[str, Any]) -> str:
             shown.append(f"{100 * (last[method] / bound - 1):z.1f} %" if known else "-")
             lines.append(f"| {' | '.join(shown)} |")
         if bound is not None:
-            lines.append(f"| any controller | {' | '.join([f'{bound:.4g}'] * len(budgets))} | 0 |")
+            lines.append(
+                f"| best known inputs | {' | '.join([f'{bound:.4g}'] * len(budgets))} | 0 |"
+            )
     return "\n".join(lines[1:])
 
 
@@ -393,9 +395,7 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
                 ax.plot(x, [r["cost"] for r in own], line, ms=4, lw=1, color=color, label=method)
                 ax.fill_between(x, *ends.T, alpha=0.15, lw=0, color=color)
             if bound is not None:
-                ax.axhline(
-                    bound, color="0", ls=":", lw=1, zorder=0, label="limit of any controller"
-                )
+                ax.axhline(bound, color="0", ls=":", lw=1, zorder=0, label="best known inputs")
                 ax.set_ylim(bottom=0.93 * bound)
             low, high = ax.get_ylim()
             plain_log(ax, high / max(low, 1e-9))

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The best affine law and the limit of any controller: `python -m benchmarks optimum` and `general`.
+"""The best affine law and the best known inputs: `python -m benchmarks optimum` and `general`.
 
 Both are those of a training's closed loop with the plant itself in place of its model, so that action
 limits and measurement noise count, and with exact derivatives:
@@ -9,7 +9,7 @@ limits and measurement noise count, and with exact derivatives:
   coordinates until it gains nothing more, from the first law or from zero, whichever leads further,
 - the inputs of least cost for known initial fields, without noise, as a_k = K_a U^T z_k + b + v_k
   around that law, by L-BFGS on all v_k: where the plant is unstable, the cost is a gentler function of
-  v than of a. No controller can do better, up to local optima.
+  v than of a. It is a local optimum: on chaotic and front-forming plants controllers can do better.
 """
 
 from __future__ import annotations

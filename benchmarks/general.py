@@ -2,7 +2,7 @@
 """`python -m benchmarks general`: the benefit of a training on plants for which it was not tuned.
 
 Every case of `benchmarks.families` is trained at each budget and seed, and compared on held-out fields
-with no control, with its own first law, with the best affine law and with the limit of any controller
+with no control, with its own first law, with the best affine law and with the best known inputs
 (`--bounds`: `benchmarks.bounds`; kept in benchmarks/families/bounds.json). Finished trainings are kept
 in a folder, so that an interrupted run continues where it stood. Constants of the method are chosen on
 `--tuning` seeds; tables are about the others.
@@ -48,7 +48,7 @@ BOUNDS = Path(__file__).parent / "families" / "bounds.json"
 EVERY_CASE = CASES | PROCESS_CASES
 REFERENCES = {
     "affine": "best affine law",
-    "limit": "limit",
+    "limit": "best known",
     "lqr": "LQR of the linearisation",
     "mpc": "its linear MPC",
 }
@@ -68,7 +68,7 @@ def run(
     folder: Path = Path("runs/general"),
     save: Path | None = None,
 ) -> dict[str, Any]:
-    """Train on every held-out case, and compare first law, adapted law and limit.
+    """Train on every held-out case, and compare first law, adapted law and best known inputs.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def run(
     tuning
         Use the seeds and held-out fields with which constants may be chosen.
     bounds
-        First compute the best affine law and the limit of any controller, and keep them.
+        First compute the best affine law and the best known inputs, and keep their costs.
     jobs
         Number of processes; one per core if not given.
     folder

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The open-loop limits that `python -m benchmarks optimum --save` keeps, to compare costs with.
+"""The costs of inputs that `python -m benchmarks optimum --save` keeps, to compare others with.
 
-A limit counts only for the plant it was computed for: all of the plant's parameters must agree, and
+A cost counts only for the plant it was computed for: all of the plant's parameters must agree, and
 it must still do the same (cost of the mean field without control).
 """
 
@@ -29,7 +29,7 @@ AGREEMENT = 1e-6
 
 
 def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> dict[str, Any]:
-    """What is kept of the limits of a problem, by evaluation seed."""
+    """What is kept of the costs for a problem, by evaluation seed."""
     return {
         "parameters": _parameters(values),
         "no_control_cost": mean_field_cost(build_plant(values)),
@@ -38,7 +38,7 @@ def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> 
 
 
 def find(values: Mapping[str, Any], folder: Path = FOLDER) -> NDArray[np.float64] | None:
-    """The limit on each field (fields,) of a closing evaluation; None if it is not known.
+    """The cost on each field (fields,) of a closing evaluation; None if it is not known.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def find(values: Mapping[str, Any], folder: Path = FOLDER) -> NDArray[np.float64
         return None
     known = read_json(path)
     costs = known["open_loop"].get(str(values["evaluation_seed"]), ())
-    # A parameter that was not known when the limit was kept has its default.
+    # A parameter that was not known when the cost was kept has its default.
     kept = {spec.name: spec.default for spec in _plant_parameters()} | known["parameters"]
     if len(costs) != values["evaluation_fields"] or kept != _parameters(values):
         return None

@@ -1,13 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks optimum`: how good can a policy be?
 
-Two limits with exact gradients of the plant (`benchmarks.bounds`):
+Two references with exact gradients of the plant (`benchmarks.bounds`):
 
 - the optimum of the policy class: the law a = K_a U^T z + b with the least mean stage cost over
   many initial fields of the training distribution, U as the training of that seed identifies it,
-- the open-loop limit: the inputs a_0 .. a_{T-1} with the least cost for one known initial field,
-  which no controller of any kind can undercut there (a local optimum, as the problem is not
-  convex).
+- the best known inputs: a_0 .. a_{T-1} of least cost for one known initial field, as one descent finds
+  them: a local optimum, as the problem is not convex.
 
 Both are measured on the fields of a training's closing evaluation, which the law has not seen.
 """
@@ -116,7 +115,7 @@ def run(
     settings: Sequence[str] = (),
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Compute the limits of the policy class and of any controller for each problem.
+    """Compute the best affine law and the best known inputs for each problem.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ def run(
     settings
         Words NAME=JSON: parameters of the problems, like reduced_order=4.
     save
-        Folder to which the open-loop limits are written, as PROBLEM.json (benchmarks.limits).
+        Folder to which the costs of these inputs are written, as PROBLEM.json (benchmarks.limits).
     """
     for name, number in (("seeds", seeds), ("fields", fields)):
         if number < 1:

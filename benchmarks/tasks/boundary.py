@@ -90,7 +90,7 @@ def rows(task: str, budgets: list[int], seeds: int) -> Iterator[Row]:
     yield row("exact LQR of the horizon", [lambda k, z: z @ K[k].T], "")
     if task == "reaction-diffusion":
         bounds = [f"{most(known, c):.6g}" for c in (1.0, 10.0)]
-        yield _row("limit of any inputs", ["", *bounds, "", ""], "", "here")
+        yield _row("best known inputs", ["", *bounds, "", ""], "", "here")
 
 
 def _row(name: str, figures: Sequence[str], spent: Any, by: str) -> Row:

@@ -206,10 +206,10 @@ def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -
     assert rows[0]["costs"] == [1.0, 2.0, 3.0, 4.0]
     rows = [{"problem": "p", **row} for row in rows]
     lines = baselines.text({"limits": {"p": 2.0}, "rows": rows}).splitlines()
-    assert lines[0] == "| p | 20 rollouts | over the limit |"
+    assert lines[0] == "| p | 20 rollouts | over the best known |"
     assert lines[2].startswith("| better | 2.5 (") and lines[2].endswith(") | 25.0 % |")
     assert lines[3].startswith("| worse | 3 (") and lines[3].endswith("to diverged) | 50.0 % |")
-    assert lines[4] == "| any controller | 2 | 0 |"
+    assert lines[4] == "| best known inputs | 2 | 0 |"
 
 
 def test_the_table_has_a_column_for_each_budget_and_says_which_methods_diverged():
@@ -223,7 +223,7 @@ def test_the_table_has_a_column_for_each_budget_and_says_which_methods_diverged(
         each["costs"] = [each["cost"]]
     lines = baselines.text({"limits": {"p": None}, "rows": rows}).splitlines()
     assert lines == [
-        "| p | 20 rollouts | 40 rollouts | over the limit |",
+        "| p | 20 rollouts | 40 rollouts | over the best known |",
         "|---|---|---|---|",
         "| a | 4 (3 to 5) | 2 | - |",
         "| b |  | diverged (2 of 3) | - |",

@@ -57,7 +57,7 @@ def test_its_return_is_that_of_the_task() -> None:
 
 
 def test_one_random_episode_gives_the_law_that_no_actions_improve_by_a_thousandth() -> None:
-    """The limit of any controller is -5.1736: `python -m benchmarks published lid`."""
+    """The best known inputs return -5.1736: `python -m benchmarks published lid`."""
     cavity = Cavity()
     plant = DynamicsPlant(cavity)
     explored = pdeloop.problem(plant=cavity, exploration_variance=1.0).explore(0)
