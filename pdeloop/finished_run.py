@@ -28,6 +28,7 @@ from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.calls import laws_of
 from pdeloop.method.laws.registry import OWN_LAWS, law_kind
 from pdeloop.method.seeds import Purpose, derive, evaluation_noise
+from tuner_node.batch import stacked
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder, model_of
 
@@ -322,7 +323,7 @@ def merged(runs: Sequence[FinishedRun]) -> FinishedRun:
         first.folder.parent,
         {**first.values, "seeds": len(runs)},
         {**first.result, "history": history},
-        policies=np.concatenate([run.policies for run in runs]),
+        policies=stacked([policy for run in runs for policy in run.policies]),
         warm=np.concatenate([run.warm for run in runs]),
         models=[model for run in runs for model in run.models],
         costs={name: np.concatenate([run.costs[name] for run in runs]) for name in first.costs},

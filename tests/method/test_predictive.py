@@ -13,6 +13,7 @@ import pdeloop
 from controller_node.law_batch import LawBatch
 from pdeloop.evaluation import evaluate
 from pdeloop.export import law_of
+from pdeloop.finished_run import merged
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
@@ -223,6 +224,10 @@ def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
     assert last["rollouts"] == 15 and last["chosen"] == "predictive" and not auto.affine
     shares = [row["could_save"] for row in auto.result["history"] if "could_save" in row]
     assert len(shares) == 1 and shares[0] > Auto.worth
+    both = merged([replace(auto, policies=auto.warm), auto])  # one plans, the other does not
+    assert not both.affine and np.array_equal(both.policies[1], auto.policies[0])
+    assert np.array_equal(both.laws[0].parts(both.policies[0])["K_a"], auto.models[0].K_a)
+    assert not both.policies[0, auto.warm.shape[1] :].any()
     line = next(
         line for line in closing_lines(problem, auto.result, out) if "the law that acts" in line
     )
