@@ -31,7 +31,7 @@ __all__ = ["run", "text"]
 def run(
     problems: Sequence[str] = (), *, lengths: Sequence[int] = (20, 80), steps: int = 25
 ) -> dict[str, Any]:
-    """Time steps of plans, each after the first one.
+    """Time steps of plans, each after the first one, by the processor's clock.
 
     Parameters
     ----------
