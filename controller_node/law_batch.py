@@ -53,12 +53,15 @@ class LawBatch:
     ) -> None:
         self._laws, self._action_set = list(laws), action_set
         self._projected = ProjectedLaw([law.model.U for law in laws], target, action_set)
-        self.compiled = self._projected if self._laws[0].compiled else None
-        """The compiled form, if all environments have one."""
+        rated = action_set.rated
+        self.compiled = self._projected if self._laws[0].compiled and not rated else None
+        """The compiled form, if all environments have one and actions have no rate limits."""
         self._by_gains = np.zeros(0, dtype=np.bool_)
         """Which environments have one."""
         self._environments: list[tuple[Law, Parts]] = []
         self._memories: list[Array] = []
+        self._before = np.zeros(0)
+        """The actions of the step before, a memory that rate limits give to every law."""
         self._next = 0
         """The step to which the memories belong."""
         self._answered: dict[int, tuple[int, Array]] = {}
@@ -68,8 +71,9 @@ class LawBatch:
 
     @property
     def remembers(self) -> bool:
-        """True if the law has a memory."""
-        return self._laws[0].memory_size > 0 and self.compiled is None
+        """True if the law has a memory, if only of its last action."""
+        remembers = self._laws[0].memory_size > 0 or self._action_set.rated
+        return remembers and self.compiled is None
 
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take theta of each environment for the next episode.
@@ -95,7 +99,8 @@ class LawBatch:
         laws = [
             (self._laws[i], own) for i, own in zip(index.tolist(), _vectors(theta), strict=True)
         ]
-        by_gains = np.array([law.has_gains(own) for law, own in laws])
+        rated = self._action_set.rated
+        by_gains = np.array([law.has_gains(own) and not rated for law, own in laws])
         if by_gains.any():
             none = np.zeros_like(laws[0][0].model.policy)
             gains = [
@@ -142,6 +147,7 @@ class LawBatch:
                 )
             ]
         self._next, self._answered[step] = step + 1, (seen, actions.copy())
+        self._before = self._answered[step][1]
         self.nbytes += actions.nbytes
         return actions
 
@@ -154,6 +160,7 @@ class LawBatch:
     def _begin(self) -> None:
         self._memories = [law.memory_start() for law, _ in self._environments]
         self._next, self._answered, self.nbytes = 0, {}, 0
+        self._before = self._action_set.start
 
     def _computed(self, step: int, states: Array) -> Array:
         if len(states) != len(self._environments):
@@ -169,7 +176,7 @@ class LawBatch:
                 )
             ]
         )
-        found = self._action_set.project(found)
+        found = self._action_set.project(found, after=self._before)
         if self._by_gains.any():  # as in a batch of their own
             by_gains = self._by_gains[:, None]
             found = np.where(by_gains, self._projected.actions(states), found)

@@ -8,6 +8,7 @@ and the nearest admissible action in place of it. It is computed by `controller_
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -194,7 +195,7 @@ def excitation(
     """The exploratory action (n_a,) of one step, of a draw of N(0, variance I).
 
     A pure function of (seed, step), so that a step that is answered twice gets the same action
-    twice.
+    twice. With rate limits it is after the actions of all steps before.
     """
     if seed < 0 or step < 0 or n_a < 1:
         raise ValueError(
@@ -203,5 +204,19 @@ def excitation(
         )
     if not (np.isfinite(variance) and variance >= 0.0):
         raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
+    if action_set.rated:
+        return _after(seed, step, n_a, variance, action_set).copy()
+    return action_set.explored(_draw(seed, step, n_a, variance))
+
+
+def _draw(seed: int, step: int, n_a: int, variance: float) -> Array:
     draw: Array = np.random.default_rng([seed, step]).standard_normal(n_a)
-    return action_set.explored(math.sqrt(variance) * draw)
+    return math.sqrt(variance) * draw
+
+
+@lru_cache(maxsize=4096)
+def _after(seed: int, step: int, n_a: int, variance: float, action_set: ActionSet) -> Array:
+    """The exploratory action within rate limits."""
+    draws = [_draw(seed, k, n_a, variance) for k in range(step + 1)]
+    found: Array = action_set.applied(action_set.explored(np.stack(draws)))[-1]
+    return found

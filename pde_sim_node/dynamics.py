@@ -73,6 +73,9 @@ class Dynamics(ABC):
         Weight of the state after the last step.
     action_low, action_high : number or (n_a,)
         Bounds of the actions. An action outside is replaced by the nearest admissible one.
+    action_rate : number or (n_a,)
+        Largest change of an action from one step to the next. Before the first step it is the middle
+        between two bounds, else 0 or the point nearest to it (`pdeloop.messages.action_set`).
     zero_mean : bool
         Whether the actions of a step must have mean zero.
     divergence_bound : float
@@ -105,6 +108,7 @@ class Dynamics(ABC):
     terminal_weight: Any = 0.0
     action_low: Any = -np.inf
     action_high: Any = np.inf
+    action_rate: Any = np.inf
     zero_mean: bool = False
     divergence_bound: float = 1e3
     supports: Array | None = None

@@ -102,6 +102,8 @@ class InstrumentedPlant:
         limit, bounds = instruments.action_limit, instruments.action_bounds
         given = {"n_a": plant.n_a, "action_limit": limit, "action_bounds": bounds}
         self._saturates = ActionSet.of(given)
+        self._before = np.zeros((0, plant.n_a))
+        """The actions applied in the step before, for rate limits."""
         self.action_set = ActionSet.of(
             {**given, "action_bounds": bounds or plant.action_set.bounds}
         )
@@ -175,6 +177,7 @@ class InstrumentedPlant:
         if noise is None:
             noise = np.zeros(self.batch, dtype=np.int64)
         drawn = field_seeds(seeds)
+        self._before = np.tile(self._saturates.start, (self.batch, 1))
         self._seeds = [(int(n), s) for n, s in zip(noise, drawn, strict=True)]
         self._published = np.tile(self._measure(), (1, self._delays))
         return self._published
@@ -182,6 +185,7 @@ class InstrumentedPlant:
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
         """Like `Plant.restart`; a step keeps the noise of that step of the episode."""
         self.plant.restart(environments, seeds)
+        self._before[environments] = self._saturates.start
         for m, seed in zip(environments.tolist(), field_seeds(seeds), strict=True):
             self._seeds[m] = self._seeds[m][0], seed
         self._published[environments] = np.tile(self._measure()[environments], (1, self._delays))
@@ -189,7 +193,10 @@ class InstrumentedPlant:
 
     def step(self, actions: Array) -> Array:
         """Hold the saturated actions for one sampling time; returns the measurement after it."""
-        self.plant.step(self._saturates.project(actions))
+        held = self._saturates.project(actions, after=self._before)
+        self.plant.step(held)
+        if self._saturates.rated:
+            self._before = held
         if self._forcing:
             self._force()
         newest = self._measure()

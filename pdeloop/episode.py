@@ -14,6 +14,7 @@ from controller_node.policy import ProjectedLaw
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
+from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array, float_array
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
@@ -188,14 +189,19 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     basis = finite_basis(plant, U)
     gains = float_array("policy", policy)
     gains = finite_array("policy", gains, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
-    projected, batch = ProjectedLaw([basis], plant.target, plant.action_set), 0
+    allowed, batch = plant.action_set, 0
+    projected = ProjectedLaw([basis], plant.target, ANY_ACTION if allowed.rated else allowed)
+    before = allowed.start
 
     def actions(k: int, states: Array) -> Array:
-        nonlocal batch
+        nonlocal batch, before
         if batch != len(states):
             batch = len(states)
             projected.set(np.broadcast_to(gains, (batch, *gains.shape[-2:])))
-        return projected.actions(states)
+        found = projected.actions(states)
+        if allowed.rated:
+            before = found = allowed.project(found, after=before if k else allowed.start)
+        return found
 
     return actions
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pdeloop.finished_run import FinishedRun
+from pdeloop.law_form import NO_RATES
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows, pack
@@ -178,13 +179,20 @@ def _filled(template: str, law: GainLaw | Parameters, model: ModelRows, **number
 
 
 def _bounds(allowed: ActionSet, n_a: int) -> dict[str, Array]:
-    """action_low and action_high (n_a,), infinite without a bound, and zero_mean."""
-    low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
-    return {"action_low": low, "action_high": high, "zero_mean": np.array(float(allowed.zero_mean))}
+    """action_low, action_high (n_a,), infinite without a bound, zero_mean, and rate limits if any.
+
+    The latter are action_rate, and action_start, a_{-1}, both (n_a,).
+    """
+    parts = {"low": allowed.low, "high": allowed.high}
+    parts |= {"rate": allowed.rate, "start": allowed.start} if allowed.rated else {}
+    arrays: dict[str, Array] = {f"action_{n}": np.broadcast_to(x, n_a) for n, x in parts.items()}
+    return {**arrays, "zero_mean": np.array(float(allowed.zero_mean))}
 
 
 def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
-    """The function that makes an action admissible."""
+    """The function that makes an action admissible; ParameterError for rate limits."""
+    if allowed.rated:
+        raise ParameterError(NO_RATES)
     low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
     balance = (_TEMPLATES / "balance.c.txt").read_text() if allowed.zero_mean else ""
     shift = "    const double shift = pdeloop_shift(a);\n"

@@ -260,7 +260,7 @@ class FinishedRun:
                 mean, total, ended = episode.cost.values.T[:3]
                 lost = np.where(ended == COMPLETED, -1, ended).astype(np.int64)
                 costs = EpisodeCosts(mean, total, lost)
-                yield EpisodeRecord(states, states, actions, costs, allowed.project(actions))
+                yield EpisodeRecord(states, states, actions, costs, allowed.applied(actions))
 
     def _repeated(self) -> Iterator[EpisodeRecord]:
         """The episodes of the same training, carried out again."""

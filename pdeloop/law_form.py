@@ -22,6 +22,11 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
 
+NO_RATES = (
+    "actions have rate limits, which this form of a law does not know: write it as .npz, where they "
+    "are action_rate, or use FinishedRun.law()"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class LawForm:
@@ -67,6 +72,8 @@ class LawForm:
 
 def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) -> LawForm:
     """The matrices of a law; ParameterError for one that has none, or a seed that there is not."""
+    if ActionSet.of(run.values).rated:
+        raise ParameterError(NO_RATES)
     theta, m = run.theta(which, seed).ravel(), run.index(seed)
     law, model = run.laws[m], run.models[m]
     if law.has_gains(theta):

@@ -120,8 +120,9 @@ def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
     draws = np.random.default_rng(0).normal(
         scale=np.sqrt(_variance(values)), size=(len(seeds), plant.horizon, plant.n_a)
     )
-    inputs = ActionSet.of(values).explored(draws)
-    return rollout(plant, lambda k, states: inputs[:, k], seeds, np.arange(len(seeds)))
+    allowed = ActionSet.of(values)
+    inputs = allowed.applied(allowed.explored(draws).swapaxes(0, 1))
+    return rollout(plant, lambda k, states: inputs[k], seeds, np.arange(len(seeds)))
 
 
 def _without_control(plant: Plant) -> NDArray[np.int64]:
@@ -267,21 +268,20 @@ def _first_law(plant: Plant, rows: ModelRows, settings: DesignSettings) -> Law:
 
 
 class Counted:
-    """A law that counts actions at a bound."""
+    """A law that counts actions at a bound, or at their rate limit."""
 
     def __init__(self, law: Law, action_set: ActionSet) -> None:
         self._law, self._action_set = law, action_set
-        self._at_bound: list[float] = []
+        self._actions: list[Array] = []
 
     def __call__(self, k: int, states: Array) -> Array:
-        actions = self._law(k, states)
-        self._at_bound.append(float(np.mean(~self._action_set.inside(actions))))
-        return actions
+        self._actions.append(self._law(k, states))
+        return self._actions[-1]
 
     @property
     def share(self) -> float:
-        """Actions at a bound, of all."""
-        return float(np.mean(self._at_bound))
+        """Actions at a bound or at their rate limit, of all."""
+        return float(np.mean(self._action_set.held_back(np.stack(self._actions))))
 
 
 def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
@@ -336,7 +336,8 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         costs.setdefault(f"order {rows.A.shape[0]}", cost)
     if share is not None and settings.action_set.bounded:
         told = (
-            f"{100 * share:.0f} % of the actions of the first law are at a bound of their actuator"
+            f"{100 * share:.0f} % of the actions of the first law are at a bound "
+            f"{'or the rate limit ' * settings.action_set.rated}of their actuator"
         )
         yield Finding("saturation", True, told, note=share > 0.5)
     told = ", ".join(

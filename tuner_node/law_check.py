@@ -43,7 +43,7 @@ def check_law(
                 near = _actions(law, theta, (1.0 + NEARBY) * states, actions)
                 moved = np.abs(near - expected).max(axis=1, initial=0.0)
                 allowed = MARGIN * np.maximum.accumulate(moved)
-        expected = action_set.project(expected)
+        expected = action_set.applied(expected)
         scale = np.maximum.accumulate(np.abs(actions).max(axis=1, initial=1.0))  # so far
         allowed += TOLERANCE * scale
         if not (np.abs(actions - expected) <= allowed[:, None]).all():

@@ -84,6 +84,7 @@ class BatchPlant(ABC):
         self.batch, self.step_index = batch, 0
         self.states = np.zeros((batch, self.n_z))
         self.actions = np.zeros((batch, self.n_a))
+        self._before = self.actions.copy()
         self.totals = np.zeros(batch)
         self.diverged_step = np.full(batch, -1, dtype=np.int64)
 
@@ -97,12 +98,14 @@ class BatchPlant(ABC):
         self.totals.fill(0.0)
         self.diverged_step.fill(-1)
         self.states[:] = states
+        self._before[:] = self.action_set.start
         return self.states
 
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
         """Begin again in some environments; see `pde_sim_node.plant.Plant.restart`."""
         self.states[environments] = self._initial_states(np.asarray(seeds), environments)
         self.totals[environments] = 0.0
+        self._before[environments] = self.action_set.start
         self.diverged_step[environments] = -1
         return self.states
 
@@ -152,6 +155,9 @@ class BatchPlant(ABC):
         self.actions[:] = actions
         if not all_finite(self.actions):
             raise ValueError("actions must be finite, got NaN or infinity")
+        if self.action_set.rated:
+            self.action_set.project(self.actions, self.actions, after=self._before)
+            self._before[:] = self.actions
         self._advance()
         self.step_index += 1
         return self.states

@@ -60,9 +60,8 @@ class DynamicsPlant(BatchPlant):
             for name, number in zip(WEIGHTS, cost.size, strict=True):
                 given[name] = number
             super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
-            self.action_set = ActionSet(
-                self.n_a, dynamics.action_low, dynamics.action_high, dynamics.zero_mean
-            )
+            bounds = dynamics.action_low, dynamics.action_high, dynamics.zero_mean
+            self.action_set = ActionSet(self.n_a, *bounds, rate=dynamics.action_rate)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
         self.supports = None if dynamics.supports is None else self._checked_supports()
@@ -132,6 +131,11 @@ class DynamicsPlant(BatchPlant):
             raise ValueError(
                 f"{self.name} has no derivatives, which exact gradients need: it has no method "
                 "pull_back(z, a, y)"
+            )
+        if self.action_set.rated:
+            raise ValueError(
+                f"{self.name} has rate limits, with which there are no exact gradients of the plant: "
+                "leave action_rate out"
             )
         return _DynamicsAdjoint(self)
 

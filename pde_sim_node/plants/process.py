@@ -45,6 +45,7 @@ DECLARED = (
     "action_target",
     "action_low",
     "action_high",
+    "action_rate",
     "zero_mean",
     "divergence_bound",
 )

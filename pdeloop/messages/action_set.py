@@ -8,6 +8,12 @@ with s = 0, or the shift with which the sum is zero. A plant applies P(a) of a r
 derivative of P is 1 for each actuator that is not at a bound and 0 for the others; with a mean of zero
 that of the former is less their mean.
 
+With rate limits the bounds of a step are narrower, P after the action applied before,
+
+    max(low, a_{k-1} - rate) <= x <= min(high, a_{k-1} + rate),
+
+and a_{-1} is the middle between two bounds, otherwise the point nearest to 0 that m is by default.
+
 Explorations are drawn around an operating point within the bounds, P(m + D x) with x ~ N(0, v I): m is
 the middle between two bounds, and otherwise the point nearest to 0 that is two standard deviations from
 the bound. D is the size of each actuator's standard deviation relative to the largest: a quarter of
@@ -53,6 +59,8 @@ class ActionSet:
         Whether the actions of a step have mean zero.
     limit : float
         Magnitude at which all actions saturate besides; 0 for none.
+    rate : number or (n_a,)
+        Largest change of an action from one step to the next; infinite where there is none.
     exploration_mean : (n_a,) array, optional
         m, the operating point; in place of the one above.
 
@@ -60,6 +68,12 @@ class ActionSet:
     ----------
     low, high : (n_a,) array, or () for any number
         The bounds, those of the limit included.
+    rate : (n_a,) array, or () for any number
+        The rate limits.
+    rated : bool
+        Whether there are any.
+    start : (n_a,) array, or ()
+        a_{-1}.
     bounded : bool
         Whether there is an action that is not in it.
     signed : (n,) array
@@ -84,9 +98,18 @@ class ActionSet:
         zero_mean: bool = False,
         *,
         limit: float = 0.0,
+        rate: ArrayLike = np.inf,
         exploration_mean: ArrayLike = (),
     ) -> None:
         own = [_bound(name, values, n_a) for name, values in (("low", low), ("high", high))]
+        self.rate = _bound("rate", rate, n_a)
+        self.rated = bool(np.isfinite(self.rate).any())
+        if not (self.rate > 0.0).all():
+            raise ValueError(f"action_rate must be positive, got {self.rate.tolist()}")
+        if self.rated and limit:
+            raise ValueError(
+                "action_rate goes with bounds, not with action_limit: give action_low and action_high"
+            )
         self.zero_mean, reach = bool(zero_mean), limit or np.inf
         self.low, self.high = np.maximum(own[0], -reach), np.minimum(own[1], reach)
         if not (self.low <= self.high).all():
@@ -96,10 +119,12 @@ class ActionSet:
             raise ValueError("no action between action_low and action_high has mean zero")
         self.bounds: list[float] = []
         """The parameter `action_bounds`."""
-        if zero_mean or np.isfinite(own).any():
-            least, most = (np.clip(part, -NO_BOUND, NO_BOUND).ravel().tolist() for part in own)
-            self.bounds = [*least, *most, float(self.zero_mean)]
-        self.bounded = bool(zero_mean or np.isfinite([self.low, self.high]).any())
+        if zero_mean or self.rated or np.isfinite(own).any():
+            least, most, rates = (
+                np.clip(part, -NO_BOUND, NO_BOUND).ravel().tolist() for part in (*own, self.rate)
+            )
+            self.bounds = [*least, *most, float(self.zero_mean), *rates * self.rated]
+        self.bounded = bool(zero_mean or self.rated or np.isfinite([self.low, self.high]).any())
         mean = float_array("exploration_mean", exploration_mean)
         if mean.size and not (mean.shape == (n_a,) and np.allclose(self.project(mean), mean)):
             raise ValueError(
@@ -111,7 +136,8 @@ class ActionSet:
             UNBOUNDED_VARIANCE,
             np.ones_like(self.low),
         )
-        self.exploration_mean = mean if mean.size else np.zeros_like(self.low)
+        self.start = np.zeros_like(self.low)
+        self.exploration_mean = mean if mean.size else self.start
         self._moved = bool(self.bounds or mean.size)
         if self.bounds:
             self._set_exploration(given=bool(mean.size))
@@ -134,14 +160,16 @@ class ActionSet:
         try:
             if not bounds.size:
                 return ActionSet(n_a, **others)
-            if bounds.size != 2 * n_a + 1 or bounds[-1] not in (0.0, 1.0):
+            sizes = (2 * n_a + 1, 3 * n_a + 1)
+            if bounds.size not in sizes or bounds[2 * n_a] not in (0.0, 1.0):
                 raise ValueError(
                     f"expected {n_a} lower bounds, {n_a} upper bounds, and 1 where actions have mean "
-                    f"zero, else 0; got {bounds.size} numbers"
+                    f"zero, else 0, then {n_a} rate limits or nothing; got {bounds.size} numbers"
                 )
             own = np.where(np.abs(bounds) < NO_BOUND, bounds, np.copysign(np.inf, bounds))
-            low, high = own[:n_a], own[n_a:-1]
-            return ActionSet(n_a, low, high, bool(bounds[-1]), **others)
+            low, high, rate = own[:n_a], own[n_a : 2 * n_a], own[2 * n_a + 1 :]
+            others["rate"] = rate if rate.size else np.inf
+            return ActionSet(n_a, low, high, bool(bounds[2 * n_a]), **others)
         except ValueError as error:
             name = "exploration_mean" if "exploration_mean" in str(error) else "action_bounds"
             raise ParameterError(f"parameter '{name}': {error}") from error
@@ -155,10 +183,9 @@ class ActionSet:
         if two.any():
             self.exploration_variance = float(own.max()) ** 2
         self.exploration_scale = own / max(float(own.max()), 1e-300)
+        self.start = self.project(inside) if inside.ndim else inside * (not self.zero_mean)
         if not given:
-            self.exploration_mean = (
-                self.project(inside) if inside.ndim else inside * (not self.zero_mean)
-            )
+            self.exploration_mean = self.start
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ActionSet) and np.array_equal(self.signed, other.signed)
@@ -170,7 +197,9 @@ class ActionSet:
         mean = ", zero_mean=True" if self.zero_mean else ""
         return f"{type(self).__name__}(low={self.low.tolist()}, high={self.high.tolist()}{mean})"
 
-    def project(self, actions: Array, out: Array | None = None) -> Array:
+    def project(
+        self, actions: Array, out: Array | None = None, *, after: Array | None = None
+    ) -> Array:
         """The nearest actions of the set; what is in it already is left as it is, to the bit.
 
         Parameters
@@ -181,6 +210,8 @@ class ActionSet:
         out : array, optional
             Where the result is written, also `actions` itself; a new array, or `actions` where every
             action is in the set, without it.
+        after : (..., n_a) array, optional
+            The actions applied in the step before, of which rate limits are; none apply without it.
 
         Examples
         --------
@@ -192,9 +223,31 @@ class ActionSet:
                 return actions
             out[...] = actions
             return out
-        moved = actions - self._shifts(actions) if self.zero_mean else actions
-        clipped: Array = np.clip(moved, self.low, self.high, out=out)
+        low, high = self._within(after)
+        moved = actions - self._shifts(actions, low, high) if self.zero_mean else actions
+        clipped: Array = np.clip(moved, low, high, out=out)
         return clipped
+
+    def applied(self, requested: Array) -> Array:
+        """The actions (T, ..., n_a) that are applied for requested ones of the steps of an episode.
+
+        Examples
+        --------
+        >>> ActionSet(1, rate=0.5).applied(np.array([[2.0], [2.0], [-1.0]])).ravel()
+        array([0.5, 1. , 0.5])
+        """
+        if not self.rated:
+            return self.project(requested)
+        found, held = np.empty_like(requested), self.start
+        for k, actions in enumerate(requested):
+            held = found[k] = self.project(actions, after=held)
+        return found
+
+    def _within(self, after: Array | None) -> tuple[Array, Array]:
+        """Lowest and highest actions of a step."""
+        if after is None or not self.rated:
+            return self.low, self.high
+        return np.maximum(self.low, after - self.rate), np.minimum(self.high, after + self.rate)
 
     def pull_back(self, requested: Array, y: Array) -> Array:
         """The transposed derivative of `project` at requested actions times y, all (..., n_a).
@@ -208,17 +261,30 @@ class ActionSet:
         """
         if not self.bounded:
             return y
-        moved = requested - self._shifts(requested) if self.zero_mean else requested
-        free = (moved >= self.low) & (moved <= self.high)
+        return self.pull_back_after(requested, y, None)[0]
+
+    def pull_back_after(
+        self, requested: Array, y: Array, after: Array | None
+    ) -> tuple[Array, Array]:
+        """`pull_back` where rate limits are of the actions before, and the same by those, times y."""
+        low, high = self._within(after)
+        moved = requested - self._shifts(requested, low, high) if self.zero_mean else requested
+        free = (moved >= low) & (moved <= high)
         pulled: Array = y * free
         if self.zero_mean:
             count = np.maximum(free.sum(axis=-1, keepdims=True), 1)
-            pulled = pulled - free * (pulled.sum(axis=-1, keepdims=True) / count)
-        return pulled
+            mean = pulled.sum(axis=-1, keepdims=True) / count
+            pulled, y = pulled - free * mean, y - mean
+        slow = ((moved < low) & (low > self.low)) | ((moved > high) & (high < self.high))
+        return pulled, y * slow
 
-    def inside(self, applied: Array) -> NDArray[np.bool_]:
-        """Which of applied actions (..., n_a) are not at a bound."""
-        found: NDArray[np.bool_] = (applied > self.low) & (applied < self.high)
+    def held_back(self, applied: Array) -> NDArray[np.bool_]:
+        """Which of the actions (T, ..., n_a) of an episode are at a bound, or at their rate limit."""
+        before = np.concatenate(
+            [np.broadcast_to(self.start, (1, *applied.shape[1:])), applied[:-1]]
+        )
+        low, high = self._within(before)
+        found: NDArray[np.bool_] = (applied <= low) | (applied >= high)
         return found
 
     def free(self, n_a: int) -> Array:
@@ -249,33 +315,34 @@ class ActionSet:
             self.exploration_mean + self.exploration_scale * draws if self._moved else draws
         )
 
-    def _shifts(self, actions: Array) -> Array:
-        """s of each action, (..., 1)."""
+    def _shifts(self, actions: Array, low: Array, high: Array) -> Array:
+        """s of each action, (..., 1), between these bounds."""
         rows = np.ascontiguousarray(actions).reshape(-1, actions.shape[-1])
+        low, high = (np.broadcast_to(x, actions.shape).reshape(rows.shape) for x in (low, high))
         with np.errstate(invalid="ignore"):
             shifts = rows.mean(axis=1)
             shifts[np.abs(shifts) <= _BALANCED * np.abs(rows).max(axis=1)] = 0.0
             moved = rows - shifts[:, None]
-            whole = ((moved >= self.low) & (moved <= self.high)).all(axis=1)
+            whole = ((moved >= low) & (moved <= high)).all(axis=1)
         for m in np.flatnonzero(~whole):
-            shifts[m] = self._balance(rows[m])
+            shifts[m] = self._balance(rows[m], low[m], high[m])
         found: Array = shifts.reshape(*actions.shape[:-1], 1)
         return found
 
-    def _balance(self, a: Array) -> float:
+    def _balance(self, a: Array, low: Array, high: Array) -> float:
         """s of one action: between two breakpoints the sum falls with it, linearly."""
         if not np.isfinite(a).all():
             return np.nan
-        breaks = np.sort(np.concatenate([a - self.low, a - self.high]))
+        breaks = np.sort(np.concatenate([a - low, a - high]))
         breaks = breaks[np.isfinite(breaks)]
-        sums = np.clip(a - breaks[:, None], self.low, self.high).sum(axis=1)
+        sums = np.clip(a - breaks[:, None], low, high).sum(axis=1)
         last = int(np.count_nonzero(sums > 0.0))  # sums fall: the zero is between last - 1 and last
         if last in (0, len(breaks)):
             between = breaks[0] - 1.0 if last == 0 else breaks[-1] + 1.0
         else:
             between = 0.5 * (breaks[last - 1] + breaks[last])
-        held: Array = np.clip(a - between, self.low, self.high)
-        free = (held > self.low) & (held < self.high)
+        held: Array = np.clip(a - between, low, high)
+        free = (held > low) & (held < high)
         if not free.any():
             return float(between)
         return float((a[free].sum() + held[~free].sum()) / np.count_nonzero(free))

@@ -45,8 +45,9 @@ INSTRUMENTS = _section(
         "magnitude at which actions saturate; 0: no limit"
     ),
     Spec("action_bounds", [], -1e300, 1e300, nodes="PCT").means(
-        "lowest actions, highest actions, and 1 if their mean is zero, else 0; filled in by a plant of "
-        "your own; -1e300 and 1e300: no bound; empty: none"
+        "lowest actions, highest actions, 1 if their mean is zero, else 0, and largest changes in a "
+        "step if there are any; filled in by a plant of your own; -1e300 and 1e300: no bound; empty: "
+        "none"
     ),
     Spec("sensors", 0, 0, 65536, group="problem").means(
         "number n_y of equally spaced point sensors; 0: the whole state is measured"

@@ -17,16 +17,17 @@ CURVES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 
 def saturated(applied: Array, allowed: ActionSet) -> float:
-    """Share of applied actions (..., n_a) that are at a bound of their actuator; 0 without bounds."""
+    """Share of applied actions (T, .., n_a) at a bound or rate limit of their actuator."""
     known = np.isfinite(applied)
-    return float((known & ~allowed.inside(applied)).sum() / max(known.sum(), 1))
+    return float((known & allowed.held_back(applied)).sum() / max(known.sum(), 1))
 
 
 def share_text(applied: Array, allowed: ActionSet) -> str:
     """The share in words; empty without bounds."""
-    if not np.isfinite([allowed.low, allowed.high]).any():
+    if not (allowed.rated or np.isfinite([allowed.low, allowed.high]).any()):
         return ""
-    return f"{100 * saturated(applied, allowed):.3g} % at a bound"
+    limits = " or rate limit" * allowed.rated
+    return f"{100 * saturated(applied, allowed):.3g} % at a bound{limits}"
 
 
 def action_range(parts: list[Array], allowed: ActionSet) -> tuple[float, float]:

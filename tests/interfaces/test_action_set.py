@@ -65,7 +65,7 @@ def test_at_a_bound_the_derivative_is_that_from_inside() -> None:
     # No control of heaters is at their bound: a descent from there must not stop.
     heaters, y = ActionSet(low=0.0, high=4.0), np.array([[1.0, 2.0, 3.0]])
     np.testing.assert_array_equal(heaters.pull_back(np.array([[0.0, -1.0, 4.0]]), y), [[1, 0, 3]])
-    assert heaters.inside(np.array([0.0, 2.0, 4.0])).tolist() == [False, True, False]
+    assert heaters.held_back(np.array([0.0, 2.0, 4.0])).tolist() == [True, False, True]
 
 
 def test_what_is_not_finite_disturbs_no_other_action() -> None:

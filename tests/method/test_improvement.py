@@ -54,6 +54,8 @@ def fields(count: int) -> np.ndarray:
         (ActionSet(limit=0.4), 0.0),
         (ActionSet(low=-0.1), 0.0),
         (ActionSet(N_A, -0.5, 0.3, zero_mean=True), 0.0),
+        (ActionSet(N_A, -0.5, 0.3, rate=0.2), 0.0),
+        (ActionSet(N_A, -0.5, 0.3, zero_mean=True, rate=[0.2, 0.1]), 0.0),
         (ANY_ACTION, 0.3),
     ],
 )
@@ -64,9 +66,9 @@ def test_the_gradient_is_that_of_finite_differences(admissible: ActionSet, noise
     cost, gradient = closed.gradient(theta, start, weights)
     assert cost == pytest.approx(weights @ closed.costs(theta, start), rel=1e-14)
     actions = closed.simulate(theta, start).actions
-    saturated = ~admissible.inside(actions)
+    saturated = admissible.held_back(actions)
     assert saturated.any() == admissible.bounded and not saturated.all()
-    np.testing.assert_array_equal(admissible.project(actions), actions)
+    np.testing.assert_array_equal(admissible.applied(actions), actions)
     h, finite = 1e-6, np.zeros_like(theta)
     for index in np.ndindex(theta.shape):
         step = np.zeros_like(theta)

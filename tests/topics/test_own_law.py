@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,16 +36,30 @@ def test_it_trains_over_topics_to_the_bits_of_one_process_and_is_recorded(
     assert "no difference, to the bit" in verified
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"law": "observer", "identification": "subspace"},
+        {"action_bounds": [*[-0.3] * 4, *[0.3] * 4, 0.0, *[0.05] * 3, 1e300]},
+    ],
+)
 def test_a_controller_that_is_killed_under_a_law_with_memory_changes_nothing(
-    loop: Processes, tmp_path: Path
+    loop: Processes, tmp_path: Path, given: dict[str, Any]
 ) -> None:
-    out = tmp_path / "run"
-    law = {"law": "observer", "identification": "subspace"}
-    flags = [word for name, value in law.items() for word in (f"--{name}", value)]
-    run = loop.pdeloop("train", str(SMALL), *flags, "--iterations", "60", "--out", str(out))
+    out, problem = tmp_path / "run", tmp_path / "small.yaml"
+    lines, flags = SMALL.read_text(), ["--iterations", "60", "--record", "--out", str(out)]
+    for name, value in given.items():
+        if name == "action_bounds":
+            lines += f"    {name}: {value}\n"
+        else:
+            flags += [f"--{name}", value]
+    problem.write_text(lines)
+    run = loop.pdeloop("train", str(problem), *flags)
     until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
     (pid,) = loop.pids("controller_node")
     os.kill(pid, signal.SIGKILL)
     told = loop.wait(run, LIMIT)
     assert "controller_node was killed by SIGKILL; starting it again" in told
-    assert_same_training(out, train_here(parameters(**law, iterations=60)))
+    assert_same_training(out, train_here(parameters(**given, iterations=60)))
+    verified = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
+    assert "no difference, to the bit" in verified

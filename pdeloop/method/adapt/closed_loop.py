@@ -309,6 +309,14 @@ class ClosedLoop(ClosedLoopProblem):
         changed[:n_a, n_f:] -= excess.T
         return changed
 
+    def calmer(self, theta: Array, share: float) -> Array:
+        """The law with this share of the gains of its actions, and the same action at the target."""
+        changed, n_a, n_f = theta.copy(), self.model.n_a, theta.shape[1] - self.constants
+        at_target = theta[:n_a, :n_f] @ np.resize(self.s_r, n_f)
+        changed[:n_a, :n_f] *= share
+        changed[:n_a, n_f:] += (1.0 - share) * at_target[:, None]
+        return changed
+
     def moment(self, simulation: Simulation, weights: Array) -> Array:
         """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields."""
         features = simulation.features

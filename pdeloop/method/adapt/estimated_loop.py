@@ -146,7 +146,7 @@ def simulate_estimated(
     known = law.filter(parts)
     if known is None:
         return Simulation(states, actions, costs, features)
-    costs, finite = np.zeros(count), np.ones(count, dtype=bool)
+    costs, finite, a = np.zeros(count), np.ones(count, dtype=bool), loop.action_set.start
     noise = loop.noise * np.random.default_rng(0).standard_normal((T, count, model.sensors))
     states[0] = fields
     x, S = (np.repeat(part[None], count, axis=0) for part in known.start)
@@ -158,8 +158,9 @@ def simulate_estimated(
             s = y @ law.model.U
             p = p if k else s
             x, S = known.measured(x, S, y)
+            before = a
             a = x @ parts["K_e"].T + p @ parts["K"].T + s @ parts["D"].T + parts["b"]
-            loop.action_set.project(a, out=a)
+            loop.action_set.project(a, out=a, after=before)
             error = z - loop.target
             costs += loop.state_weight * np.einsum("fi,fi->f", error, error)
             costs += loop.action_weight * np.einsum("fi,fi->f", a, a)

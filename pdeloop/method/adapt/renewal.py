@@ -280,6 +280,8 @@ def _descent(
     def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
         drawn = mixtures(fields, most, rng, components, periodic=periodic)
         every, weights = weighted(fields, drawn)
+        if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
+            starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
         start = cheapest(loop, starts, every, weights)
         found = improve(loop, start, every, weights, curvature, settings, least_gain)
         rests = found is not None and not found.after < (1.0 - least_gain) * found.before

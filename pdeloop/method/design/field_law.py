@@ -384,12 +384,11 @@ def field_law(
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
-        law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_set)
-        total = 0.0
-        for states in states_under(judge, law, fields, horizon):
+        law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0
+        for states in states_under(judge, saturated(law, action_set), fields, horizon):
             if len(states) < horizon:
                 return np.inf
-            actions = law(0, states[:horizon])
+            actions = action_set.applied(law(0, states[:horizon]))
             if cost is not None:
                 total += sum_of(cost, states, actions)
                 continue

@@ -103,12 +103,15 @@ def affine_law(K: Array, b: Array) -> Law:
 
 
 def saturated(law: Law, action_set: ActionSet) -> Law:
-    """The law with the nearest admissible actions."""
+    """The law with the nearest admissible actions, for one rollout after the other from k = 0."""
     if not action_set.bounded:
         return law
+    before = action_set.start
 
     def limited(k: int, states: Array) -> Array:
-        return action_set.project(law(k, states))
+        nonlocal before
+        before = action_set.project(law(k, states), after=before if k else action_set.start)
+        return before
 
     return limited
 

@@ -292,6 +292,6 @@ def limited(rollout: Measured, action_set: ActionSet) -> Measured:
     law = rollout.law
     return replace(
         rollout,
-        actions=action_set.project(rollout.actions),
+        actions=action_set.applied(rollout.actions),
         law=None if law is None else saturated(law, action_set),
     )

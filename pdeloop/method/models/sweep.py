@@ -11,7 +11,8 @@ eta_k and mu_k those by z_k and p_k,
     g_k       = P'^T [ (df/da)^T eta_{k+1} + B^T mu_{k+1} + dJ/da_k ],        dJ/dv_k = [g_k; mu_{k+1}],
     [eta; mu]_k = [(df/dz)^T eta_{k+1}; 0] + dJ/d[z; p]_k + K^T [g_k; mu_{k+1}],
 
-about three simulations' work. Laws in a closed loop (`pdeloop.method.adapt.closed_loop`) and plans
+about three simulations' work. With rate limits P also depends on a_{k-1}, through which g_k has a part
+of g_{k+1}. Laws in a closed loop (`pdeloop.method.adapt.closed_loop`) and plans
 (`pdeloop.method.laws.plans`) give K, b, v and e. Only a law whose memory is not linear in what it sees,
 the extended Kalman filter's, is simulated elsewhere (`pdeloop.method.adapt.estimated_loop`).
 
@@ -87,7 +88,7 @@ def sweep_of(
     horizon: most steps; B (n_p, n_a), or None: there is no memory.
     """
     B = np.zeros((0, model.n_a)) if B is None else B
-    separate = not action_set.zero_mean
+    separate = not (action_set.zero_mean or action_set.rated)
     if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
         plan = model.compiled.plan
         tape = 64 * int(plan["steps"]) * int(plan["fine"]["m"]) * max(horizon, 1)
@@ -138,7 +139,8 @@ class ModelSweep:
         states[:, 0] = start
         for k in range(H):
             own = requested[:, k] = np.einsum("mi,ji->mj", states[:, k], K) + b + v[:, k]
-            a = actions[:, k] = self._set.project(own[:, :n_a])
+            before = actions[:, k - 1] if k else self._set.start
+            a = actions[:, k] = self._set.project(own[:, :n_a], after=before)
             z = self._model.step(states[:, k, :n_z], a)
             states[:, k + 1, :n_z] = z if e is None else z + e[:, k]
             states[:, k + 1, n_z:] = own[:, n_a:] + np.einsum("mi,ji->mj", a, self._B)
@@ -155,14 +157,20 @@ class ModelSweep:
         self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
     ) -> Array:
         n_a, n_z = self._B.shape[1], self._model.n_z
-        found = np.empty((*on_actions.shape[:2], len(K)))
+        found, later = np.empty((*on_actions.shape[:2], len(K))), np.zeros(n_a)
         for k in reversed(range(found.shape[1])):
             mu = eta[:, n_z:]
             pulled, g = self._model.pull_back(
                 self._states[:, k, :n_z], self._actions[:, k], eta[:, :n_z]
             )
             g = g + on_actions[:, k] + np.einsum("mj,ji->mi", mu, self._B)
-            found[:, k, :n_a] = self._set.pull_back(requested[:, k], g)
+            if self._set.rated:
+                before = self._actions[:, k - 1] if k else self._set.start
+                found[:, k, :n_a], later = self._set.pull_back_after(
+                    requested[:, k], g + later, before
+                )
+            else:
+                found[:, k, :n_a] = self._set.pull_back(requested[:, k], g)
             found[:, k, n_a:] = mu
             eta = on_states[:, k] + np.einsum("mj,ji->mi", found[:, k], K)
             eta[:, :n_z] += pulled
