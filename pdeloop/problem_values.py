@@ -6,14 +6,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from pde_sim_node.build import complete
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.problem import find_problem
 from pdeloop.messages.spec import flatten
 from pdeloop.method.models.settings import SENSED_MOST
 from tuner_node.build import few_sensors
 from tuner_node.optimizer_parameters import training_parameters
+
+RESTS = 1e-9
+"""Change of a state in a step, in units of the divergence bound, that rounding explains."""
 
 
 def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[str, Any]]:
@@ -23,11 +30,23 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     """
     given = flatten(options)
     plant, values = complete(training_parameters(name, given), compiled=False)
-    if plant.cost.target.ndim > 1:  # which the plant itself may say
-        values |= training_parameters(name, given, plant.cost)
+    if plant.cost.target.ndim > 1 or _drifts(plant):  # which the plant itself may say
+        values |= training_parameters(name, given, constants=True)
     if _is_order_sought(name, given, plant, values):
         values["reduced_order"] = 0
     return plant, values
+
+
+def _drifts(plant: Plant) -> bool:
+    """Whether a plant of one's own leaves a target of 0 by itself, where K_b s_r cannot hold it."""
+    true = getattr(plant, "plant", plant)
+    if plant.target.any() or not (isinstance(true, DynamicsPlant) and true.settable):
+        return False
+    try:
+        after, _ = true.evaluate(np.zeros((1, plant.n_z)), np.zeros((1, plant.n_a)))
+    except OwnCodeError:  # a training says so where it matters
+        return False
+    return bool(np.abs(after).max() > RESTS * true.divergence_bound)
 
 
 def _is_order_sought(

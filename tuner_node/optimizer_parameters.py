@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from pdeloop.messages.cost import Cost
 from pdeloop.messages.parameters import LAW, OPTIMIZER, POINTS
 from pdeloop.messages.problem import load_parameters
 from pdeloop.messages.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
@@ -57,23 +56,24 @@ def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
 
 
 def training_parameters(
-    name: str, options: Mapping[str, Any], cost: Cost | None = None
+    name: str, options: Mapping[str, Any], *, constants: bool = False
 ) -> dict[str, Any]:
     """Like `load_parameters`, with the optimiser's preferred defaults and all settings.
 
-    options: by dotted names, or nested, as optimizer_settings={"fields": 5}; cost: that of the plant,
-    where it is known.
+    options: by dotted names, or nested, as optimizer_settings={"fields": 5}; constants: whether the
+    plant needs a law with constant parts of its own, where that is known.
     """
     own = flatten(options)
-    return with_settings(load_parameters(name, own, partial(_preferred, options=own, cost=cost)))
+    preferred = partial(_preferred, options=own, constants=constants)
+    return with_settings(load_parameters(name, own, preferred))
 
 
 def _preferred(
-    given: Mapping[str, Any], options: Mapping[str, Any], cost: Cost | None
+    given: Mapping[str, Any], options: Mapping[str, Any], constants: bool
 ) -> dict[str, Any]:
     """The given parameters with the defaults that the optimiser prefers.
 
-    The law too may be one of few sensors, or of a target that moves.
+    The law too may be one of few sensors, or with constant parts.
 
     A model of the whole field that a problem's file asks for, and the options do not, gives way to one
     of few readings. The optimiser's name may be written as the command line writes words: two-point.
@@ -88,8 +88,8 @@ def _preferred(
     )
     if few and kind.law_of_sensors and _number(given, "sensor_delays") <= 1:
         preferences[LAW.name] = kind.law_of_sensors
-    elif kind.law_of_moving_targets and not few and cost is not None and cost.target.ndim > 1:
-        preferences[LAW.name] = kind.law_of_moving_targets
+    elif kind.law_with_constants and not few and constants:
+        preferences[LAW.name] = kind.law_with_constants
     readings = law_of({**preferences, **given}).from_readings
     if few and readings:
         preferences["identification"] = readings

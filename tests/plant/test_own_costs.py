@@ -131,6 +131,45 @@ def test_a_moving_target_is_followed_by_default() -> None:
     assert cost["adapted"].mean() <= 1.03 * cost["best"].mean()
 
 
+class Offset(pdeloop.Dynamics):
+    """A plant that a constant disturbance moves away from its target of 0."""
+
+    n_z, n_a, horizon, action_weight = 2, 1, 30, 0.1
+    A, B, d = np.array([[1.0, 0.3], [-0.1, 0.9]]), np.array([[0.0], [0.4]]), np.array([0.0, 0.3])
+
+    def __init__(self, share: float = 1.0) -> None:
+        self.share = share
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(2)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return self.A @ z + self.B @ a + self.share * self.d
+
+    def least_cost(self, fields: np.ndarray) -> float:
+        """By dynamic programming with the state [z; 1]."""
+        A, B = (
+            np.block([[self.A, self.d[:, None]], [np.zeros((1, 2)), 1.0]]),
+            np.r_[self.B, [[0.0]]],
+        )
+        P = Q = np.diag([1.0, 1.0, 0.0])
+        for _ in range(self.horizon - 1):  # the last action only costs: it is 0
+            K = np.linalg.solve(self.action_weight * np.eye(1) + B.T @ P @ B, B.T @ P @ A)
+            P = A.T @ P @ (A - B @ K) + Q
+        x = np.c_[fields, np.ones(len(fields))]
+        return float(np.mean(np.einsum("mi,ij,mj->m", x, P, x)) / self.horizon)
+
+
+def test_a_constant_disturbance_is_met_at_a_target_of_0_by_default() -> None:
+    run = pdeloop.train(plant=Offset(), rollouts=12, evaluation_fields=20, reduced_order=2)
+    assert run.values["law"] == "feedforward"
+    fields = DynamicsPlant(Offset()).reset(run.evaluation[0]).copy()
+    least = Offset().least_cost(fields)
+    assert least <= np.mean(run.costs["adapted"]) <= 1.01 * least
+    assert pdeloop.problem(plant=Offset(0.0)).values["law"] == "affine"
+    assert pdeloop.problem(plant=Offset(), law="observer").values["law"] == "observer"
+
+
 def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
     class OfWeights(ModelBased):
         name = "of_weights"

@@ -242,8 +242,9 @@ class Optimizer(Protocol):
     states of more than 2,048 numbers (`pdeloop.method.adapt.in_coordinates`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
-    law_of_moving_targets: ClassVar[str] = ""
-    """The law preferred where the target changes from step to step; empty: as without."""
+    law_with_constants: ClassVar[str] = ""
+    """The law preferred where the target changes from step to step, or is 0 and not where the plant
+    rests; empty: as without."""
     law_of_sensors: ClassVar[str] = ""
     """The law preferred where the state is that of few sensors; empty: as without."""
     iteration_rollouts: ClassVar[int] = 0

@@ -113,7 +113,7 @@ class ModelBased(Optimizer):
     in_coordinates = True
     judges_first_law = True
     explorations = 2
-    law_of_moving_targets = "feedforward"
+    law_with_constants = "feedforward"
     law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
 
     def __init__(
