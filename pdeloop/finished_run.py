@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -63,6 +63,8 @@ class FinishedRun:
     rollouts : list of dict
         Rollouts of each seed by purpose (tuner_node.budget), empty if an older version did not
         count them.
+    measured : list of dict
+        Costs of rollouts as they came, the rows `measured` of progress.jsonl; empty without that file.
     """
 
     folder: Path
@@ -73,6 +75,7 @@ class FinishedRun:
     models: list[ModelRows]
     costs: dict[str, Array]
     rollouts: list[dict[str, int]]
+    measured: list[dict[str, Any]] = field(default_factory=list)
 
     def __repr__(self) -> str:
         means = ", ".join(f"{name} {costs.mean():.4g}" for name, costs in self.costs.items())
@@ -301,8 +304,11 @@ def load_run(folder: str | Path) -> FinishedRun:
     """
     if not isinstance(folder, str | PathLike):
         raise ValueError(f"folder is {folder!r}; expected the path of a run")
+    from pdeloop.display import ProgressFile
+
     run = RunFolder(Path(folder))
     values, arrays, result = run.values(), run.policies(), run.result()
+    rows = ProgressFile(run.path / "progress.jsonl", past=True).rows()
     return FinishedRun(
         run.path,
         values,
@@ -312,6 +318,7 @@ def load_run(folder: str | Path) -> FinishedRun:
         models=[model_of(rows, values) for rows in arrays["model"]],
         costs={name: np.array(result["costs_by_field"][name]) for name in EVALUATED},
         rollouts=result.get("rollouts", []),
+        measured=[row for row in rows if row.get("event") == "measured"],
     )
 
 
@@ -328,6 +335,7 @@ def merged(runs: Sequence[FinishedRun]) -> FinishedRun:
         models=[model for run in runs for model in run.models],
         costs={name: np.concatenate([run.costs[name] for run in runs]) for name in first.costs},
         rollouts=[counted for run in runs for counted in run.rollouts],
+        measured=[row for run in runs for row in run.measured],
     )
 
 

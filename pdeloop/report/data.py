@@ -73,7 +73,8 @@ class ProblemData:
     runs: by adapted controller; curves: their costs while they learn; shown: index of the seed whose
     behaviour, gains and steps are shown; plant: the built-in one; behaviours: empty where they cannot
     be computed; orders: what the shown seed's exploratory episode says about the order, None where
-    that is not known; missing: a sentence for each thing that cannot be shown.
+    that is not known; explored: rollouts used, up to 0, and mean costs of explorations; missing: a
+    sentence for each thing that cannot be shown.
     """
 
     runs: Mapping[str, FinishedRun]
@@ -83,6 +84,7 @@ class ProblemData:
     missing: list[str] = field(default_factory=list)
     behaviours: list[Behaviour] = field(default_factory=list)
     orders: OrderStudy | None = None
+    explored: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
 
     @property
     def first(self) -> FinishedRun:
@@ -162,7 +164,7 @@ def gather(folder: Path) -> ReportData:
 
 def of_run(run: FinishedRun) -> ProblemData:
     """A single run's part of a report."""
-    return _problem({"adapted": run}, _history(run), 0)
+    return replace(_problem({"adapted": run}, _history(run), 0), explored=_explored(run))
 
 
 def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
@@ -201,6 +203,15 @@ def _history(run: FinishedRun) -> list[Curve]:
         used = np.array([row["rollouts"] - before for row in rows], dtype=np.float64)
         seeds.append((used, costs))
     return _curve("adapted", seeds, over_lqt=False)
+
+
+def _explored(run: FinishedRun) -> tuple[Array, Array]:
+    """Rollouts that explorations had used, 0 where the adaptation begins, and their mean costs."""
+    before = dict(zip(run.seeds, run.before, strict=True))
+    rows = [row for row in run.measured if row["phase"] == "identify" and "cost" in row]
+    points = [(row["rollouts"] - before.get(row["seed"], 0), row["cost"]) for row in rows]
+    used, costs = np.array(sorted(set(points)), dtype=np.float64).reshape(-1, 2).T
+    return used, costs
 
 
 def _curve(controller: str, seeds: Sequence[tuple[Array, Array]], *, over_lqt: bool) -> list[Curve]:

@@ -27,6 +27,10 @@ def training_curves(problems: Sequence[ProblemData]) -> Figure:
     over_lqt = all(curve.over_lqt for problem in problems for curve in problem.curves)
     for ax, problem in zip(axes, problems, strict=True):
         reached = [bound for curve in problem.curves for bound in _band(ax, curve)]
+        used, costs = problem.explored
+        if used.size:
+            ax.plot(used, costs, "x", color="0.5", label="exploration")
+            reached += [float(costs.min()), float(costs.max())]
         if over_lqt:
             ax.axhline(1.0, color=COLOURS["lqt"], linestyle=LINES["lqt"], label=NAMES["lqt"])
             reached += [0.8 / 0.93, 1.0, 1.25 / 1.08]
@@ -34,7 +38,7 @@ def training_curves(problems: Sequence[ProblemData]) -> Figure:
         if low > 0:
             plain_log(ax, top / low)
         ax.set_ylim(0.93 * low, 1.08 * top or 1.0)
-        ax.set_xlim(left=0)
+        ax.set_xlim(left=1.1 * used.min(initial=0.0))
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
         ax.set_xlabel("rollouts of the adaptation")
         ax.set_title(problem.name)

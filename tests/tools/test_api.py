@@ -241,6 +241,11 @@ def test_figures_show_what_the_arrays_hold(run, small) -> None:
         pdeloop.plot_spectrum,
     ):
         assert draw(run).axes
+    learning = pdeloop.plot_training(run).axes[0].get_legend_handles_labels()
+    crosses = dict(zip(learning[1], learning[0], strict=True))["exploration"]
+    explored = [row["cost"] for row in run.measured if row["phase"] == "identify"]
+    assert explored and np.array_equal(np.sort(crosses.get_ydata()), np.sort(explored))
+    assert np.max(crosses.get_xdata()) <= 0.0
     plant = small.plant()
     episode = pdeloop.rollout(plant, lambda k, z: np.full((2, plant.n_a), k), [0, 1])
     field, actions, _ = pdeloop.plot_episode(plant, episode, environment=1).axes
