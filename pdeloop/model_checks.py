@@ -57,7 +57,7 @@ class Residuals:
     count: N; in_time: channels with the largest |rho|; with_inputs: channels with the R^2 of earlier
     inputs; rounding: whether there is nothing else in them; modes: whether channels are
     modes; size: standard deviation relative to that
-    of the measurements.
+    of the measurements; driven: whether they are enough to be compared with earlier inputs.
     """
 
     count: int
@@ -66,10 +66,11 @@ class Residuals:
     rounding: bool = False
     modes: bool = False
     size: float = 0.0
+    driven: bool = False
 
     def summary(self) -> dict[str, Any]:
-        """As data."""
-        white = not (self.in_time or self.with_inputs)
+        """As data; `white` is None where nothing could be tested."""
+        white = not (self.in_time or self.with_inputs) if self.count else None
         return {"count": self.count, "white": white, "relative_size": self.size}
 
     def text(self, channels: Channels) -> str:
@@ -85,7 +86,8 @@ class Residuals:
                 )
                 found.append(f"{what} ({names}, up to {max(value for _, value in own):.2f})")
         if not found:
-            return f"{share}, white, and not correlated with earlier inputs"
+            inputs = "not correlated with" if self.driven else "too few for a test against"
+            return f"{share}, white, and {inputs} earlier inputs"
         return (
             f"{share}, correlated {' and '.join(found)}, as with noise on the measurements, missing "
             "states or nonlinearity"
@@ -173,7 +175,8 @@ def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory
     )
     share = np.zeros(basis.shape[1])
     columns = X.shape[1]
-    if len(X) > LEAST * columns:
+    driven = len(X) > LEAST * columns
+    if driven:
         left = y - X @ linalg.lstsq(X, y)[0]
         share = 1.0 - np.sum(left**2, axis=0) / np.maximum(np.sum(y**2, axis=0), 1e-300)
     moved = np.flatnonzero(len(X) * share > special.chdtri(columns, level))
@@ -183,6 +186,7 @@ def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory
         tuple((int(i), float(share[i])) for i in moved),
         modes=basis.shape[1] < len(model.U),
         size=size,
+        driven=driven,
     )
 
 

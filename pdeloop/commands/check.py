@@ -128,7 +128,7 @@ def _check(options: argparse.Namespace) -> int:
         print_json([asdict(finding) for finding in findings])
     elif options.picture is not None:
         print(f"picture in {options.picture}")
-    return 0 if all(finding.good for finding in findings) else 1
+    return 0 if findings and all(finding.good for finding in findings) else 1
 
 
 def _mark(finding: Finding) -> str:

@@ -81,6 +81,24 @@ def functions(tree: ast.AST) -> list[Function]:
     return [node for node in ast.walk(tree) if isinstance(node, Function)]
 
 
+def test_no_rule_is_about_no_file() -> None:
+    """A pattern that finds nothing would hold for ever: here is every one that a rule looks for."""
+    packages = ["pdeloop", *(f"{name}_node" for name in ("pde_sim", "controller", "tuner"))]
+    packages += ["recorder_node", "viewer_node", "benchmarks", "tests"]
+    patterns = [*(f"{name}/**/*.py" for name in packages), "docs/**/*.md", "*.md", "findings/*.sh"]
+    patterns += ["config/problems/*.yaml", "benchmarks/studies/*.yaml", "docs/reference/*.md"]
+    assert [pattern for pattern in patterns if not any(ROOT.glob(pattern))] == []
+    pages = [page.read_text() for page in (ROOT / "docs").rglob("*.md")]
+    for what in (
+        r"python -m benchmarks \w",
+        r"^ *pdeloop \w+",
+        r"^#+ \S",
+        r"\]\([^)]+\)",
+        "```python",
+    ):
+        assert any(re.search(what, page, re.MULTILINE) for page in pages), what
+
+
 def dotted(function: ast.expr) -> str:
     """a.b.c of a function, as in the source; (...).c of what begins with no name."""
     if isinstance(function, ast.Attribute):

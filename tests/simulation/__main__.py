@@ -25,7 +25,7 @@ def main() -> int:
             if finding:
                 print(finding, flush=True)
     print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))
-    return bool(ends["wrong"])
+    return bool(ends["wrong"] or not ends)
 
 
 if __name__ == "__main__":

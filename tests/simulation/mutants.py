@@ -255,7 +255,7 @@ def main() -> int:
         total += found
         print(f"{module:<34} {_score(found)}", flush=True)
     print(f"{'all':<34} {_score(total)}")
-    return int(_share(total) < options.least)
+    return int(_share(total) < options.least or not total)
 
 
 def _share(found: Counter[str]) -> float:

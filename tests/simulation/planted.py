@@ -219,7 +219,7 @@ def main() -> int:
             )
             print(f"{name:<50} {told[:100]}", flush=True)
     print(f"{len(options.names) - missed} of {len(options.names)} planted bugs found")
-    return int(missed > 0)
+    return int(missed > 0 or not options.names)
 
 
 if __name__ == "__main__":

@@ -178,7 +178,7 @@ def command() -> int:
     with tempfile.TemporaryDirectory(dir=where) as place:
         result = run(Path(place), every)
     print(json.dumps(result))
-    return int(any(found["wrong"] for found in result.values()))
+    return int(any(found["wrong"] or not found["orders"] for found in result.values()))
 
 
 if __name__ == "__main__":

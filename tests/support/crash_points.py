@@ -253,7 +253,7 @@ def command() -> int:
     with tempfile.TemporaryDirectory(dir=where) as place:
         result = run(Path(place), tuple(given.kinds), given.most)
     print(json.dumps(result))
-    return int(bool(result["wrong"]))
+    return int(bool(result["wrong"]) or not result["failures"])
 
 
 if __name__ == "__main__":
