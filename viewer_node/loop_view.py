@@ -7,13 +7,15 @@ out. `now` is any monotonic time in s.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Grid
 from pdeloop.messages.topics import VOID, CostColumn
@@ -33,12 +35,22 @@ COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
 """The number with the cost of each controller (pdeloop.messages.controllers)."""
 
 
+def path_of(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """The target of each step from a plant's parameters; None where it is constant or of an output."""
+    try:
+        cost = Cost.parse(values["cost"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    moves = cost is not None and cost.target.ndim > 1 and cost.output is None
+    return cost.target if cost is not None and moves else None
+
+
 class LoopView:
     """Follows the loop of one plant and controller.
 
     only: the run to follow, any by default; curve_from_topics: whether the learning curve comes
     from the costs on the topics; horizon, weights: steps of an episode, q and r, where known;
-    components: their names.
+    components: their names; path: the target of each step where it moves.
     """
 
     def __init__(
@@ -49,9 +61,11 @@ class LoopView:
         horizon: int = 0,
         weights: tuple[float, float] = (0.0, 0.0),
         components: Sequence[str] = ("u",),
+        path: Array | None = None,
     ) -> None:
         self.only, self.curve_from_topics = only, curve_from_topics
         self.horizon, self.weights, self.components = horizon, weights, list(components)
+        self.path = np.empty((0, 0)) if path is None else path
         self.grid: Grid | None = None
         """Grid of the state, if known."""
         self.environment = 0
@@ -196,7 +210,8 @@ class LoopView:
         current = self.current
         if current is None:
             return None
-        target = self.target_of(current.key)
+        target = self.path_at(current)
+        target = self.target_of(current.key) if target is None else target
         fits = target is not None and len(target) == len(current.z)
         return current.z, target if fits else None
 
@@ -259,6 +274,11 @@ class LoopView:
         """z_r of the plant of an episode."""
         frame = self._targets.get(key[2])
         return None if frame is None else frame.values
+
+    def path_at(self, shown: EpisodeSamples) -> Array | None:
+        """The target at the newest step of an episode; None where it does not move."""
+        fits = self.path.shape[1] == shown.z.size
+        return np.asarray(self.path[min(shown.last, len(self.path) - 1)]) if fits else None
 
     def _error(self) -> Array | None:
         """z - z_r of the newest sample."""

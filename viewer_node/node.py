@@ -32,7 +32,7 @@ from pdeloop.ros.parameters import declare, given_parameters, on_change
 from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import MAX_COMPONENTS
 from viewer_node.loop_reader import PERIOD, LoopReader
-from viewer_node.loop_view import LoopView
+from viewer_node.loop_view import LoopView, path_of
 from viewer_node.picture import Range, plane, space_time
 from viewer_node.shapes import shape_of
 
@@ -62,6 +62,7 @@ class ViewerNode:
             weights=weights,
             curve_from_topics=False,
             components=self._grid.components,
+            path=path_of(values),
         )
         kept = min(len(self._grid.components), MAX_COMPONENTS)
         self._ranges: list[Range] = [(0.0, 1.0)] * kept

@@ -76,11 +76,16 @@ class RolloutCosts:
         self._starts: dict[tuple[int, int], Frame] = {}
         self._policies: dict[tuple[int, int], Frame] = {}
         self._models: dict[tuple[int, int], Frame] = {}
+        self._explored = 0
+        """The run that was seen from its exploration on."""
+        self._first: dict[tuple[int, int], dict[int, Array]] = {}
+        """By run and generation of models: the first theta of each, where a law has no gains."""
 
     def start(self, frame: Frame) -> None:
         """Take the start of an episode."""
         if frame.values.shape[1] in (START_COLUMNS, len(StartColumn)):
             remember(self._starts, (frame.run, frame.episode), frame)
+            self._explored = frame.run if _explores(frame) else self._explored
 
     def policy(self, frame: Frame) -> None:
         """Take the gains of an episode."""
@@ -140,15 +145,23 @@ class RolloutCosts:
         theta = policy.reshape(len(policy), -1)
         zero = ~theta.any(axis=1)
         lqt = self._lqt(start, policy)
-        same = np.zeros_like(zero) if lqt is None else (policy == lqt).all(axis=(1, 2))
+        same = np.zeros_like(zero)
+        if lqt is not None:
+            same = (policy == lqt).reshape(theta.shape).all(axis=1)
         return np.where(zero, "none", np.where(same, "lqt", "adapted"))
 
     def _lqt(self, start: Frame, policy: Array) -> Array | None:
-        """The LQT gains of an episode's environments, if its models are known."""
-        model = self._models.get((start.run, start.step))
-        if model is None or policy.ndim != 3:  # of another law, whose start nobody tells
-            return None
+        """The first law of an episode's environments, LQT gains if its models are known."""
         which = start.values[:, StartColumn.MODEL].astype(np.int64)
+        if policy.ndim != 3:
+            first, none = (
+                self._first_of(start, policy, which.tolist()),
+                np.full(policy.shape[1:], np.nan),
+            )
+            return np.stack([first.get(m, none) for m in which.tolist()]) if first else None
+        model = self._models.get((start.run, start.step))
+        if model is None:
+            return None
         if which.min() < 0 or which.max() >= len(model.values):
             return None
         try:
@@ -157,6 +170,19 @@ class RolloutCosts:
             return None
         lqt = np.stack([known[m].policy for m in which])
         return lqt if lqt.shape == policy.shape else None
+
+    def _first_of(self, start: Frame, policy: Array, which: list[int]) -> dict[int, Array]:
+        """Theta of each model in the first episode after an exploration, where they are of one law."""
+        key = start.run, start.step
+        episodes = [episode for run, episode in self._policies if run == start.run]
+        if key in self._first or start.run != self._explored or min(episodes) < start.episode:
+            return self._first.get(key, {})
+        found: dict[int, Array] = {}
+        for m, theta in zip(which, policy, strict=True):
+            if theta.any() and not np.array_equal(found.setdefault(m, theta), theta):
+                return {}
+        self._first = {key: found}
+        return found
 
 
 def _explores(start: Frame) -> bool:

@@ -110,7 +110,7 @@ PROBLEM = _section(
     Spec("grid", "", nodes="PCTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
-    Spec("cost", [], nodes="PCT").means(
+    Spec("cost", [], nodes="PCTV").means(
         "the cost as packed JSON, from Python or the plant; empty: scalar weights and a constant "
         "target"
     ),

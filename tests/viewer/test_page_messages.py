@@ -238,6 +238,8 @@ def test_a_moving_target_is_sent_once_for_all_columns_and_as_it_is_at_the_newest
     parts = dict(map(part, page.updates(sent, 0.0)))
     assert "path" not in parts
     np.testing.assert_array_equal(parts["target"][1], [*rows[3], *rows[3]])
+    error = float(np.sqrt(np.mean(rows[3] ** 2)))
+    assert page.view.numbers()["tracking_error"] == pytest.approx(error)
     assert path_of({"cost": Cost(4, 1, 8, target=rows[0]).packed}) is None
     assert path_of({"cost": ["{"]}) is None and path_of({}) is None
 

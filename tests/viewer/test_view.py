@@ -17,7 +17,7 @@ from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import COLUMNS
 from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, diverging
-from viewer_node.rollout_costs import MAX_BYTES
+from viewer_node.rollout_costs import MAX_BYTES, RolloutCosts
 
 RUN, PLANT, N_Z, N_A, N_S = 5, 9, 8, 2, 3
 RNG = np.random.default_rng(4)
@@ -74,6 +74,26 @@ def test_a_view_of_nothing_has_nothing_to_show():
     assert empty.numbers() == {}
     assert empty.profile() is None
     assert empty.space_time(0.0) is None
+
+
+def test_the_first_law_without_gains_is_told_from_adapted_ones():
+    """Of a law with other parameters nobody publishes the first: they follow the exploration."""
+    first = RNG.normal(size=7)
+
+    def seen(costs: RolloutCosts, episode: int, *thetas) -> list[str]:
+        costs.policy(frame(thetas, episode, step=1))
+        costs.start(frame([(0, -1.0, 0.0, 0.0)] * len(thetas), episode, step=1))
+        return [costs.controller(RUN, episode, row) for row in range(len(thetas))]
+
+    assert seen(RolloutCosts(), 2, first, first) == ["adapted"] * 2  # who came late cannot know
+    costs = RolloutCosts()
+    costs.start(frame([(0, 5.0, 0.1, 0.0)], 1, step=1))
+    assert seen(costs, 2, first, first) == ["lqt"] * 2
+    assert seen(costs, 3, first + 1.0, first) == ["adapted", "lqt"]
+    assert seen(costs, 4, 0.0 * first, first, first + 2.0) == ["none", "lqt", "adapted"]
+    pairs = RolloutCosts()  # of an optimiser that begins with other laws
+    pairs.start(frame([(0, 5.0, 0.1, 0.0)], 1, step=1))
+    assert seen(pairs, 2, first + 0.1, first - 0.1) == ["adapted"] * 2
 
 
 def test_the_numbers_of_a_sample_are_those_of_their_definitions():

@@ -26,12 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages.action_set import ActionSet
-from pdeloop.messages.cost import Cost
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
 from pdeloop.messages.places import parse
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
-from viewer_node.loop_view import SILENT, LoopView
+from viewer_node.loop_view import SILENT, LoopView, path_of
 from viewer_node.operation import Call
 
 RATE_WINDOW = 3.0
@@ -122,16 +121,6 @@ def bounds_of(values: Mapping[str, Any]) -> dict[str, list[float | None]] | None
     return {name: [b if np.isfinite(b) else None for b in part] for name, part in told.items()}
 
 
-def path_of(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """The target of each step from a plant's parameters; None where it is constant or of an output."""
-    try:
-        cost = Cost.parse(values["cost"])
-    except (KeyError, TypeError, ValueError):
-        return None
-    moves = cost is not None and cost.target.ndim > 1 and cost.output is None
-    return cost.target if cost is not None and moves else None
-
-
 @dataclass(frozen=True)
 class ShowLoop:
     """A request to show the loop in this namespace of the domain."""
@@ -161,7 +150,6 @@ class Page:
         self._status: str | None = None
         self._of_plant: dict[str, Any] = {}
         """Its parameters that say where things are."""
-        self._path: NDArray[np.float64] = np.empty((0, 0))
         """The target of each step, where it moves."""
         self._colours: dict[int, Range] = {}
         self._coloured = float("-inf")
@@ -181,7 +169,6 @@ class Page:
             view.environment = self.view.environment
             self.view = view
             self.parameters, self.controls, self._of_plant = {}, [], {}
-            self._path = np.empty((0, 0))
             self._colours, self._coloured = {}, float("-inf")
             self._counts.clear()
             self.place = {
@@ -203,8 +190,10 @@ class Page:
             self.parameters["places"] = places_of(self._of_plant)
             self.view.grid = Grid.parse(str(self._of_plant.get("grid")))
         self.parameters["bounds"] = bounds_of(self._of_plant)
-        if (path := path_of(self._of_plant)) is None or not np.array_equal(path, self._path):
-            self._path = np.empty((0, 0)) if path is None else path
+        path = path_of(self._of_plant)
+        path = np.empty((0, 0)) if path is None else path
+        if not np.array_equal(path, self.view.path):
+            self.view.path = path
         self.parameters["horizon"] = self.view.horizon = int(self._of_plant.get("horizon", 0))
 
     def request_call(self, node: object, verb: object) -> bool:
@@ -296,10 +285,10 @@ class Page:
         target = view.target_of(shown.key)
         chosen = (self.place["begun"], shown.components, shown.plane, *panels)
         known: tuple[object, ...] = (*chosen, id(target))
-        if self._path.shape[1] == shown.z.size:
-            target = self._path[min(shown.last, len(self._path) - 1)]
-            known = (*chosen, id(self._path), shown.last)
-            path = (*chosen, id(self._path), shown.first, shown.stride)
+        if (moving := view.path_at(shown)) is not None:
+            target = moving
+            known = (*chosen, id(view.path), shown.last)
+            path = (*chosen, id(view.path), shown.first, shown.stride)
             yield "path", path, partial(self._moving, shown)
         yield "target", known, partial(self._target, target, shown)
         ranges = tuple(self._colours.get(i, (0.0, 1.0)) for i in panels)
@@ -329,10 +318,10 @@ class Page:
 
     def _moving(self, shown: EpisodeSamples) -> bytes:
         """The target of each column to the horizon, (columns, panels, rows)."""
-        panels, last = self._of_shown(shown), len(self._path) - 1
+        panels, last = self._of_shown(shown), len(self.view.path) - 1
         end = max(self.view.horizon, shown.last, 1)
         steps = np.minimum(np.arange(shown.first, end + 1, shown.stride), last)
-        rows = self._path[:, rows_of(shown.z.size, shown.components)][steps]
+        rows = self.view.path[:, rows_of(shown.z.size, shown.components)][steps]
         own = np.stack([rows[:, shown.part(i)] for i in panels], axis=1)
         header = {"part": "path", "columns": len(steps), "begin": shown.first}
         return _pack({**header, "stride": shown.stride, "panels": panels}, own.ravel())
