@@ -28,6 +28,8 @@ _SEMIDEFINITE = 1e-10
 """An eigenvalue of a weight below minus this, relative to the largest, is negative."""
 _LINE = 8000
 """Characters of one text; a YAML file takes no much longer ones."""
+MAX_WEIGHT = 1e100
+"""Largest weight: with a larger one costs overflow, which would be taken for a divergence."""
 MAX_ARRAY_BYTES = 2**29
 """Most bytes of an array in a text: a weight of 8,192 x 8,192."""
 _ARRAYS = ("state_weight", "action_weight", "target", "output", "action_target", "terminal_weight")
@@ -292,6 +294,8 @@ def _weight(name: str, values: ArrayLike, size: int) -> Array:
         raise ValueError(
             f"{name} must be a number, {size} numbers or {size} x {size}, got shape {weight.shape}"
         )
+    if (largest := float(np.abs(weight).max(initial=0.0))) > MAX_WEIGHT:
+        raise ValueError(f"{name} must be at most {MAX_WEIGHT:g}, got {largest:g}")
     if weight.ndim < 2:
         if (weight < 0.0).any():
             raise ValueError(f"{name} must not be negative, got {float(weight.min()):g}")

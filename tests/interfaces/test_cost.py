@@ -107,6 +107,7 @@ def test_numbers_and_a_constant_target_need_no_text() -> None:
     ("words", "told"),
     [
         ({"state_weight": -1.0}, "state_weight must not be negative"),
+        ({"action_weight": [1.0, 1e308]}, r"action_weight must be at most 1e\+100, got 1e\+308"),
         ({"state_weight": -np.eye(N_Z)}, "state_weight must have no negative eigenvalue"),
         ({"state_weight": np.triu(np.ones((N_Z, N_Z)))}, "state_weight must be symmetric"),
         ({"state_weight": [1.0, 2.0]}, "state_weight must be a number, 5 numbers or 5 x 5"),
