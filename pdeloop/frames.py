@@ -98,8 +98,7 @@ class Frames:
                     self._shows[c].append(self._begin(own, c, i, colour))
                 axes[0, c].set_title(title, fontsize=9)
                 self._bars.append(_actions(axes[-1, c], plant, colour, largest))
-            if self._flat:
-                self._targets(axes[:, -1].tolist())
+            self._pictures = self._targets(axes[:, -1].tolist()) if self._flat else []
             for ax in axes[:, 1:count].ravel() if count > 1 else ():
                 ax.set_ylabel("")
                 ax.tick_params(labelleft=False)
@@ -116,6 +115,10 @@ class Frames:
         for shows, state in zip(self._shows, states, strict=True):
             for show, values in zip(shows, self._plant.grid.fields(state), strict=True):
                 show(step, values)
+        if self._moving is not None:
+            target = self._plant.grid.fields(self._moving[step])
+            for picture, values in zip(self._pictures, target, strict=False):
+                picture.set_data(planes.middle(values))
         for (bars, ax), own in zip(self._bars, actions, strict=True):
             for bar, value in zip(bars, own, strict=True):
                 bar.set_height(value)
@@ -150,7 +153,7 @@ class Frames:
         (dashes,) = ax.plot(axis.points, target, "--", color="0.45", lw=1)
         (line,) = ax.plot(axis.points, target, color=colour, lw=1.5)
         ax.set(ylabel=grid.components[component], xlabel=axis.label, xlim=(0, axis.length))
-        ax.set_ylim(_around(target if moving is None else moving[:, own]))
+        ax.set_ylim(_around(self._span(component)))
         if self._fields is not None:
             with np.errstate(invalid="ignore"):
                 _grow(ax, self._fields[..., own])
@@ -169,8 +172,7 @@ class Frames:
         own = self._plant.grid.part(component)
         whole = self._fields[column, :, own].T
         axis, end = self._plant.grid.line, self._plant.sample_time * (whole.shape[1] - 1)
-        target = self._target(component) if self._moving is None else self._moving[:, own]
-        low, high = field_range(self._fields[..., own], target)
+        low, high = field_range(self._fields[..., own], self._span(component))
         so_far = np.full_like(whole, np.nan)
         extent = (0.0, end, 0.0, axis.length)
         drawn = image(ax, so_far, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
@@ -187,7 +189,7 @@ class Frames:
 
     def _plane(self, ax: Axes, component: int) -> Show:
         """A field on several axes as a picture; without `fields` its range grows."""
-        grid, target = self._plant.grid, self._target(component)
+        grid, target = self._plant.grid, self._span(component)
         own = grid.part(component)
         known = np.empty(0) if self._fields is None else self._fields[..., own]
         low, high = field_range(known, target)
@@ -208,20 +210,27 @@ class Frames:
 
         return show
 
-    def _targets(self, axes: Sequence[Axes]) -> None:
-        """The target of a field on several axes, in a column of its own."""
+    def _targets(self, axes: Sequence[Axes]) -> list[Any]:
+        """The target of a field on several axes, in a column: the picture of each component."""
+        pictures, first = [], self._plant.field_target if self._moving is None else self._moving[0]
         for i in range(len(self._plant.grid.components)):
             known = np.empty(0)
             if self._fields is not None:
                 known = self._fields[..., self._plant.grid.part(i)]
-            low, high = field_range(known, self._target(i))
-            planes.plane(axes[i], self._plant.grid, self._plant.field_target, i, low, high)
+            low, high = field_range(known, self._span(i))
+            pictures.append(planes.plane(axes[i], self._plant.grid, first, i, low, high))
             axes[i].tick_params(labelleft=False)
         axes[0].set_title("target", fontsize=9)
         axes[-1].set_axis_off()
+        return pictures
 
     def _target(self, component: int) -> Array:
         return self._plant.field_target[self._plant.grid.part(component)]
+
+    def _span(self, component: int) -> Array:
+        """The target of a component, of all steps where it moves."""
+        own = self._plant.grid.part(component)
+        return self._target(component) if self._moving is None else self._moving[:, own]
 
 
 def _actions(ax: Axes, plant: Plant, colour: str, largest: float) -> tuple[Any, Axes]:

@@ -59,9 +59,12 @@ def told(plant: Plant, costs: Array) -> dict[str, Array]:
     cost (M,): the stage cost of the step that ended; distance (M,): root mean square over the grid of
     z - z_r, of the field itself; target (M, state_size), read-only: z_r as it is observed.
     """
-    error = plant.states - plant.field_target
+    now, seen, cost = plant.field_target, plant.target, plant.cost
+    if cost.target.ndim > 1 and cost.output is None:  # it moves
+        now = seen = cost.wanted(plant.step_index)
+    error = plant.states - now
     distance = np.sqrt(np.einsum("mi,mi->m", error, error) / plant.n_z)
-    target = np.broadcast_to(plant.target, (len(costs), plant.state_size))
+    target = np.broadcast_to(seen, (len(costs), plant.state_size))
     return {"cost": costs, "distance": distance, "target": target}
 
 

@@ -15,7 +15,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Grid
 from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
-from pdeloop.report.places import mark_places, supports_of
+from pdeloop.report.places import mark_places, moving_target, supports_of
 from pdeloop.report.style import FIELD_MAP, NAMES
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ SHARES = (0.0, 0.25, 1.0)
 
 def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: each controller's fields, the target, and the actions."""
-    plant, shown = problem.plant, problem.behaviours
+    plant, shown, moving = problem.plant, problem.behaviours, moving_target(problem.plant)
     grid, count = plant.grid, len(shown)
     rows = len(SHARES) * len(grid.components)
     figure = Figure(figsize=(2.05 * (count + 1) + 0.9, 1.6 * rows + 1.8))
@@ -42,11 +42,11 @@ def behaviour(problem: ProblemData) -> Figure:
                 drawn = plane(ax, grid, b.states[k], i, low, high)
                 mark_places(ax, plant, i)
             row[0].set_ylabel(f"t = {k * plant.sample_time:.3g} s\n{grid.axes[-2].label}")
-            row[-1].set_axis_off()
-        last = axes[len(SHARES) * (i + 1) - 1, -1]
-        last.set_axis_on()
-        plane(last, grid, plant.field_target, i, low, high)
-        last.set_title("target")
+            if moving is None and share < 1.0:
+                row[-1].set_axis_off()
+                continue
+            plane(row[-1], grid, plant.field_target if moving is None else moving[k], i, low, high)
+            row[-1].set_title("target")
         own = axes[len(SHARES) * i : len(SHARES) * (i + 1)].ravel().tolist()
         figure.colorbar(drawn, ax=own, label=name, pad=0.01, extend="both")
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
@@ -137,7 +137,8 @@ def middle(values: Array) -> Array:
 def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
     """Range of the colours of a component."""
     values = np.concatenate([part.ravel() for part in parts])
-    return field_range(values, plant.field_target[plant.grid.part(component)])
+    moving, own = moving_target(plant), plant.grid.part(component)
+    return field_range(values, plant.field_target[own] if moving is None else moving[:, own])
 
 
 def _held(

@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import pdeloop
 from pde_sim_node.plants.loading import as_plant
+from pdeloop.environments.signals import told
+from pdeloop.frames import Frames
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.places import Box, boxes_of, parse, text_of
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
+from pdeloop.report.data import Behaviour
 from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, plane, space_time
 from viewer_node.shapes import shape_of
@@ -124,3 +129,27 @@ def test_actuators_act_where_their_supports_are_at_least_half_as_large() -> None
 def test_the_live_page_names_the_components_of_a_grid() -> None:
     assert component_names({"grid": GRID.text, "equation": ""}) == ["u", "v"]
     assert component_names({"grid": "{}", "equation": "wave"}) != ["u", "v"]
+
+
+class Following(Sheet):
+    target = np.outer(np.arange(5.0), np.ones(24))
+
+
+def test_a_target_that_moves_is_shown_as_it_is_at_each_instant() -> None:
+    plant = as_plant(Following())
+    states = np.zeros((5, 24))
+    shown = [Behaviour("none", states, np.zeros((4, 2)), 1.0, -1)]
+    figure = planes.behaviour(SimpleNamespace(plant=plant, behaviours=shown))  # type: ignore[arg-type]
+    goals = [ax for ax in figure.axes if ax.get_title() == "target"]
+    assert [float(ax.images[0].get_array().mean()) for ax in goals] == 2 * [0.0, 1.0, 4.0]
+    frames = Frames(plant, fields=states[None])
+    for k in (0, 3):
+        frames.draw(states[None, k], np.zeros((1, 2)), k)
+        pictures = [picture.get_array().mean() for picture in frames._pictures]
+        assert pictures == [k, k]
+    plant.reset([0, 1])
+    assert not told(plant, np.zeros(2))["target"].any()
+    plant.step(np.zeros((2, 2)))
+    info, error = told(plant, np.zeros(2)), plant.states - 1.0
+    assert (info["target"] == 1.0).all()
+    np.testing.assert_allclose(info["distance"], np.sqrt(np.mean(error**2, axis=1)))
