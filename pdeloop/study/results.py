@@ -53,6 +53,12 @@ CREATE TABLE IF NOT EXISTS files (
 """
 
 
+def made_with(result: Mapping[str, Any]) -> int | None:
+    """The fingerprint of a result's plant, with that of the user's own law and optimiser, if known."""
+    plant = result.get("plant")
+    return None if plant is None else int(plant) ^ int(result.get("code", 0))
+
+
 class Ended(NamedTuple):
     """A training that has ended.
 
@@ -78,7 +84,7 @@ class Ended(NamedTuple):
             "cost": means.get("adapted"),
             "rollouts": result["rollouts"][0]["total"],
             "costs": json.dumps(costs),
-            "plant": result.get("plant"),
+            "plant": made_with(result),
             "environment": json.dumps(result.get("environment", {}), sort_keys=True),
         }
         return cls(name, row, {file: zlib.compress(own, 1) for file, own in files.items()})

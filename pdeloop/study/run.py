@@ -23,8 +23,8 @@ from pde_sim_node.build import fingerprint
 from pdeloop.study.deaths import LINES, MOST_DEATHS, Deaths
 from pdeloop.study.description import Study, StudyError
 from pdeloop.study.executors import Death, LostWorkerError, Processes, Workers
-from pdeloop.study.results import STUDY_FILE, UNFINISHED, Ended, Results, writing
-from pdeloop.study.training import CURVE, FILES, Place, differences, train_one
+from pdeloop.study.results import STUDY_FILE, UNFINISHED, Ended, Results, made_with, writing
+from pdeloop.study.training import CURVE, FILES, Place, code_of, differences, train_one
 from pdeloop.training_run import load_compiled
 from tuner_node.run_folder import RunFolder, RunFolderError, parameter_changes
 
@@ -220,7 +220,7 @@ class _Driver:
                     run = RunFolder(place)
                     try:
                         result, _ = run.result(), run.policies()
-                        changes = self._changes(name, run.parameters(), result.get("plant"))
+                        changes = self._changes(name, run.parameters(), made_with(result))
                         files = {each: (place / each).read_bytes() for each in self._files}
                     except (RunFolderError, OSError):
                         continue  # half copied, or damaged: it is trained anew
@@ -237,13 +237,19 @@ class _Driver:
         if changes := parameter_changes(known, self._trainings[name]):
             return changes
         if plant is not None and plant != self._plant(name):
-            return "another plant: its code or its data have changed"
+            values = self._trainings[name]
+            further = "".join(
+                f", or the {word}" for word in ("law", "optimizer") if ":" in values[word]
+            )
+            return f"another plant{further}: its code or its data have changed"
         return ""
 
     def _plant(self, name: str) -> int:
         whose = name.rpartition("/")[0]
         if whose not in self._plants:  # one for all seeds
-            self._plants[whose] = fingerprint(self._trainings[name])
+            values = self._trainings[name]
+            own = code_of(values) if self._task(name) is None else 0
+            self._plants[whose] = fingerprint(values) ^ own
         return self._plants[whose]
 
     def _identity(self, name: str) -> str:

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import resource
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -21,11 +24,14 @@ import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
 
+from pde_sim_node.definition import source_of
 from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.files import make_folder, write_atomically
+from pdeloop.method.laws.registry import law_kind
 from pdeloop.training_run import built_in
 from tuner_node.build import build_training
+from tuner_node.optimizer_parameters import kind_of
 from tuner_node.results import versions
 from tuner_node.run_folder import RunFolder, RunFolderError, parameter_changes
 from tuner_node.run_store import RunWriter
@@ -44,7 +50,7 @@ _listener: ContextVar[Callable[[Mapping[str, Any]], None]] = ContextVar(
 CHECKPOINT_PERIOD, CHECKPOINT_SHARE = 10.0, 0.05
 """Seconds between two checkpoints of a training, and the share of its time that they may take."""
 PLANT_FILE = "plant"
-"""The file of an unfinished training that has the fingerprint of its plant."""
+"""The file of an unfinished training that has the fingerprint of its plant, with `code_of`."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,8 @@ def train_one(
     """
     with _ONE_AT_A_TIME, ExitStack() as stack:
         pair = LocalPair(parameters)
-        folder = _opened(stack, place, parameters, pair.fingerprint, anew=curves)
+        plant = pair.fingerprint ^ code_of(parameters)
+        folder = _opened(stack, place, parameters, plant, anew=curves)
         names = (CURVE, *FILES) if curves else FILES
         if not (folder.path / FILES[-1]).exists():
             _train(folder, parameters, pair, curves)
@@ -153,7 +160,24 @@ def _train(folder: RunFolder, parameters: Mapping[str, Any], pair: LocalPair, cu
     if curves:
         write_atomically(folder.path / CURVE, curve(parameters, pair, policies, rollouts))
     extra = {"transport": "in-process", "controller": built_in(training)}
-    folder.finish(training, {**extra, "environment": environment()})
+    code = {"code": own} if (own := code_of(parameters)) else {}
+    folder.finish(training, {**extra, **code, "environment": environment()})
+
+
+def code_of(parameters: Mapping[str, Any]) -> int:
+    """A digest of the source of the user's own law and optimiser; 0 without any."""
+    kinds: list[type] = []
+    if ":" in parameters["law"]:
+        kinds.append(law_kind(parameters["law"], parameters))
+    if ":" in parameters["optimizer"]:
+        kinds.append(kind_of(parameters))
+    own = [base for kind in kinds for base in kind.__mro__ if not _shipped(base.__module__)]
+    sources = json.dumps([source_of(base) for base in own])
+    return int(hashlib.sha256(sources.encode()).hexdigest()[:12], 16) if own else 0
+
+
+def _shipped(module: str) -> bool:
+    return module.partition(".")[0] in ("pdeloop", *sys.stdlib_module_names)
 
 
 def _opened(
@@ -166,7 +190,7 @@ def _opened(
 ) -> RunFolder:
     """The run folder of a training, with what an earlier process has left of it; else a temporary one.
 
-    plant: its fingerprint; anew: begin again, unless there is the result.
+    plant: its fingerprint, with `code_of`; anew: begin again, unless there is the result.
     """
     path = place and place.run_folder()
     if path:

@@ -24,6 +24,7 @@ from pdeloop.study import Failure, Study, StudyError, cluster, executors, rows, 
 from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
+from tests.support.interpreter import ROOT
 from tests.support.loop_harness import until
 from tests.support.small import SMALL, same_bits, train_here
 from tests.support.small_study import CONTENT, LIMIT, contents, here
@@ -359,6 +360,38 @@ class Rod(pdeloop.Dynamics):
     def step(self, z, a):
         return self.radius * z + np.repeat(a, [2, 3])
 """
+
+
+@pytest.mark.parametrize(
+    ("word", "example", "name"),
+    [
+        ("law", "laws/saturating.py", "Saturating"),
+        ("optimizer", "random_search.py", "RandomSearch"),
+    ],
+)
+@pytest.mark.usefixtures("forked_workers")
+def test_an_edited_law_or_optimizer_is_another_one(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    word: str,
+    example: str,
+    name: str,
+):
+    monkeypatch.setenv(f"PDELOOP_{word.upper()}S", "")  # to be as it was after the test
+    source = (ROOT / "examples" / example).read_text()
+    code, file, out = tmp_path / f"own_{word}.py", tmp_path / "study.yaml", str(tmp_path / "out")
+    code.write_text(source)
+    settings = {"rollouts": 12, "evaluation_fields": 2, "optimizer": "two_point"}
+    settings[word] = f"{code}:{name}"
+    file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 1, "settings": settings}))
+    words = ["--out", out, f"--{word}", f"{code}:{name}", "--processes", "1"]
+    assert main(["study", str(file), *words]) == main(["study", *words]) == 0
+    code.write_text(source + "\nEDITED = True\n")
+    capsys.readouterr()
+    assert main(["study", *words]) == 1
+    assert f"another plant, or the {word}: its code" in capsys.readouterr().err
+    assert main(["study", *words, "--again"]) == main(["study", *words]) == 0
 
 
 @pytest.mark.usefixtures("forked_workers")
