@@ -28,6 +28,13 @@ CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diver
 """Columns of a curve."""
 FORMULA = tuple("=+-@\t\r")
 """First characters of a formula in a spreadsheet."""
+_KEPT = """    double before[PDELOOP_N_A];
+    for (int k = 0; k < PDELOOP_N_A; ++k)
+        before[k] = a[k];
+"""
+_LIMITED = """    for (int k = 0; k < PDELOOP_N_A; ++k)
+        a[k] = fmin(fmax(a[k], before[k] - rate[k]), before[k] + rate[k]);
+"""
 _TEMPLATES = Path(__file__).parent / "commands" / "template"
 
 
@@ -164,7 +171,7 @@ def _cell(value: Any) -> Any:
 
 def _filled(template: str, law: GainLaw | Parameters, model: ModelRows, **numbers: str) -> bytes:
     """A template with the law's numbers; U, sizes, limit and name among them."""
-    (n_z, n_s), n_a = model.U.shape, len(model.K_a)
+    (n_z, n_s), n_a, rated = model.U.shape, len(model.K_a), law.action_set.rated
     text = Template((_TEMPLATES / f"{template}.c.txt").read_text())
     return text.substitute(
         name=" ".join(law.name.replace("*/", "* /").split()),
@@ -174,6 +181,9 @@ def _filled(template: str, law: GainLaw | Parameters, model: ModelRows, **number
         n_a=n_a,
         U=_rows(model.U.T),
         bounds=_bounds_in_c(law.action_set, n_a),
+        held="; before the call, that of the step before, at first pdeloop_start" if rated else "",
+        kept=_KEPT if rated else "",
+        passed=", before" if rated else "",
         **numbers,
     ).encode()
 
@@ -190,9 +200,13 @@ def _bounds(allowed: ActionSet, n_a: int) -> dict[str, Array]:
 
 
 def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
-    """The function that makes an action admissible; ParameterError for rate limits."""
-    if allowed.rated:
+    """The function that makes an action admissible.
+
+    ParameterError for rate limits of actions of mean zero.
+    """
+    if allowed.rated and allowed.zero_mean:
         raise ParameterError(NO_RATES)
+    own = {"static const double rate": allowed.rate, "const double pdeloop_start": allowed.start}
     low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
     balance = (_TEMPLATES / "balance.c.txt").read_text() if allowed.zero_mean else ""
     shift = "    const double shift = pdeloop_shift(a);\n"
@@ -203,6 +217,13 @@ def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
         balance=balance,
         balanced=shift if allowed.zero_mean else "",
         moved=" - shift" if allowed.zero_mean else "",
+        rates="".join(
+            f"{name}[PDELOOP_N_A] = {{{_numbers(np.broadcast_to(x, n_a))}}};\n"
+            for name, x in own.items()
+        )
+        * allowed.rated,
+        taken=", const double *before" if allowed.rated else "",
+        limited=_LIMITED if allowed.rated else "",
     )
 
 

@@ -23,8 +23,8 @@ from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
 
 NO_RATES = (
-    "actions have rate limits, which this form of a law does not know: write it as .npz, where they "
-    "are action_rate, or use FinishedRun.law()"
+    "actions have rate limits, which this form of a law does not know: write it as .c, if their mean "
+    "is not zero, or as .npz, where they are action_rate"
 )
 
 

@@ -31,6 +31,9 @@ SETS = {
     "zero mean within bounds": ActionSet(
         N_A, [0.0, -1.0, -0.5, -2.0], [0.4, 1.0, np.inf, 1.0], True
     ),
+    "rate limits": ActionSet(
+        N_A, [0.0, -1.0, -np.inf, -2.0], [4.0, 2.0, 0.5, 2.0], rate=[0.3, np.inf, 0.1, 0.5]
+    ),
     "none": ActionSet(N_A),
 }
 needs_compiler = pytest.mark.skipif(
@@ -85,7 +88,7 @@ def test_c_acts_as_the_loop_at_every_bound(tmp_path: Path, kind: type[Law]) -> N
             parts = {**law.model.arrays, "K_a": gains[:, :N_S], "K_b": gains[:, N_S:]}
             exported = GainLaw(ModelRows(**parts), allowed, 0.1, name)
         source.write_bytes(exported.c())
-        function, a = compiled(source), np.empty(N_A)
+        function, a = compiled(source), np.broadcast_to(allowed.start, N_A).copy()
         memory = ctypes.create_string_buffer(8 * (1 + N_S))
         for k, z in enumerate(STATES):
             first: Any = {Affine: (), FeedForward: (k,)}.get(kind, (memory,))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pdeloop
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.policy import excitation
 from pdeloop.export import law_of
+from pdeloop.law_form import law_form
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws import Affine
@@ -128,8 +130,10 @@ def test_what_does_not_know_them_says_so(run: pdeloop.FinishedRun) -> None:
     exported = law_of(run)
     with np.load(io.BytesIO(exported.npz())) as kept:
         assert kept["action_rate"] == RATE and kept["action_start"] == 1.0
-    with pytest.raises(ParameterError, match="rate limits, which this form"):
-        exported.c()
+    balanced = replace(exported, action_set=ActionSet(1, zero_mean=True, rate=RATE))
+    for refused in (balanced.c, lambda: law_form(run)):
+        with pytest.raises(ParameterError, match="rate limits, which this form"):
+            refused()
     with pytest.raises(ValueError, match="'predictive' plans without rate limits"):
         pdeloop.train(plant=Valve(), law="predictive", rollouts=24)
     with pytest.raises(ValueError, match="goes with bounds, not with action_limit"):
