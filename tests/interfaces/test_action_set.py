@@ -148,3 +148,18 @@ def test_an_operating_point_of_mean_zero_and_one_that_is_given() -> None:
             ParameterError, match=r"'exploration_mean': .* 2 numbers that are an admi"
         ):
             ActionSet.of(values | {"exploration_mean": bad})
+
+
+@pytest.mark.parametrize("zero_mean", [False, True])
+def test_actions_within_rate_limits_stay_as_they_are(zero_mean: bool) -> None:
+    """Small ones after large ones as well, whose mean rounding makes as large as theirs allows."""
+    allowed = ActionSet(3, -1.0, 1.0, zero_mean, rate=[0.1, 0.2, 0.3])
+    asked = 3.0 * np.random.default_rng(0).normal(size=(300, 20, 3))
+    asked[150:] *= 1e-3
+    applied = allowed.applied(asked)
+    np.testing.assert_array_equal(allowed.applied(applied), applied)
+    moves = np.diff(applied, axis=0, prepend=np.zeros((1, 20, 3)))
+    assert (np.abs(moves) <= allowed.rate + 1e-15).all()
+    assert (np.abs(applied.sum(axis=-1)) < 1e-14).all() == zero_mean
+    with pytest.raises(ValueError, match="goes with bounds, not with action_limit"):
+        ActionSet(3, limit=0.4, rate=0.1)
