@@ -318,12 +318,11 @@ class ActionSet:
     def _shifts(self, actions: Array, low: Array, high: Array) -> Array:
         """s of each action, (..., 1), between these bounds."""
         rows = np.ascontiguousarray(actions).reshape(-1, actions.shape[-1])
-        limited = low is not self.low  # by rates: small actions may be at large distances
         low, high = (np.broadcast_to(x, actions.shape).reshape(rows.shape) for x in (low, high))
         with np.errstate(invalid="ignore"):
             shifts = rows.mean(axis=1)
             size = np.abs(rows).max(axis=1)
-            if limited:
+            if self.rated:  # small actions may come from large ones
                 width = high - low
                 size = np.maximum(size, np.where(np.isfinite(width), width, 0.0).max(axis=1))
             shifts[np.abs(shifts) <= _BALANCED * size] = 0.0

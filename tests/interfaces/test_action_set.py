@@ -158,6 +158,7 @@ def test_actions_within_rate_limits_stay_as_they_are(zero_mean: bool) -> None:
     asked[150:] *= 1e-3
     applied = allowed.applied(asked)
     np.testing.assert_array_equal(allowed.applied(applied), applied)
+    np.testing.assert_array_equal(allowed.project(applied), applied)
     moves = np.diff(applied, axis=0, prepend=np.zeros((1, 20, 3)))
     assert (np.abs(moves) <= allowed.rate + 1e-15).all()
     assert (np.abs(applied.sum(axis=-1)) < 1e-14).all() == zero_mean
