@@ -16,10 +16,12 @@ from pdeloop.method.models.sensed_unknowns import (
     SHARED,
     TERMS,
     unknowns,
+    well_posed,
 )
 from pdeloop.method.models.settings import DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
-from tests.support.sensed import SENSORS, equally_spaced, readings_of
+from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
+from tests.support.small import same_bits
 
 Array = np.ndarray
 
@@ -52,10 +54,26 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     fields = [np.cos(2 * np.pi * x), 0.5 + np.sin(4 * np.pi * x)]
     readings = [readings_of(model, *pair) for pair in zip(actions, fields, strict=True)]
     with threadpool_limits(1):
-        found, _, error = fit_sensed(readings, list(actions), actuators)
-    assert error < 1e-4
-    B = sensed_model(found, SENSORS, actuators, 4.0).B
+        found = fit_sensed(readings, list(actions), actuators)
+    assert found.error < 1e-4
+    B = sensed_model(found.shared, SENSORS, actuators, 4.0).B
     assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
+
+
+def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_inputs() -> None:
+    """The calmest ones have only what no equation explains, too small to matter in the others."""
+    shared, random = np.zeros(unknowns(3)), np.random.default_rng(0)
+    shared[[TERMS.index((1, 2)), TERMS.index((1, 0)), COEFFICIENTS]] = 5.0, 1.0, 5.0
+    model = sensed_model(shared, SENSORS, DECLARED, 10.0)
+    x = (np.arange(model.n_z) + 0.5) / model.n_z
+    actions = random.normal(size=(4, 30, 3)) * np.array([1e-4, 1e-4, 3.0, 1.0])[:, None, None]
+    fields = [np.cos(2 * np.pi * (x - shift)) for shift in (0.1, 0.4)]
+    readings = [*1e-3 * random.normal(size=(2, 30, SENSORS))]
+    readings += [readings_of(model, a, z) for a, z in zip(actions[2:], fields, strict=True)]
+    with threadpool_limits(1):
+        found = fit_sensed(readings, list(actions), DECLARED)
+    assert found.error < 1e-4
+    np.testing.assert_allclose(found.fields[2:], fields, atol=0.02)
 
 
 def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() -> None:
@@ -107,3 +125,35 @@ def test_readings_are_interpolated_by_the_lowest_wavenumbers() -> None:
     sensors = (np.arange(SENSORS) + 0.5) / SENSORS
     field = interpolated(np.cos(2 * np.pi * sensors) + 0.5)
     np.testing.assert_allclose(field, np.cos(2 * np.pi * np.arange(n) / n) + 0.5, atol=1e-12)
+
+
+def test_a_fourth_derivative_allows_a_negative_diffusion_and_the_fifth_power_a_positive_third() -> (
+    None
+):
+    shared = np.zeros(unknowns(2))
+    for term in ((1, 2), (1, 4), (3, 0), (5, 0)):
+        shared[TERMS.index(term)] = 1.0 if term == (3, 0) else -1.0
+    assert same_bits(well_posed(shared), shared)
+    for highest in ((1, 4), (5, 0)):
+        shared[TERMS.index(highest)] = 0.5
+    bounded = well_posed(shared)
+    assert not bounded.any()
+
+
+def test_short_waves_that_a_fourth_derivative_damps_need_no_internal_steps() -> None:
+    """Phase separation: the waves that follow others would ask for eight times as many."""
+    shared, actuators, n = np.zeros(unknowns(1)), equally_spaced(1), grid_points(16)
+    for term, value in {(1, 2): -630.0, (1, 4): -31.0, (3, 2): 39.5}.items():
+        shared[TERMS.index(term)] = value
+    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
+    (substeps,) = equation.substeps(np.array([4.0]))
+    assert 1 < substeps <= 8
+
+    def after(substeps: int) -> Array:
+        step = equation.compiled(substeps, equation.supports)
+        z = step.spectra(4.0 * np.cos(2 * np.pi * x)[None] + np.sin(14 * np.pi * x))
+        for _ in range(20):
+            step.advance(z, np.zeros((1, 2)))
+        return step.states(z)
+
+    np.testing.assert_allclose(after(int(substeps)), after(64), atol=1e-3)

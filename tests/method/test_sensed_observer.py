@@ -16,17 +16,14 @@ from pdeloop.method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
-from pdeloop.method.models.sensed_fit import fit_sensed
-from pdeloop.method.models.sensed_smoothing import Smoothing
 from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
 from tests.support.sensed import SENSORS
-from tests.support.sensed_optimiser import FEW_ITERATIONS, N_A, rows_of
+from tests.support.sensed_optimiser import N_A, rows_of
 from tests.support.small import same_bits
 
 Array = np.ndarray
 T = 24
 ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.zeros(N_A))
-RNG = np.random.default_rng(17)
 
 
 def equation(**terms: float) -> Array:
@@ -63,58 +60,6 @@ def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
     explored = Trajectory(np.zeros((T + 1, SENSORS)), none)
     context = Context(U, target, 1.0, 0.1, T, explored, sensors=SENSORS, law=Observer(rows, T))
     return sensed_loop(context, model)
-
-
-def test_the_initial_field_is_what_the_readings_came_from() -> None:
-    """It moves past the sensors, by three of their distances."""
-    moving = equation(z1_x0=1.0, z1_x1=80.0, z3_x0=-1.0)
-    model = model_with(moving, 0.0)
-    true = field(model, 4)
-    z, actions = true[None], 2.0 * RNG.standard_normal((T, N_A))
-    seen, every = [], model.n_z // SENSORS
-    for a in actions:
-        seen.append(z[0, every // 2 :: every])
-        z = model.step(z, a[None])
-    smoothing = Smoothing(moving, ACTUATORS, 0.0, np.zeros(SENSORS))
-    found, error = smoothing.field(np.array(seen), actions, np.nan)
-    assert error < 1e-6
-    assert np.linalg.norm(found - true) < 0.01 * np.linalg.norm(true)
-
-
-def test_what_readings_do_not_tell_is_as_large_as_other_rollouts_say() -> None:
-    """From eight sensors with noise, whose short waves would otherwise be those of the noise."""
-    model, sigma, rng = model_with(CUBIC, 0.0), 0.2, np.random.default_rng(6)
-    every, seen, true = model.n_z // SENSORS, [], []
-    for seed in range(4):
-        z, actions, rows = field(model, seed)[None], 10.0 * rng.standard_normal((T, N_A)), []
-        true.append(z[0])
-        for a in actions:
-            rows.append(z[0, every // 2 :: every] + sigma * rng.standard_normal(SENSORS))
-            z = model.step(z, a[None])
-        seen.append((np.array(rows), actions, np.nan))
-    first = Smoothing(CUBIC, ACTUATORS, sigma, np.zeros(SENSORS))
-    learned = first.learned(seen)
-    assert learned.spread is not None
-    # Means of 0.3, and waves of half of 1 at the first two wavenumbers.
-    assert learned.spread[1] > 0.25 and learned.spread[8] < 0.1 * learned.spread[1]
-    off = [
-        sum(np.sum((each.field(*own)[0] - z) ** 2) for own, z in zip(seen, true, strict=True))
-        for each in (learned, first)
-    ]
-    assert off[0] < 0.7 * off[1]
-    # So does the equation.
-    readings, taken = [own[0] for own in seen], [own[1] for own in seen]
-    known = np.zeros(SENSORS), np.full(len(seen), np.nan)
-    off = [
-        np.linalg.norm(
-            fit_sensed(
-                readings, taken, ACTUATORS, sigma, CUBIC, *known, spread, settings=FEW_ITERATIONS
-            )[1]
-            - np.array(true)
-        )
-        for spread in (learned.spread, None)
-    ]
-    assert off[0] < 0.5 * off[1]
 
 
 def test_a_compensator_does_the_same_in_the_coordinates_of_the_law() -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,13 +16,10 @@ from pdeloop.method.adapt import Context, ModelBased, Optimizer, Rollout, Rollou
 from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Observer
-from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import SENSORS
 
 Array = np.ndarray
 N_A = 3
-FEW_ITERATIONS = replace(DEFAULTS, sensed_iterations=6, sensed_last_iterations=15)
-"""For claims that need no exact equation."""
 
 
 def rows_of(n_s: int, U: Array, n_a: int = N_A) -> ModelRows:
@@ -52,7 +48,6 @@ def small() -> tuple[pdeloop.Problem, Context]:
         sensors=SENSORS,
         further=[second],
         law=law,
-        field_models=FEW_ITERATIONS,
     )
     return problem, context
 

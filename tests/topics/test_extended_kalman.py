@@ -28,13 +28,7 @@ PARAMETERS = {
 }
 SETTINGS = {
     "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1},
-    "field_model_settings": {
-        "sensed_iterations": 2,
-        "sensed_last_iterations": 3,
-        "sensed_newest": 2,
-        "sensed_learning": 1,
-        "sensed_again": 0,
-    },
+    "field_model_settings": {"sensed_newest": 2},
 }
 
 

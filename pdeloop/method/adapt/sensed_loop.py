@@ -2,7 +2,7 @@
 """A law with an observer on a model of the field between few sensors.
 
 The initial field of a rollout is estimated from its readings
-(`pdeloop.method.models.sensed_smoothing`).
+(`pdeloop.method.models.sensed_fit`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ from pdeloop.method.adapt.estimated_loop import simulate_estimated
 from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
-from pdeloop.method.models.sensed_fit import fit_sensed, halved
-from pdeloop.method.models.sensed_smoothing import Smoothing, settled
+from pdeloop.method.models.sensed import SensedModel, interpolated, sensed_model
+from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
 from pdeloop.method.models.settings import (
     DEFAULTS,
-    SENSED_ALIKE_CHI,
     SENSED_MOST,
     SENSED_REPRODUCED,
     FieldModelSettings,
@@ -81,11 +79,8 @@ class SensedLoop(ObservedLoop):
         if not steps or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[model.seen], self.state_weight * (model.n_z // model.sensors)
-        smoothing = Smoothing(
-            model.shared, model.actuators, model.noise, target, model.spread, self.settings
-        )
         known = distance(record, weight, self.action_weight, self.horizon)
-        return smoothing.field(record.acted_from, record.actions, known)
+        return initial_field(model, record.acted_from, record.actions, target, known, self.settings)
 
 
 def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:
@@ -124,38 +119,6 @@ def of_rollouts(
     )
 
 
-def fit_rollouts(
-    problem: ClosedLoopProblem,
-    rollouts: Sequence[Record],
-    actuators: Actuators,
-    noise: float,
-    start: Array | None,
-    settings: FieldModelSettings = DEFAULTS,
-    spread: Array | None = None,
-) -> tuple[Array, Array, float] | None:
-    """The fit that reproduces the readings of rollouts, from an earlier equation or from nothing.
-
-    The shared unknowns, the initial fields and the error, as for `fit_sensed`; None if neither does.
-    spread: as for `fit_sensed` as well.
-    """
-    readings, actions, distances = of_rollouts(problem, rollouts)
-    for first in (None,) if start is None else (start, None):
-        found = fit_sensed(
-            readings,
-            actions,
-            actuators,
-            noise,
-            start=first,
-            target=problem.target,
-            distances=distances,
-            spread=spread,
-            settings=settings,
-        )
-        if found[2] <= SENSED_REPRODUCED:
-            return found
-    return None
-
-
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring."""
     sensors, most = context.sensors, SENSED_MOST
@@ -181,83 +144,32 @@ def sensed_from(
 
     before: the model of earlier rollouts, whose equation and spread the fit starts from.
     """
-    sensors, n_a, settings = context.sensors, records[0].actions.shape[1], context.field_models
     problem, chosen = to_be_fitted(context, records)
     if not chosen:
         return None
-    actuators = context.actuators(n_a)
-    start, spread = (None, None) if before is None else (before.shared, before.spread)
+    actuators = context.actuators(records[0].actions.shape[1])
     readings, actions, distances = of_rollouts(problem, chosen)
-    size = float(np.mean([np.mean(own**2) for own in readings]))
-    # Else what the grid does not resolve would be taken for fields and actuators.
-    declared = float(np.hypot(context.noise, settings.sensed_unresolved * np.sqrt(size)))
-    found = fit_rollouts(problem, chosen, actuators, declared, start, alike(settings), spread)
-    noise = context.noise**2 / size
-    chance = SENSED_ALIKE_CHI * noise * np.sqrt(2.0 / np.size(readings))
-    if found is None or found[2] > max(settings.sensed_unresolved**2, chance):
-        near = start if found is None else found[0]
-        free = fit_rollouts(problem, chosen, actuators, declared, near, settings, spread)
-        if found is None or (free is not None and differ(found[2], free[2], chance, settings)):
-            found = free
-        else:
-            settings = alike(settings)
-    else:
-        settings = alike(settings)
-    if found is None:
+    found = fit_sensed(
+        readings,
+        actions,
+        actuators,
+        context.noise,
+        start=None if before is None else (before.shared, before.spread),
+        target=context.target,
+        distances=distances,
+        settings=context.field_models,
+    )
+    if found.error > SENSED_REPRODUCED:
         return None
-    shared, fields, error = found
-    known = list(zip(readings, actions, distances.tolist(), strict=True))
-
-    def learned() -> tuple[Smoothing, Array]:
-        # The unpredicted part of a reading is noise to a filter.
-        noise = float(np.sqrt(declared**2 + error * size))
-        smoothing = Smoothing(shared, actuators, noise, context.target, spread, settings)
-        smoothing = smoothing.learned(known, fields)
-        assert smoothing.spread is not None
-        return smoothing, smoothing.spread
-
-    smoothing, likely = learned()
-    # The fit takes noise between the sensors for short waves as long as it knows nothing of them.
-    for _ in range(settings.sensed_again):
-        if spread is not None and settled(likely, spread):
-            break
-        again = fit_sensed(
-            readings,
-            actions,
-            actuators,
-            declared,
-            start=shared,
-            target=context.target,
-            distances=distances,
-            spread=likely,
-            settings=settings,
-            near=fields,
-        )
-        if again[2] > SENSED_REPRODUCED:
-            break
-        (shared, fields, error), spread = again, likely
-        smoothing, likely = learned()
-    largest = _EXTRAPOLATION * float(np.abs(fields).max())
-    model = sensed_model(shared, sensors, actuators, largest, settings, noise=smoothing.noise)
-    return replace(model, spread=likely), error
-
-
-def alike(settings: FieldModelSettings) -> FieldModelSettings:
-    """Settings with which a fit holds the strengths of actuators near to each other.
-
-    Few sensors tell little of them: waves that the sensors do not resolve would be taken for
-    differences in strength, with which the readings are reproduced as well.
-    """
-    held = settings.sensed_alike_unequal, settings.sensed_alike_ridge
-    return replace(settings, sensed_unequal=held[0], sensed_unequal_ridge=held[1])
-
-
-def differ(held: float, free: float, chance: float, settings: FieldModelSettings) -> bool:
-    """True if actuators differ in strength, by the errors of fits that hold them and do not.
-
-    chance: the least change of an error that noise does not explain.
-    """
-    return held - free > chance and halved(held, free, settings)
+    model = sensed_model(
+        found.shared,
+        context.sensors,
+        actuators,
+        _EXTRAPOLATION * float(np.abs(found.fields).max()),
+        context.field_models,
+        noise=found.noise,
+    )
+    return replace(model, spread=found.spread), found.error
 
 
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:

@@ -1,67 +1,143 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The equation of `pdeloop.method.models.sensed` and initial fields from the readings of rollouts.
 
-The initial fields of the rollouts are unknown as well: a few Fourier coefficients each. All of them are
-fitted at once to the readings y_k = z_k(sensors) of whole rollouts, and to d, the mean of (z - z_r)^2
-over all points and steps of each, which follows from its cost,
+With z_{k+1} = f(z_k, a_k; phi) the equation over a sampling time and H the sensors, the likeliest phi
+and initial fields minimise
 
-    min  mean over rollouts and steps |y_k^model - y_k|^2 / mean |y_k|^2
-         + mean over rollouts (0.1 (d^model / d - 1))^2 + a small ridge,
+    J = sum_r sum_{k < m} |y_k - H z_k|^2 / (2 sigma^2) + |phi / s|^2 / 2 + sum_r |z_0 / S|^2 / 2
 
-by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then over longer
-and longer parts: over a whole rollout at once, a front makes the error flat in most unknowns. The field
-between the sensors is observed later, when it passes one.
+over the first m steps of the rollouts r, and for whole rollouts also the error of d, the mean of
+(z - z_r)^2 over all points and steps, which follows from the cost of a rollout. z_0 has 33 Fourier
+coefficients with the standard deviations S.
 
-Where constant coefficients leave an error that is not noise, all rollouts are fitted once more from
-nothing, with coefficients that depend on x. These count if they halve the error, and if, fitted to
-every other rollout, they reproduce the rest better than constant ones that were fitted to all.
+m grows from a twentieth of the rollouts to all of their steps: over a whole rollout at once, a front
+makes J flat in most unknowns, and the field between the sensors is observed later, when it passes one.
+Each is the method of Levenberg and Marquardt. As z_0 moves its own rollout alone, it is eliminated,
 
-After each part the ridge of an unknown becomes s^2/(x^2 + C), with C its variance given the readings
-and s^2 that of a residual. An unknown that is not significant, such as a growth that a few calm
-rollouts cannot tell from none, goes to zero and does not make other rollouts run away.
+    A_r = J_z^T J_z + S^-2,  B_r = J_z^T J_phi,
+    (sum_r J_phi^T J_phi + s^-2 - sum_r B_r^T A_r^-1 B_r) dphi = g_phi - sum_r B_r^T A_r^-1 g_z.
+
+Whole rollouts are fitted again with the S and the deviation between actuators that the last fit implies
+(empirical Bayes), without the terms whose loss of J is small. Equations with more terms are fitted from
+nothing where the first ones leave an error that is not noise.
 
 References
 ----------
-Tipping, "Sparse Bayesian learning and the relevance vector machine", J. Machine Learning Research 1,
-2001 (the ridges: automatic relevance determination).
 Le Dimet, Talagrand, "Variational algorithms for analysis and assimilation of meteorological
-observations", Tellus A 38, 1986 (initial fields from readings: 4D-Var). Raissi, Perdikaris,
-Karniadakis, "Physics-informed neural networks", J. Comput. Phys. 378, 2019 (equation and field from few
-points).
+observations", Tellus A 38, 1986 (initial fields from readings: 4D-Var). Bock, "Recent advances in
+parameter identification techniques for ODE", 1983 (elimination of initial states). MacKay, "Bayesian
+interpolation", Neural Computation 4(3), 1992 (the deviations).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.sensed import Actuators, coefficients_of, field_of, grid_points
-from pdeloop.method.models.sensed_growth import USED, Found, further_terms, grown, start_with
-from pdeloop.method.models.sensed_problem import SensedProblem
-from pdeloop.method.models.sensed_unknowns import EQUATION, TERMS
+from pdeloop.method.models.sensed import (
+    WAVES,
+    Actuators,
+    SensedModel,
+    coefficients_of,
+    field_of,
+    grid_points,
+    interpolated,
+)
+from pdeloop.method.models.sensed_flow import SensedFlow
+from pdeloop.method.models.sensed_unknowns import (
+    COEFFICIENTS,
+    EQUATION,
+    FIRST,
+    SHARED,
+    TERMS,
+    unknowns,
+    well_posed,
+)
 from pdeloop.method.models.settings import (
     DEFAULTS,
-    SENSED_ALIKE_CHI,
-    SENSED_ENOUGH,
-    SENSED_HELD_RIDGE,
+    SENSED_CHANCE,
     SENSED_HOPELESS,
     SENSED_REPRODUCED,
     FieldModelSettings,
 )
 
-_LIKELIER = 30.0
-"""Margin in log-likelihood by which a fit from nothing must exceed one with an earlier equation's
-spread."""
-_DISPERSION = 20.0
-"""Dispersion at which fits start, of both signs; also half of it and 1.5 times it."""
+_FEW = tuple(range(len(FIRST)))
+_LIBRARIES: tuple[tuple[tuple[int, ...], bool, float], ...] = (
+    (_FEW, False, 0.0),
+    (_FEW, True, 0.0),
+    ((*_FEW, TERMS.index((1, 4)), TERMS.index((3, 2))), False, 0.0),
+    ((*_FEW, TERMS.index((4, 0)), TERMS.index((5, 0))), False, 0.0),
+    ((*_FEW, *range(len(TERMS), EQUATION)), False, 3e-4),
+)
+"""Unknowns of the equations that are fitted one after the other; whether actuators differ in strength
+(few sensors tell little of it, and waves that they do not resolve would be taken for differences); and
+the error from which each is tried, beside what neither the grid nor chance explains."""
+_BEGINNING, _SHORTEST, _LONGER = 0.05, 10, 1.5
+"""Share of each rollout over which a fit begins, its least number of steps, and its growth."""
+_FIRST = 4
+"""The part to which the field of a known equation is fitted before the whole."""
+_COMPARED = 100
+"""Maximum number of time steps whose readings are compared."""
+_ITERATIONS, _LAST_ITERATIONS = 20, 40
+"""Of a part, and of whole rollouts, at most."""
+_LEAST_GAIN = 1e-3
+"""Share of J that an iteration must gain for the fit to continue."""
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-8, 1e6
+_DIFFERENCE = 1e-5
+"""Step of the finite differences."""
+_DEVIATION, _UNEQUAL, _WIDTH = 30.0, 3.0, 0.3
+"""Prior standard deviations of a coefficient, of an actuator's strength from the mean one, and of a
+width that is not declared."""
+_WAVE = 2.0
+"""Wavenumber beyond which the prior deviation of a field's coefficients falls."""
+_DISTANCE = 0.01
+"""Standard deviation of d, relative to it."""
+_LOST = 0.25
+"""Error, in variances of a reading, from which a fit says nothing of the readings."""
+_STARTS = ((0.3, 0.0), (1.0, 0.0), (0.0, -20.0), (0.0, 20.0))
+"""Of fits from nothing: the least sigma, relative to the readings, until whole rollouts were fitted, as
+short parts would be taken too literally; and the coefficient of the third derivative, as no descent
+leads from waves that run one way to waves that run the other."""
+_TERM = 4.0
+"""Loss of J for which a term stays."""
+_AGAIN = 2
+"""Times that whole rollouts are fitted again."""
+_SETTLED = 0.05
+"""Relative change of S below which they are not."""
+_MARGIN, _NEAR, _CLIP = 1.3, 2, 3.0
+"""The size of a field relative to the largest reading of as many steps before and after, which sets the
+internal steps, and the bound on z in powers."""
+_WAVENUMBERS = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
 
-# Shares of the declared dispersion that fits begin with: no descent leads from waves that run one way
-# to waves that run the other. The last ones are tried only where none of the others is good enough.
-_DISPERSIONS, _FEW = (0.0, -1.0, 1.0, -0.5, 0.5, -1.5, 1.5), 3
-# Times that whole rollouts are fitted, each with the unknowns that were significant before.
-_WHOLE = 2
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An equation and the initial fields of rollouts.
+
+    Attributes
+    ----------
+    shared : (44 + n_a,) array
+        Its unknowns.
+    fields : (rollouts, n) array
+        Initial fields.
+    spread : (33,) array
+        S.
+    error : float
+        Squared error of the readings over their sum of squares, less what noise has in it; infinite
+        where nothing is finite.
+    noise : float
+        Standard deviation of what is not predicted of a reading, which is noise to a filter.
+    """
+
+    shared: Array
+    fields: Array
+    spread: Array
+    error: float
+    noise: float
 
 
 def fit_sensed(
@@ -69,13 +145,11 @@ def fit_sensed(
     actions: Sequence[Array],
     actuators: Actuators,
     noise: float = 0.0,
-    start: Array | None = None,
+    start: tuple[Array, Array] | None = None,
     target: Array | None = None,
     distances: Array | None = None,
-    spread: Array | None = None,
     settings: FieldModelSettings = DEFAULTS,
-    near: Array | None = None,
-) -> tuple[Array, Array, float]:
+) -> Fitted:
     """Fit the equation and the initial fields of rollouts.
 
     Parameters
@@ -86,249 +160,371 @@ def fit_sensed(
         What is declared of them.
     noise : float
         Standard deviation of the noise on every reading.
-    start : (44 + n_a,) array, optional
-        The shared unknowns to begin with; from several equations, with no actuators, if there are none.
+    start : (44 + n_a,) and (33,) arrays, optional
+        The unknowns of an earlier equation and its S, to begin with in place of none.
     target : (n_y,) array, optional
         z_r at the sensors.
     distances : (rollouts,) array, optional
         d of each rollout; NaN where it is not known.
-    spread : (33,) array, optional
-        Standard deviations of the Fourier coefficients of an initial field; those that readings of any
-        size suggest if there are none.
     settings : FieldModelSettings
-        The constants of the fit, `sensed_`.
-    near : (rollouts, n) array, optional
-        Initial fields that an earlier fit of the same rollouts found with `start`.
-
-    Returns
-    -------
-    (44 + n_a,) array, (rollouts, n) array and float
-        The shared unknowns with the least error, the initial fields, and the error: what is minimised,
-        but for the ridge and for what noise has in it. It is infinite where no equation reproduces even
-        the beginning of the rollouts.
+        Of the simulations.
     """
-    y, a = np.stack(readings), np.stack(actions)
-    if target is None or distances is None:
-        target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
-    problem = SensedProblem(y, a, actuators, noise, target, distances, settings)
-    problem.prior.spread = spread
-    fields, n = problem.interpolated(), grid_points(y.shape[2])
+    data = _Data(
+        np.stack(readings), np.stack(actions), actuators, noise, target, distances, settings
+    )
     if start is not None:
-        known = None if near is None else coefficients_of(near)
-        found = _refined(problem, start, fields, known)
-    else:
-        first, *others = few_rollouts(y, a, settings.sensed_starts)
-        found, enough = _from_few(problem, first, settings, np.inf), SENSED_REPRODUCED
-        for few in others:
-            if found[0] <= enough:
+        own = np.flatnonzero(start[0][:EQUATION]).tolist()
+        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted()
+        if fit.error(data.steps) <= SENSED_REPRODUCED:
+            return fit.found
+    best = _of_first_terms(data)
+    for library, unequal, least in _LIBRARIES[1:]:
+        error = best.error(data.steps)
+        if error <= max(least, data.unexplained):
+            continue
+        most = 0.5 * (error + data.unresolved) - data.unresolved
+        if best.lost or best.promised(library, unequal) < most:
+            fit = _Fit(data, library, unequal).fitted()
+            if fit.error(data.steps) < most:
+                best = fit
+    return best.found
+
+
+def _of_first_terms(data: _Data) -> _Fit:
+    """The likeliest of fits from nothing, which are made until one says something of the readings."""
+    fits = list[_Fit]()
+    for loose, dispersion in _STARTS:
+        fits.append(_Fit(data, *_LIBRARIES[0][:2], loose=loose))
+        fits[-1].shared[TERMS.index((1, 3))] = dispersion
+        if not fits[-1].fitted().lost:
+            return fits[-1]
+    return min(fits, key=lambda fit: fit.value(data.steps))
+
+
+def initial_field(
+    model: SensedModel,
+    readings: Array,
+    actions: Array,
+    target: Array,
+    distance: float,
+    settings: FieldModelSettings = DEFAULTS,
+) -> tuple[Array, float]:
+    """The likeliest initial field (n,) of a rollout on a model, and its error as in `Fitted`.
+
+    target, distance: z_r at the sensors (n_y,), and d, NaN where it is not known.
+    """
+    y, a, d = readings[None], actions[None], np.array([distance])
+    data = _Data(y, a, model.actuators, model.noise, target, d, settings)
+    fit = _Fit(data, (), False, model.shared, model.spread, known=True)
+    for m in (data.lengths[:_FIRST][-1], data.steps):
+        fit.descend(m)
+    field: Array = field_of(fit.fields, data.n)[0]
+    return field, fit.error(data.steps)
+
+
+class _Data:
+    """Rollouts: y (R, T, n_y), a (R, T, n_a), and how their errors are measured."""
+
+    def __init__(
+        self,
+        y: Array,
+        a: Array,
+        actuators: Actuators,
+        noise: float,
+        target: Array | None,
+        distances: Array | None,
+        settings: FieldModelSettings,
+    ) -> None:
+        self.readings, self.actions, self.actuators, self.settings = y, a, actuators, settings
+        self.rollouts, self.steps, sensors = y.shape
+        # Readings that a law brings to the target say little of the size of the field before.
+        self.size = float(np.sqrt(max(np.mean(y * y), np.mean(y[:, 0] ** 2)))) or 1.0
+        self.noise = noise
+        # Else what the grid does not resolve would be taken for fields and actuators.
+        self.unresolved = settings.sensed_unresolved**2
+        self.sigma = float(np.sqrt(noise**2 + self.unresolved * self.size**2))
+        self.n = grid_points(sensors)
+        near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
+        self.sizes, self.clip = _MARGIN * windows.max(axis=1), _CLIP * float(near.max())
+        waves, places = np.arange(self.n // 2 + 1), (np.arange(sensors) + 0.5) / sensors
+        # Of the two planes of a spectrum: the field at the sensors, and its mean square.
+        self.mean_square = np.tile(np.where((waves == 0) | (waves == self.n // 2), 1.0, 2.0), 2)
+        phase = 2 * np.pi * waves[:, None] * places
+        self.read = np.vstack([np.cos(phase), -np.sin(phase)]) * self.mean_square[:, None]
+        aim = np.fft.rfft(interpolated(np.zeros(sensors) if target is None else target)) / self.n
+        self.target = np.concatenate([aim.real, aim.imag])
+        self.distances = np.full(len(y), np.nan)
+        if target is not None and distances is not None:
+            self.distances = distances
+        grid = np.arange(self.n) / self.n
+        first = np.stack([np.interp(grid, places, own[0], period=1.0) for own in y])
+        self.interpolated = coefficients_of(first)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Steps of the rollouts that are fitted one after the other."""
+        found, m = list[int](), max(_SHORTEST, round(_BEGINNING * self.steps))
+        while m < self.steps:
+            found.append(m)
+            m = int(np.ceil(_LONGER * m))
+        return [*found, self.steps]
+
+    @property
+    def unexplained(self) -> float:
+        """The least error that is due neither to the grid nor to chance in the noise."""
+        share = (self.noise / self.size) ** 2
+        return self.unresolved + SENSED_CHANCE * share * float(np.sqrt(2.0 / self.readings.size))
+
+
+class _Fit:
+    """The unknowns of a fit, and its descent.
+
+    library: the coefficients that are not known; unequal: whether actuators differ in strength; spread:
+    S, if it is known. `known` leaves nothing but the fields.
+    """
+
+    def __init__(
+        self,
+        data: _Data,
+        library: Sequence[int],
+        unequal: bool,
+        shared: Array | None = None,
+        spread: Array | None = None,
+        *,
+        loose: float = _STARTS[0][0],
+        known: bool = False,
+    ) -> None:
+        self.data, self.fields, size = data, data.interpolated, data.size
+        count = unknowns(data.actions.shape[2])
+        self.shared = np.zeros(count) if shared is None else shared.copy()
+        self.sigma = data.sigma if known else max(data.sigma, loose * size)
+        self.spread = size / (1.0 + (_WAVENUMBERS / _WAVE) ** 2) if spread is None else spread
+        width = [] if data.actuators.declared else [COEFFICIENTS + 3]
+        each = range(SHARED, count) if unequal else ()
+        varied = [*library, COEFFICIENTS - 1, COEFFICIENTS, *width, *each]
+        self.varied: NDArray[np.intp] = np.array([] if known else varied, dtype=np.intp)
+        self.deviations = np.full(len(self.varied), _DEVIATION)
+        for i, own in enumerate(self.varied.tolist()):
+            if own < len(TERMS):
+                self.deviations[i] /= size ** (TERMS[own][0] - 1)
+            elif own == COEFFICIENTS - 1:
+                self.deviations[i] *= size
+            elif own == COEFFICIENTS + 3:
+                self.deviations[i] = _WIDTH
+            elif own >= SHARED:
+                self.deviations[i] = _UNEQUAL
+
+    def fitted(self) -> _Fit:
+        """This one, over longer and longer parts."""
+        data = self.data
+        for m in data.lengths:
+            self.descend(m)
+            if self.error(m) > SENSED_HOPELESS:
+                return self
+        self.sigma = data.sigma
+        self.descend(data.steps)
+        for _ in range(_AGAIN):
+            before = self.spread
+            if not self.learn():
                 break
-            # A fit to all rollouts takes long: only from what is an equation of these few.
-            own = _from_few(problem, few, settings, enough)
-            found = min(found, own, key=lambda each: each[0])
-        found = with_coefficients_of_x(problem, found, settings)
-    error, shared, fields = found
-    return shared, field_of(fields, n), max(error, 0.0)
+            self.descend(data.steps)
+            if np.linalg.norm(self.spread - before) <= _SETTLED * np.linalg.norm(before):
+                break
+        return self
 
+    @property
+    def lost(self) -> bool:
+        """True if it is so far off that it says nothing of equations with other terms."""
+        data = self.data
+        least = max(_LOST * (data.sigma / data.size) ** 2, data.unexplained)
+        return self.error(data.steps) > min(least, SENSED_REPRODUCED)
 
-def few_rollouts(y: Array, a: Array, most: int) -> list[list[int]]:
-    """Sets of rollouts that a fit from nothing begins with, one after the other; so many at most.
+    @property
+    def found(self) -> Fitted:
+        """What it found."""
+        data, error = self.data, self.error(self.data.steps)
+        noise = float(np.hypot(data.sigma, np.sqrt(error) * data.size))
+        return Fitted(self.shared, field_of(self.fields, data.n), self.spread, error, noise)
 
-    The calmest one with inputs and the calmest of the others, from which most descents find the
-    equation. Where they show too little of it, the calmest one and that with the largest inputs. Then
-    each of these by itself, as one rollout is reproduced more easily, and the calmest one with each of
-    the others.
-    """
-    calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
-    acted = [m for m in calmest if a[m].any()]
-    driven = np.argsort(-np.sum(a * a, axis=(1, 2)), kind="stable").tolist()
-    pairs = [list(dict.fromkeys([*acted[:1], *own]))[:2] for own in (calmest, driven)]
-    first = pairs[0][:1]
-    alone = [first, [m for m in pairs[1] if m not in first]]
-    others = [[*first, m] for m in calmest if m not in first]
-    every: list[list[int]] = []
-    for few in (*pairs, *alone, *others):
-        if few and few not in every:
-            every.append(few)
-    return every[:most]
+    def promised(self, library: Sequence[int], unequal: bool) -> float:
+        """The error that one step with these unknowns promises, by its curvature."""
+        data = self.data
+        other = _Fit(data, library, unequal, self.shared, self.spread)
+        other.fields, other.sigma = self.fields, self.sigma
+        with np.errstate(all="ignore"):
+            e, Jz, Jp = other._derivatives(data.steps)
+        if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+            return 0.0
+        A, B, C = other._curvatures(Jz, Jp)
+        gz, gp = other._slopes(e, Jz, Jp)
+        X = np.linalg.solve(A, np.concatenate([B, gz[:, :, None]], axis=2))
+        H = C - np.einsum("ruv,ruw->vw", B, X[..., :-1])
+        rest = gp - np.einsum("ruv,ru->v", B, X[..., -1])
+        gain = 0.5 * float(rest @ np.linalg.solve(H, rest) + np.sum(gz * X[..., -1]))
+        share = 2.0 * gain / data.readings.size * (self.sigma / data.size) ** 2
+        return self.error(data.steps) - share
 
+    def value(self, m: int) -> float:
+        """J over m steps."""
+        with np.errstate(all="ignore"):
+            return self._value(self.shared, self.fields, m)
 
-def _from_few(
-    problem: SensedProblem, few: list[int], settings: FieldModelSettings, most: float
-) -> Found:
-    """The fit to all rollouts from what a few of them suggest, and with further terms.
+    def error(self, m: int) -> float:
+        """Mean square of the errors of the first m readings, less the noise, relative to their size."""
+        data = self.data
+        with np.errstate(all="ignore"):
+            e = self._errors(self.shared, self.fields[None], m)[0]
+            readings = e[:, : e.shape[1] - bool(self._told(m))]
+            found = float(np.mean(readings**2)) / -(-m // _COMPARED) * self.sigma**2
+        return max(found - data.noise**2, 0.0) / data.size**2 if np.isfinite(found) else np.inf
 
-    most: the error on these from which on there is none, of infinite error.
-    """
-    problem.prior.forget()
-    fields = problem.interpolated()
-    error, shared, fields[few] = _first_guess(problem.part(few, hold=True))
-    if not np.isfinite(error) or error > most:
-        return np.inf, shared, fields
-    found = _refined(problem, shared, fields, None, first=True)
-    shared = further_terms(problem, found, settings)
-    if shared is not found[1]:
-        found = _refined(problem, shared, problem.interpolated(), None, first=True)
-    return found
+    def descend(self, m: int) -> None:
+        """Iterate over the first m steps."""
+        damping, count = _DAMPING, len(self.varied)
+        most = _LAST_ITERATIONS if m == self.data.steps else _ITERATIONS
+        with np.errstate(all="ignore"):
+            now = self._value(self.shared, self.fields, m)
+            for _ in range(most):
+                e, Jz, Jp = self._derivatives(m)
+                if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+                    return
+                A, B, C = self._curvatures(Jz, Jp)
+                gz, gp = self._slopes(e, Jz, Jp)
+                before = now
+                while damping < _MOST_DAMPING:
+                    damped = A + damping * np.einsum("ruu,uv->ruv", A, np.eye(A.shape[1]))
+                    X = np.linalg.solve(damped, np.concatenate([B, gz[:, :, None]], axis=2))
+                    H = (
+                        C
+                        + damping * np.diag(np.diag(C))
+                        - np.einsum("ruv,ruw->vw", B, X[..., :count])
+                    )
+                    shared = self._moved(H, gp - np.einsum("ruv,ru->v", B, X[:, :, count]))
+                    dp = (self.shared - shared)[self.varied]
+                    fields = self.fields - (X[:, :, count] - X[:, :, :count] @ dp)
+                    value = self._value(shared, fields, m)
+                    if value < now:
+                        self.shared, self.fields, now = shared, fields, value
+                        damping = max(damping / 5.0, _LEAST_DAMPING)
+                        break
+                    damping *= 5.0
+                if not now < before - _LEAST_GAIN * max(before, 1.0):
+                    return
 
+    def _moved(self, H: Array, g: Array) -> Array:
+        """The shared unknowns after a step; those that a bound stops stay, the others do without."""
+        shared, free = self.shared.copy(), np.ones(len(g), dtype=bool)
+        for _ in range(4):
+            dp = np.zeros(len(g))
+            dp[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
+            shared[self.varied] = self.shared[self.varied] - dp
+            bounded = well_posed(shared)
+            stopped = free & (self.shared[self.varied] == 0.0) & (dp != 0.0)
+            stopped &= bounded[self.varied] == 0.0
+            if not stopped.any():
+                break
+            free &= ~stopped
+        return bounded
 
-def _refined(
-    problem: SensedProblem,
-    shared: Array,
-    fields: Array,
-    known: Array | None,
-    *,
-    first: bool = False,
-) -> Found:
-    """The fit to all rollouts from these unknowns; known: their fields, if an earlier fit found them.
+    def learn(self) -> bool:
+        """S and the deviation between actuators from what was found, and fewer terms; False: none."""
+        with np.errstate(all="ignore"):
+            _, Jz, Jp = self._derivatives(self.data.steps)
+        if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+            return False
+        A, B, C = self._curvatures(Jz, Jp)
+        P = C - np.einsum("ruv,ruw->vw", B, np.linalg.solve(A, B))
+        own = np.diagonal(np.linalg.inv(A), axis1=1, axis2=2)
+        second = np.sum(self.fields**2 + own, axis=0)
+        # Nothing is known of where on the circle a field is.
+        second[1:] = np.tile(second[1:].reshape(2, WAVES).mean(axis=0), 2)
+        self.spread = np.sqrt((second + self.spread**2) / (self.data.rollouts + 1))
+        self._leave_out(P)
+        return True
 
-    first: the equation is that of a few rollouts.
-    """
-    fresh = known is None
-    if known is None:
-        _, _, known = problem.fit(shared, fields, known=True)
-    whole, found = [problem.y.shape[1]] * _WHOLE, []
-    # Else the equation does not hold for the other rollouts: nothing is near enough for a whole fit.
-    holds = problem.error(shared, known) <= SENSED_REPRODUCED
-    if holds:
-        found.append(problem.fit(shared, known, lengths=whole))
-    # With noise two rollouts leave much of an equation open.
-    if not holds or (first and problem.noise):
-        problem.prior.forget()
-        found.append(part_by_part(problem, shared, fields))
-    if problem.noise and fresh:
-        problem.prior.forget()
-        most = SENSED_HOPELESS
-        anew = part_by_part(problem, dispersion_of(shared), fields, most)
-        found += [anew] if np.isfinite(anew[0]) else []
-        # Errors that are all below the noise tell no equation from another.
-        best = min(found, key=lambda own: problem.implausibility(*own[1:]))
-        if problem.prior.spread is not None:
-            best = far_likelier(problem, best, dispersion_of(shared), fields)
-        error, shared, fields = best
-    else:
-        error, shared, fields = min(found, key=lambda own: own[0])
-    return error - problem.noise, shared, fields
+    def _leave_out(self, P: Array) -> None:
+        """Leave out the terms whose loss of J, by its curvature P, is small, one by one."""
+        kept, shared = list(range(len(self.varied))), self.shared[self.varied]
+        while True:
+            V = np.linalg.inv(P[np.ix_(kept, kept)])
+            losses = {
+                i: 0.5 * shared[i] ** 2 / V[j, j]
+                for j, i in enumerate(kept)
+                if self.varied[i] < EQUATION
+            }
+            least = min(losses, key=losses.__getitem__, default=None)
+            if least is None or losses[least] > _TERM:
+                break
+            j = kept.index(least)
+            shared[kept] -= V[:, j] * shared[least] / V[j, j]
+            shared[least] = 0.0
+            kept.pop(j)
+        self.shared[self.varied] = shared
+        self.shared = well_posed(self.shared)
+        self.varied, self.deviations = self.varied[kept], self.deviations[kept]
 
+    def _curvatures(self, Jz: Array, Jp: Array) -> tuple[Array, Array, Array]:
+        """A (R, 33, 33), B (R, 33, varied) and that of phi (varied, varied)."""
+        A = np.einsum("ure,vre->ruv", Jz, Jz) + np.diag(self.spread**-2.0)
+        B = np.einsum("ure,vre->ruv", Jz, Jp)
+        return A, B, np.einsum("ure,vre->uv", Jp, Jp) + np.diag(self.deviations**-2.0)
 
-def far_likelier(problem: SensedProblem, best: Found, start: Array, fields: Array) -> Found:
-    """A fit from these unknowns without a spread of waves, if it is likelier by far, or else the best.
+    def _slopes(self, e: Array, Jz: Array, Jp: Array) -> tuple[Array, Array]:
+        """Of J, by the fields (R, 33) and the shared unknowns (varied,)."""
+        gz = np.einsum("ure,re->ru", Jz, e) + self.fields / self.spread**2
+        gp = np.einsum("ure,re->u", Jp, e) + self.shared[self.varied] / self.deviations**2
+        return gz, gp
 
-    The spread followed from the equation before, and may hold a wrong one: with eight sensors one whose
-    short waves move past them, as an advection that is not there.
-    """
-    spread, problem.prior.spread = problem.prior.spread, None
-    problem.prior.forget()
-    anew = part_by_part(problem, start, fields, SENSED_HOPELESS)
-    if np.isfinite(anew[0]):
-        # Each with its likeliest fields: those of the best were held to that spread.
-        _, *held = problem.fit(*best[1:], known=True, lengths=[problem.y.shape[1]])
-        gain = problem.implausibility(*held) - problem.implausibility(*anew[1:])
-        share = problem.weight(problem.y.shape[1])  # that of one reading, with its variance
-        if 0.5 * gain / share > _LIKELIER:
-            best = anew
-    problem.prior.spread = spread
-    return best
+    def _value(self, shared: Array, fields: Array, m: int) -> float:
+        """J."""
+        e = self._errors(shared, fields[None], m)
+        prior = np.sum((shared[self.varied] / self.deviations) ** 2)
+        found = 0.5 * float(np.sum(e * e) + prior + np.sum((fields / self.spread) ** 2))
+        return found if np.isfinite(found) else np.inf
 
+    def _derivatives(self, m: int) -> tuple[Array, Array, Array]:
+        """Errors (R, errors), and their derivatives by fields and shared unknowns, (., R, errors)."""
+        own = self.fields.shape[1]
+        nearby = np.tile(self.fields, (1 + own, 1, 1))
+        nearby[1:] -= _DIFFERENCE * np.eye(own)[:, None]
+        e = self._errors(self.shared, nearby, m, self.varied.tolist())
+        J = (e[:1] - e[1:]) / _DIFFERENCE
+        return e[0], J[:own], J[own:]
 
-def dispersion_of(shared: Array) -> Array:
-    """No equation but the terms and the dispersion of another, on which a descent depends.
+    def _told(self, m: int) -> bool:
+        return m == self.data.steps and not np.isnan(self.data.distances).all()
 
-    What few rollouts suggested may be a wrong optimum, from which no descent leads away.
-    """
-    found, own = start_with(shared), TERMS.index((1, 3))
-    found[own] = shared[own]
-    return found
+    def _errors(self, shared: Array, fields: Array, m: int, varied: Sequence[int] = ()) -> Array:
+        """Errors (P, R, errors) of the first m readings and of d, in standard deviations.
 
-
-def part_by_part(
-    problem: SensedProblem,
-    shared: Array,
-    fields: Array,
-    most: float = np.inf,
-) -> tuple[float, Array, Array]:
-    """The fit over longer and longer parts; with noise, declared actuators stay where they are.
-
-    The beginning of noisy rollouts does not determine where and how strong each of them is: what the
-    equation does would be taken for that, and no descent leads back.
-
-    most: the error after any part, besides noise, with which the fit is given up.
-    """
-    if not problem.holds:
-        return problem.fit(shared, fields, most=most)
-    problem.prior.place_ridge = SENSED_HELD_RIDGE
-    error, shared, fields = problem.fit(shared, fields, most=most)
-    problem.prior.place_ridge = 0.0
-    problem.prior.forget()
-    if not np.isfinite(error):
-        return error, shared, fields
-    return problem.fit(shared, fields, lengths=[problem.y.shape[1]] * _WHOLE)
-
-
-def with_coefficients_of_x(
-    problem: SensedProblem, first: Found, settings: FieldModelSettings
-) -> Found:
-    """The fit with coefficients that depend on x, if its error is less than half of the first one's.
-
-    All of them are unknowns from the beginning: from an equation that makes up for them, as with wider
-    actuators, no descent leads to the right one.
-    """
-    count = len(problem.y)
-    if first[0] <= unexplained(problem, settings) or count < 2:
-        return first
-    start = np.zeros(problem.shared)
-    start[len(TERMS) : EQUATION] = USED
-    some, others = (problem.part(range(own, count, 2)) for own in (0, 1))
-    most = SENSED_HOPELESS
-    error, shared, _ = part_by_part(some, start, some.interpolated(), most)
-    if not np.isfinite(error):
-        return first
-    before = foretold(others, first[1], np.inf) if np.isfinite(first[0]) else np.inf
-    # These rollouts are among those that the first equation was fitted to.
-    if not foretold(others, shared, most) < min(before, SENSED_REPRODUCED):
-        return first
-    problem.prior.forget()
-    found = _refined(problem, shared, problem.interpolated(), None)
-    reproduced = found[0] <= SENSED_REPRODUCED
-    return found if reproduced and halved(first[0], found[0], settings) else first
-
-
-def foretold(problem: SensedProblem, shared: Array, most: float) -> float:
-    """The error of this equation in these rollouts, from their likeliest fields.
-
-    most: as for `SensedProblem.fit`.
-    """
-    return problem.fit(shared, problem.interpolated(), known=True, most=most)[0] - problem.noise
-
-
-def unexplained(problem: SensedProblem, settings: FieldModelSettings) -> float:
-    """The least error that is due neither to the grid nor to chance in the noise."""
-    chance = SENSED_ALIKE_CHI * problem.noise * np.sqrt(2.0 / problem.y.size)
-    return max(settings.sensed_varying, float(chance))
-
-
-def halved(before: float, after: float, settings: FieldModelSettings) -> bool:
-    """True if an error is less than half of another, beside what the grid does not resolve."""
-    unresolved = settings.sensed_unresolved**2
-    return after + unresolved < 0.5 * (before + unresolved)
-
-
-def _first_guess(problem: SensedProblem) -> Found:
-    """The least error, and the unknowns of a few rollouts that have it."""
-    best = np.inf, np.zeros(problem.shared), problem.interpolated()
-    reached, longest = 0, best
-    for i, share in enumerate(_DISPERSIONS):
-        good = best[0] <= SENSED_REPRODUCED
-        if best[0] <= SENSED_ENOUGH or (good and i >= _FEW):
-            break
-        start = np.zeros(problem.shared)
-        start[TERMS.index((1, 3))] = share * _DISPERSION
-        problem.prior.forget()
-        most = SENSED_HOPELESS
-        error, *found = problem.fit(start, problem.interpolated(), most=most)
-        if error - problem.noise < best[0]:
-            best = error - problem.noise, found[0], found[1]
-        if problem.reached > reached:
-            reached, longest = problem.reached, (np.inf, found[0], found[1])
-    if np.isfinite(best[0]) or not reached:
-        return best
-    return grown(problem, longest, problem.missing(*longest[1:], reached), reached)
+        P: fields (P, R, 33), then the first of them with each of the varied unknowns less by a
+        difference.
+        """
+        data, stride, told = self.data, -(-m // _COMPARED), self._told(m)
+        flow = SensedFlow(
+            shared,
+            data.n,
+            data.actuators,
+            data.sizes,
+            data.settings,
+            data.clip,
+            varied,
+            _DIFFERENCE,
+        )
+        rows = len(fields) + len(varied)
+        if not flow.finite:
+            return np.full((rows, data.rollouts, 1), np.inf)
+        found, distance = [], np.zeros((rows, data.rollouts))
+        for k, z in enumerate(flow.path(fields, data.actions, m)):
+            z = z.reshape(rows, data.rollouts, -1)
+            if k % stride == 0:
+                found.append(z @ data.read - data.readings[:, k])
+            if told:
+                distance += (z - data.target) ** 2 @ data.mean_square
+        e = np.stack(found, axis=2).reshape(rows, data.rollouts, -1)
+        e *= np.sqrt(stride) / self.sigma
+        if not told:
+            return e
+        off = (distance / (m * data.distances) - 1.0) / _DISTANCE
+        return np.concatenate([e, np.where(np.isnan(off), 0.0, off)[..., None]], axis=2)

@@ -49,12 +49,6 @@ def unknowns(n_a: int) -> int:
     return SHARED + n_a
 
 
-def open_unknowns(shared: Array) -> NDArray[np.intp]:
-    """The unknowns that a fit starting from these finds: all but those terms that are not used yet."""
-    own = np.arange(len(shared))
-    return np.flatnonzero((own < len(FIRST)) | (own >= EQUATION) | (shared != 0.0))
-
-
 def well_posed(shared: Array) -> Array:
     """The nearest unknowns whose short waves do not grow and whose large fields are not driven on."""
     found = shared.copy()

@@ -26,11 +26,7 @@ SENSED_REPRODUCED = 0.05
 """Maximum error of an equation that is used."""
 SENSED_HOPELESS = 0.1
 """Error over any part of the rollouts at which a start of the fit is abandoned."""
-SENSED_ENOUGH = 1e-5
-"""Error at which no other dispersion is tried as a start."""
-SENSED_HELD_RIDGE = 0.1
-"""Ridge of the positions of actuators with measurement noise, until whole rollouts are fitted."""
-SENSED_ALIKE_CHI = 4.0
+SENSED_CHANCE = 4.0
 """Fall of an error, in standard deviations of the noise in it, from which a difference counts."""
 REPRODUCED_NOISY = 0.05
 """Largest E at which a kind is selected with measurement noise: initial states are uncertain then."""
@@ -92,43 +88,9 @@ class FieldModelSettings(Settings):
     sensed_unresolved: float = setting(
         0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
     )
-    sensed_varying: float = setting(
-        3e-4,
-        "error of an equation with constant coefficients, fitted from nothing, above which "
-        "coefficients that depend on x are tried",
-        0,
-        1,
-    )
     sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
-    sensed_starts: int = setting(
-        8, "maximum number of sets of a few rollouts from which an equation is looked for", 1, 1000
-    )
-    sensed_again: int = setting(
-        2,
-        "further fits with measurement noise, each with the spread of waves that the last one implies",
-        0,
-        100,
-    )
-    sensed_iterations: int = setting(
-        20, "maximum number of iterations of a fit over a part of the rollouts", 1, 1000
-    )
-    sensed_last_iterations: int = setting(60, "the same over whole rollouts", 1, 1000)
-    sensed_compared: int = setting(
-        100, "maximum number of time steps whose readings are compared", 2, 1_000_000
-    )
     sensed_growth: float = setting(
         0.5, "maximum growth of a wave per sampling time, as an exponent of e", 0, 10
-    )
-    sensed_unequal_ridge: float = setting(1e-4, "ridge of the differences between actuators", 0, 1)
-    sensed_alike_ridge: float = setting(
-        1e-2, "ridge of these differences while the actuators are held close to one strength", 0, 1
-    )
-    sensed_unequal: float = setting(
-        1.0, "prior standard deviation of the differences in strength between actuators", 1e-6, 1e12
-    )
-    sensed_alike_unequal: float = setting(0.1, "the same while they are held close", 1e-6, 1e12)
-    sensed_learning: int = setting(
-        5, "maximum number of iterations towards the most likely spread of waves", 0, 100
     )
 
 
