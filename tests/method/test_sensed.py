@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -283,3 +284,13 @@ def test_the_initial_field_of_a_rollout_is_what_its_readings_came_from() -> None
     field, error = initial_field(model, readings[0], actions[0], np.zeros(SENSORS), np.nan)
     assert error < 1e-6
     assert np.linalg.norm(field - fields[0]) < 0.01 * np.linalg.norm(fields[0])
+
+
+def test_readings_may_be_taken_for_exact() -> None:
+    readings, actions, _ = _drawn(REACTION, 4, 0.0, [10.0] * 3)
+    with threadpool_limits(1):
+        found = fit_sensed(
+            readings, actions, DECLARED, settings=replace(DEFAULTS, sensed_unresolved=0.0)
+        )
+    assert found.error < 1e-7
+    np.testing.assert_allclose(found.shared[COEFFICIENTS], 10.0, rtol=1e-3)

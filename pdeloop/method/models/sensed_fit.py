@@ -96,6 +96,8 @@ _WAVE = 2.0
 """Wavenumber beyond which the prior deviation of a field's coefficients falls."""
 _DISTANCE = 0.01
 """Standard deviation of d, relative to it."""
+_EXACT = 1e-4
+"""Least sigma, relative to the readings."""
 _LOST = 0.25
 """Error, in variances of a reading, from which a fit says nothing of the readings."""
 _STARTS = ((0.3, 0.0), (1.0, 0.0), (0.0, -20.0), (0.0, 20.0))
@@ -241,7 +243,7 @@ class _Data:
         self.size = float(np.sqrt(max(np.mean(y * y), np.mean(y[:, 0] ** 2)))) or 1.0
         self.noise = noise
         # Else what the grid does not resolve would be taken for fields and actuators.
-        self.unresolved = settings.sensed_unresolved**2
+        self.unresolved = max(settings.sensed_unresolved, _EXACT) ** 2
         self.sigma = float(np.sqrt(noise**2 + self.unresolved * self.size**2))
         self.n = grid_points(sensors)
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
