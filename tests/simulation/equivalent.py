@@ -44,11 +44,6 @@ ARGUED: dict[tuple[str, str, str], str] = {
     ): "it is compared once there is a policy, with which it is set",
     (
         "controller_node.law_batch",
-        "return",
-        "removed",
-    ): "what is set besides is not looked at where the law is compiled",
-    (
-        "controller_node.law_batch",
         "self._next = 0",
         "removed",
     ): "it is compared once there is a policy, with which it is set",

@@ -18,6 +18,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -93,8 +94,9 @@ def test_a_study_without_trainings_and_a_comparison_without_runs_are_refused(
     ],
 )
 def test_searches_of_nothing_find_it_wanting(
-    tool: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch
+    tool: ModuleType, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # for tests that they run
     monkeypatch.setattr(sys, "argv", ["tool", *words])
     assert tool.main() == 1
 
@@ -104,7 +106,10 @@ def test_a_parametrised_test_without_a_case_fails(tmp_path: Path) -> None:
     file.write_text("import pytest\n\n@pytest.mark.parametrize('x', [])\ndef test(x):\n    pass\n")
     command = [sys.executable, "-m", "pytest", "-q", "-c", str(ROOT / "pyproject.toml")]
     command += [f"--basetemp={tmp_path / 'base'}", "-p", "no:cacheprovider", str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    own = {**os.environ, "TMPDIR": str(tmp_path)}  # its workers have folders of their own there
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=tmp_path, env=own, check=False
+    )
     assert done.returncode != 0 and "Empty parameter set" in done.stdout
 
 
