@@ -227,11 +227,27 @@ class Dynamics(ABC):
         return None
 
 
+_ELSEWHERE = {
+    "action_bounds": "'action_low' and 'action_high'",
+    "action_limit": "'action_low' and 'action_high'",
+    "bounds": "'action_low' and 'action_high'",
+} | {
+    name: f"the parameter of a training, {name}=… or --set {name}=…"
+    for name in ("measurement_noise", "process_noise", "sensors", "exploration_variance")
+}
+"""Names of parameters that a class could take for attributes, and what is meant."""
+
+
 def refuse_misspelt(kind: type[Dynamics]) -> None:
     """ValueError where a class sets a name close to one that it could set and does not."""
     known = {name for name in (*vars(Dynamics), *Dynamics.__annotations__) if name[0] != "_"}
     own = {name for cls in kind.__mro__ if cls not in Dynamics.__mro__ for name in vars(cls)}
     for name in sorted(name for name in own - known if name[0] != "_"):
+        if name in _ELSEWHERE:
+            raise ValueError(
+                f"{kind.__qualname__} sets '{name}', which a plant does not have; expected "
+                f"{_ELSEWHERE[name]}. An attribute of your own may begin with _"
+            )
         for meant in get_close_matches(name, known - own, n=1, cutoff=SPELT_ALIKE):
             raise ValueError(
                 f"{kind.__qualname__} sets '{name}', which a plant does not have; did you mean "

@@ -168,3 +168,18 @@ def test_an_initial_state_that_is_wrong_is_told_and_changes_nothing() -> None:
         with pytest.raises(OwnCodeError, match=words):
             plant.reset([1])
         assert np.array_equal(plant.states, before) and plant.step_index == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("action_bounds", "expected 'action_low' and 'action_high'"),
+        ("measurement_noise", "the parameter of a training, measurement_noise=…"),
+    ],
+)
+def test_a_parameter_that_a_class_takes_for_an_attribute_is_named(name: str, meant: str) -> None:
+    """It would have no effect."""
+    with pytest.raises(
+        ValueError, match=f"Own sets '{name}', which a plant does not have; .*{meant}"
+    ):
+        DynamicsPlant(type("Own", (Linear,), {name: 3.0})())
