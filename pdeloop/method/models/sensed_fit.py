@@ -17,9 +17,9 @@ Each is the method of Levenberg and Marquardt. As z_0 moves its own rollout alon
     A_r = J_z^T J_z + S^-2,  B_r = J_z^T J_phi,
     (sum_r J_phi^T J_phi + s^-2 - sum_r B_r^T A_r^-1 B_r) dphi = g_phi - sum_r B_r^T A_r^-1 g_z.
 
-Whole rollouts are fitted again with the S and the deviation between actuators that the last fit implies
-(empirical Bayes), without the terms whose loss of J is small. Equations with more terms are fitted from
-nothing where the first ones leave an error that is not noise.
+Whole rollouts are fitted again with the S that the last fit implies (empirical Bayes), without terms
+whose loss of J is small. Equations with more terms are fitted from nothing where the first ones leave
+an error that is not noise.
 
 References
 ----------
@@ -32,7 +32,7 @@ interpolation", Neural Computation 4(3), 1992 (the deviations).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +59,6 @@ from pdeloop.method.models.sensed_unknowns import (
 )
 from pdeloop.method.models.settings import (
     DEFAULTS,
-    SENSED_CHANCE,
-    SENSED_HOPELESS,
     SENSED_REPRODUCED,
     FieldModelSettings,
 )
@@ -78,8 +76,8 @@ _LIBRARIES: tuple[tuple[tuple[int, ...], bool, float], ...] = (
 the error from which each is tried, beside what neither the grid nor chance explains."""
 _BEGINNING, _SHORTEST, _LONGER = 0.05, 10, 1.5
 """Share of each rollout over which a fit begins, its least number of steps, and its growth."""
-_FIRST = 4
-"""The part to which the field of a known equation is fitted before the whole."""
+_EARLY = 4
+"""Which of these parts the field of a known equation is fitted to before the whole."""
 _COMPARED = 100
 """Maximum number of time steps whose readings are compared."""
 _ITERATIONS, _LAST_ITERATIONS = 20, 40
@@ -99,11 +97,15 @@ _DISTANCE = 0.01
 _EXACT = 1e-4
 """Least sigma, relative to the readings."""
 _LOST = 0.25
-"""Error, in variances of a reading, from which a fit says nothing of the readings."""
+"""Error, in variances of a reading, from which a fit tells nothing of the plant."""
 _STARTS = ((0.3, 0.0), (1.0, 0.0), (0.0, -20.0), (0.0, 20.0))
 """Of fits from nothing: the least sigma, relative to the readings, until whole rollouts were fitted, as
 short parts would be taken too literally; and the coefficient of the third derivative, as no descent
 leads from waves that run one way to waves that run the other."""
+_HOPELESS = 0.1
+"""Error over any part of the rollouts at which a fit is abandoned."""
+_CHANCE = 4.0
+"""Error, in standard deviations of the noise in it, that chance explains."""
 _TERM = 4.0
 """Loss of J for which a term stays."""
 _AGAIN = 2
@@ -193,7 +195,7 @@ def fit_sensed(
 
 
 def _of_first_terms(data: _Data) -> _Fit:
-    """The likeliest of fits from nothing, which are made until one says something of the readings."""
+    """The likeliest of fits from nothing, which are made until one is not lost."""
     fits = list[_Fit]()
     for loose, dispersion in _STARTS:
         fits.append(_Fit(data, *_LIBRARIES[0][:2], loose=loose))
@@ -216,9 +218,10 @@ def initial_field(
     target, distance: z_r at the sensors (n_y,), and d, NaN where it is not known.
     """
     y, a, d = readings[None], actions[None], np.array([distance])
-    data = _Data(y, a, model.actuators, model.noise, target, d, settings)
+    exact = replace(settings, sensed_unresolved=0.0)  # the model's noise has that in it
+    data = _Data(y, a, model.actuators, model.noise, target, d, exact)
     fit = _Fit(data, (), False, model.shared, model.spread, known=True)
-    for m in (data.lengths[:_FIRST][-1], data.steps):
+    for m in (data.lengths[:_EARLY][-1], data.steps):
         fit.descend(m)
     field: Array = field_of(fit.fields, data.n)[0]
     return field, fit.error(data.steps)
@@ -276,7 +279,7 @@ class _Data:
     def unexplained(self) -> float:
         """The least error that is due neither to the grid nor to chance in the noise."""
         share = (self.noise / self.size) ** 2
-        return self.unresolved + SENSED_CHANCE * share * float(np.sqrt(2.0 / self.readings.size))
+        return self.unresolved + _CHANCE * share * float(np.sqrt(2.0 / self.readings.size))
 
 
 class _Fit:
@@ -322,7 +325,7 @@ class _Fit:
         data = self.data
         for m in data.lengths:
             self.descend(m)
-            if self.error(m) > SENSED_HOPELESS:
+            if self.error(m) > _HOPELESS:
                 return self
         self.sigma = data.sigma
         self.descend(data.steps)
@@ -337,7 +340,7 @@ class _Fit:
 
     @property
     def lost(self) -> bool:
-        """True if it is so far off that it says nothing of equations with other terms."""
+        """True if it is so far off that it tells nothing of the plant, so that others are tried."""
         data = self.data
         least = max(_LOST * (data.sigma / data.size) ** 2, data.unexplained)
         return self.error(data.steps) > min(least, SENSED_REPRODUCED)
@@ -358,11 +361,8 @@ class _Fit:
             e, Jz, Jp = other._derivatives(data.steps)
         if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
             return 0.0
-        A, B, C = other._curvatures(Jz, Jp)
         gz, gp = other._slopes(e, Jz, Jp)
-        X = np.linalg.solve(A, np.concatenate([B, gz[:, :, None]], axis=2))
-        H = C - np.einsum("ruv,ruw->vw", B, X[..., :-1])
-        rest = gp - np.einsum("ruv,ru->v", B, X[..., -1])
+        H, rest, X = eliminated(*other._curvatures(Jz, Jp), gz, gp)
         gain = 0.5 * float(rest @ np.linalg.solve(H, rest) + np.sum(gz * X[..., -1]))
         share = 2.0 * gain / data.readings.size * (self.sigma / data.size) ** 2
         return self.error(data.steps) - share
@@ -383,7 +383,7 @@ class _Fit:
 
     def descend(self, m: int) -> None:
         """Iterate over the first m steps."""
-        damping, count = _DAMPING, len(self.varied)
+        damping = _DAMPING
         most = _LAST_ITERATIONS if m == self.data.steps else _ITERATIONS
         with np.errstate(all="ignore"):
             now = self._value(self.shared, self.fields, m)
@@ -396,15 +396,10 @@ class _Fit:
                 before = now
                 while damping < _MOST_DAMPING:
                     damped = A + damping * np.einsum("ruu,uv->ruv", A, np.eye(A.shape[1]))
-                    X = np.linalg.solve(damped, np.concatenate([B, gz[:, :, None]], axis=2))
-                    H = (
-                        C
-                        + damping * np.diag(np.diag(C))
-                        - np.einsum("ruv,ruw->vw", B, X[..., :count])
-                    )
-                    shared = self._moved(H, gp - np.einsum("ruv,ru->v", B, X[:, :, count]))
+                    H, rest, X = eliminated(damped, B, C + damping * np.diag(np.diag(C)), gz, gp)
+                    shared = self._moved(H, rest)
                     dp = (self.shared - shared)[self.varied]
-                    fields = self.fields - (X[:, :, count] - X[:, :, :count] @ dp)
+                    fields = self.fields - (X[..., -1] - X[..., :-1] @ dp)
                     value = self._value(shared, fields, m)
                     if value < now:
                         self.shared, self.fields, now = shared, fields, value
@@ -430,13 +425,13 @@ class _Fit:
         return bounded
 
     def learn(self) -> bool:
-        """S and the deviation between actuators from what was found, and fewer terms; False: none."""
+        """S from what was found, and fewer terms; False where nothing is finite."""
         with np.errstate(all="ignore"):
-            _, Jz, Jp = self._derivatives(self.data.steps)
+            e, Jz, Jp = self._derivatives(self.data.steps)
         if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
             return False
         A, B, C = self._curvatures(Jz, Jp)
-        P = C - np.einsum("ruv,ruw->vw", B, np.linalg.solve(A, B))
+        P = eliminated(A, B, C, *self._slopes(e, Jz, Jp))[0]
         own = np.diagonal(np.linalg.inv(A), axis1=1, axis2=2)
         second = np.sum(self.fields**2 + own, axis=0)
         # Nothing is known of where on the circle a field is.
@@ -530,3 +525,10 @@ class _Fit:
             return e
         off = (distance / (m * data.distances) - 1.0) / _DISTANCE
         return np.concatenate([e, np.where(np.isnan(off), 0.0, off)[..., None]], axis=2)
+
+
+def eliminated(A: Array, B: Array, C: Array, gz: Array, gp: Array) -> tuple[Array, Array, Array]:
+    """Curvature and slope of J by phi alone, and A^-1 [B, g_z] of each rollout (R, 33, varied + 1)."""
+    X = np.linalg.solve(A, np.concatenate([B, gz[:, :, None]], axis=2))
+    H = C - np.einsum("ruv,ruw->vw", B, X[..., :-1])
+    return H, gp - np.einsum("ruv,ru->v", B, X[..., -1]), X

@@ -24,10 +24,6 @@ NOISE_MISJUDGED = 2.0
 different."""
 SENSED_REPRODUCED = 0.05
 """Maximum error of an equation that is used."""
-SENSED_HOPELESS = 0.1
-"""Error over any part of the rollouts at which a start of the fit is abandoned."""
-SENSED_CHANCE = 4.0
-"""Fall of an error, in standard deviations of the noise in it, from which a difference counts."""
 REPRODUCED_NOISY = 0.05
 """Largest E at which a kind is selected with measurement noise: initial states are uncertain then."""
 DENSE = 512
