@@ -205,7 +205,9 @@ def excitation(
     if not (np.isfinite(variance) and variance >= 0.0):
         raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
     if action_set.rated:
-        return _after(seed, step, n_a, variance, action_set).copy()
+        steps = 1 << step.bit_length()  # twice the draws in all, if steps are asked for in order
+        found: Array = _explored(seed, steps, n_a, variance, action_set)[step].copy()
+        return found
     return action_set.explored(_draw(seed, step, n_a, variance))
 
 
@@ -214,9 +216,8 @@ def _draw(seed: int, step: int, n_a: int, variance: float) -> Array:
     return math.sqrt(variance) * draw
 
 
-@lru_cache(maxsize=4096)
-def _after(seed: int, step: int, n_a: int, variance: float, action_set: ActionSet) -> Array:
-    """The exploratory action within rate limits."""
-    draws = [_draw(seed, k, n_a, variance) for k in range(step + 1)]
-    found: Array = action_set.applied(action_set.explored(np.stack(draws)))[-1]
-    return found
+@lru_cache(maxsize=64)
+def _explored(seed: int, steps: int, n_a: int, variance: float, action_set: ActionSet) -> Array:
+    """The exploratory actions (steps, n_a) within rate limits."""
+    draws = [_draw(seed, k, n_a, variance) for k in range(steps)]
+    return action_set.applied(action_set.explored(np.stack(draws)))
