@@ -108,12 +108,27 @@ class Cost:
             and not (self.action_target.any() or self.terminal_weight.any())
         )
         mean = self.target if self.target.ndim == 1 else self.target[:horizon].mean(axis=0)
+        self._mean: Array = mean
         self.field_target: Array = (
             mean.copy() if self.output is None else np.linalg.lstsq(self.output, mean)[0]
         )
         self._state = _Square(self.state_weight, self.output)
         self._action = _Square(self.action_weight, None)
         self._terminal = _Square(self.terminal_weight, self.output)
+
+    def steady(self) -> Cost:
+        """The same with the mean of a moving target as its target."""
+        return Cost(
+            self.n_z,
+            self.n_a,
+            self.horizon,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            target=self._mean,
+            output=self.output,
+            action_target=self.action_target,
+            terminal_weight=self.terminal_weight,
+        )
 
     def wanted(self, k: int) -> Array:
         """y_r,k (n_y,), for k = 0 .. T."""

@@ -75,10 +75,9 @@ def test_no_law_costs_less_than_lq_tracking_over_the_horizon() -> None:
 
 def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
     """From s = 0 it takes the best way, with one feedback for all steps."""
-    plant, one = DynamicsPlant(Servo()), np.ones((N_A, N_Z))
-    rows = ModelRows(A=A, B=B, U=np.eye(N_Z), K_a=one, K_b=one, s_r=plant.field_target)
-    (law,) = laws_of(FeedForward, [rows], T, plant.cost.texts)
-    start, best = law.parts(law.theta_start), track_horizon(A, B, plant.cost, np.eye(N_Z))
+    plant = DynamicsPlant(Servo())
+    best, law = track_horizon(A, B, plant.cost, np.eye(N_Z)), _feedforward(plant, np.zeros(N_Z))
+    start = law.parts(law.theta_start)
     rest = np.zeros((1, N_Z))
     found, expected = (
         pdeloop.rollout(plant, own, rest)
@@ -88,8 +87,46 @@ def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
         )
     )
     np.testing.assert_allclose(found.actions, expected.actions, atol=1e-10)
-    (constant,) = laws_of(FeedForward, [rows], T)
+    (constant,) = laws_of(FeedForward, [law.model], T)
     assert np.ptp(constant.parts(constant.theta_start)["b"], axis=0).max() == 0.0
+
+
+def _feedforward(plant: DynamicsPlant, d: np.ndarray) -> FeedForward:
+    """The law of rows that know of the constant term d by K_b alone, as those without a filter do."""
+    K, b = track_horizon(A, B, plant.cost.steady(), np.eye(N_Z), d)
+    z_r = plant.field_target
+    K_b = np.outer(b[0], z_r) / (z_r @ z_r)
+    rows = ModelRows(A=A, B=B, U=np.eye(N_Z), K_a=K[0], K_b=K_b, s_r=z_r)
+    (law,) = laws_of(FeedForward, [rows], T, plant.cost.texts)
+    assert isinstance(law, FeedForward)
+    return law
+
+
+def test_a_law_with_a_feedforward_holds_a_plant_that_moves_by_itself() -> None:
+    """An offset of the plant is in its start; without it the target was missed by the offset."""
+    d = np.linspace(1.5, -1.0, N_Z)
+
+    class Moved(Servo):
+        def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+            return A @ z + B @ a + d
+
+    plant, best = (
+        DynamicsPlant(Moved()),
+        track_horizon(A, B, DynamicsPlant(Servo()).cost, np.eye(N_Z), d),
+    )
+    laws = [_feedforward(plant, own) for own in (d, np.zeros(N_Z))]
+    knows, ignores = (
+        pdeloop.rollout(
+            plant,
+            lambda k, z, law=law: law.action(law.parts(law.theta_start), z[0], np.zeros(0), k)[
+                None
+            ],
+            [5],
+        ).costs.mean[0]
+        for law in laws
+    )
+    least = pdeloop.rollout(plant, lambda k, z: z @ best.K[k].T + best.b[k], [5]).costs.mean[0]
+    assert least < knows < 1.01 * least and ignores > 1.5 * least
 
 
 def test_a_training_designs_and_adapts_for_it() -> None:

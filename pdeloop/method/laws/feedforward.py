@@ -17,9 +17,12 @@ class FeedForward(Law):
     foresee the transient from one initial field to the target, of which the b_k may hold what is
     common to all fields.
 
-    Where the cost is more than numbers and a constant target, K and b_k are those of LQ tracking over
-    the horizon, which looks ahead to the targets to come: K is its first one, and b_k makes up for the
-    difference to the later ones on the way that the model takes from s = 0.
+    Where the cost is more than numbers and a constant target, LQ tracking over the horizon on the model
+    is added, which looks ahead to the targets to come: a_k on its way from s_0 = 0, less what the first
+    of its laws does for the mean target, on its own way. K_b s_r is of that target, and knows of the
+    model's constant term d, which A and B do not tell:
+
+        b_k = K_b s_r + (a_k - K_a s_k) - (a'_k - K_a s'_k).
     """
 
     name = "feedforward"
@@ -27,18 +30,16 @@ class FeedForward(Law):
     def start(self) -> Parts:
         """K (n_a, n_s) and b (T, n_a)."""
         model, cost = self.model, self.cost
+        b = np.tile(model.K_b @ model.s_r, (self.horizon, 1))
         if cost is not None and cost.horizon == self.horizon:
-            K, b = track_horizon(model.A, model.B, cost, model.U)
-            s, first = np.zeros(len(model.A)), K[0]
+            K, ahead = track_horizon(model.A, model.B, cost, model.U)
+            steady = track_horizon(model.A, model.B, cost.steady(), model.U).b[0]
+            s = rest = np.zeros(len(model.A))
             for k in range(self.horizon):
-                a = K[k] @ s + b[k]
-                b[k] = a - first @ s
-                s = model.A @ s + model.B @ a
-            return {"K": first, "b": b}
-        return {
-            "K": self.model.K_a,
-            "b": np.tile(self.model.K_b @ self.model.s_r, (self.horizon, 1)),
-        }
+                a, held = K[k] @ s + ahead[k], K[0] @ rest + steady
+                b[k] += a - held - model.K_a @ (s - rest)
+                s, rest = model.A @ s + model.B @ a, model.A @ rest + model.B @ held
+        return {"K": model.K_a, "b": b}
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         a: Array = theta["K"] @ self.reduced(z) + theta["b"][self._row(k)]
