@@ -53,7 +53,8 @@ class Rollouts:
         self._own: Any = getattr(plants, case.plant)() if case.plant else None
         if self._own is not None:
             plant: Any = self._own
-            self.variance, self.components = plant.exploration_variance, plant_components(plant)
+            self.components = plant_components(plant)
+            self.variance = case.settings["exploration_variance"]
             self.action_set, self.noise = ANY_ACTION, 0.0
         else:
             problem = pdeloop.problem(case.base, **case.parameters())

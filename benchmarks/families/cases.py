@@ -51,10 +51,7 @@ class Case:
         """The parameters that replace those of the base; its code is allowed in this process."""
         given = dict(self.settings)
         if self.plant:
-            plant = getattr(plants, self.plant)
-            # What its own class of plants would have in its file of parameters.
-            given |= {"plant": plant(), "reduced_order": plant.reduced_order}
-            given["exploration_variance"] = plant.exploration_variance
+            given["plant"] = getattr(plants, self.plant)()
         given |= {f"physical.{name}": value for name, value in self.physical.items()}
         if self.equation:
             given["equation"] = allow(f"{HERE / 'equations.py'}:{self.equation}")
@@ -82,9 +79,12 @@ def other(equation: str, **settings: Any) -> Case:
     return Case("other equations", "kdv", {**common, **settings}, {}, equation)
 
 
-def foreign(plant: str, group: str = "plants of other kinds") -> Case:
-    """A plant that is not an equation of the compiled solver."""
-    return Case(group, "", {}, {}, "", plant)
+def foreign(
+    plant: str, reduced_order: int, variance: float, group: str = "plants of other kinds"
+) -> Case:
+    """A plant that is not an equation of the compiled solver, explored with this variance."""
+    settings = {"reduced_order": reduced_order, "exploration_variance": variance}
+    return Case(group, "", settings, {}, "", plant)
 
 
 VISCOUS = {"viscosity": 1e-2}
@@ -169,17 +169,17 @@ CASES: dict[str, Case] = {
         horizon=100,
         exploration_variance=0.1,
     ),
-    "allen-cahn with V(x)": foreign("AllenCahnInhomogeneous", "coefficients of x"),
+    "allen-cahn with V(x)": foreign("AllenCahnInhomogeneous", 24, 0.1, "coefficients of x"),
     "reaction-diffusion with D(x), r(x)": foreign(
-        "ReactionDiffusionInhomogeneous", "coefficients of x"
+        "ReactionDiffusionInhomogeneous", 24, 0.1, "coefficients of x"
     ),
-    "burgers between walls": foreign("BurgersBetweenWalls", "coefficients of x"),
-    "fitzhugh-nagumo": foreign("FitzHughNagumo", "two components"),
-    "gray-scott": foreign("GrayScott", "two components"),
-    "sine-gordon": foreign("SineGordon", "two components"),
-    "lorenz-96": foreign("Lorenz96"),
-    "coupled pendulums": foreign("CoupledPendulums"),
-    "random linear": foreign("RandomLinear"),
+    "burgers between walls": foreign("BurgersBetweenWalls", 16, 0.1, "coefficients of x"),
+    "fitzhugh-nagumo": foreign("FitzHughNagumo", 16, 0.1, "two components"),
+    "gray-scott": foreign("GrayScott", 16, 1e-5, "two components"),
+    "sine-gordon": foreign("SineGordon", 16, 0.3, "two components"),
+    "lorenz-96": foreign("Lorenz96", 24, 4.0),
+    "coupled pendulums": foreign("CoupledPendulums", 24, 1.0),
+    "random linear": foreign("RandomLinear", 16, 0.01),
 }
 """By name; nobody may choose a constant of the method on the seeds of `general.TABLE_SEEDS`."""
 
@@ -187,9 +187,11 @@ OF_FEW_SENSORS: dict[str, Case] = {
     "allen-cahn-modes, unequal strengths": Case(
         "unequal actuators", "allen-cahn-modes", {}, {}, "AllenCahnUnequal"
     ),
-    "allen-cahn with V(x), declared": foreign("AllenCahnInhomogeneousCircle", "coefficients of x"),
+    "allen-cahn with V(x), declared": foreign(
+        "AllenCahnInhomogeneousCircle", 24, 0.1, "coefficients of x"
+    ),
     "reaction-diffusion with D(x), r(x), declared": foreign(
-        "ReactionDiffusionInhomogeneousCircle", "coefficients of x"
+        "ReactionDiffusionInhomogeneousCircle", 24, 0.1, "coefficients of x"
     ),
 }
 """Further ones, where only readings of the field make the difference hard to tell."""

@@ -49,8 +49,8 @@ class AllenCahnInhomogeneous(RatePlant):
 
     n_z, n_a = 128, 12
     sample_time, horizon = 0.01, 80
-    state_weight, action_weight, exploration_variance = 1.0, 0.05, 0.1
-    reduced_order, substeps = 24, 2
+    state_weight, action_weight = 1.0, 0.05
+    substeps = 2
 
     def __init__(self) -> None:
         x = np.arange(self.n_z) / self.n_z
@@ -116,8 +116,8 @@ class FitzHughNagumo(RatePlant):
 
     n_z, n_a = 128, 8
     sample_time, horizon = 0.2, 100
-    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
-    reduced_order, substeps = 16, 8
+    state_weight, action_weight = 1.0, 1.0
+    substeps = 8
     components = 2
 
     def __init__(self) -> None:
@@ -144,7 +144,7 @@ class GrayScott(FitzHughNagumo):
     """Gray-Scott on a ring, actuated in the fed component; the target is a half-way mixture."""
 
     sample_time, horizon = 1.0, 100
-    action_weight, exploration_variance, substeps = 100.0, 1e-5, 4
+    action_weight, substeps = 100.0, 4
 
     def __init__(self) -> None:
         super().__init__()
@@ -176,7 +176,7 @@ class SineGordon(FitzHughNagumo):
     """Sine-Gordon, u_tt = u_xx - sin u + a, on a ring: a wave equation with kinks."""
 
     sample_time, horizon = 0.1, 100
-    exploration_variance, substeps = 0.3, 4
+    substeps = 4
 
     def initial_state(self, rng: np.random.Generator) -> Array:
         n = self.n_z // 2
@@ -199,8 +199,8 @@ class BurgersBetweenWalls(RatePlant):
 
     n_z, n_a = 96, 6
     sample_time, horizon = 0.05, 100
-    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
-    reduced_order, substeps = 16, 24
+    state_weight, action_weight = 1.0, 1.0
+    substeps = 24
 
     def __init__(self) -> None:
         self.x = np.arange(1, self.n_z + 1) / (self.n_z + 1)
@@ -230,8 +230,8 @@ class Lorenz96(RatePlant):
 
     n_z, n_a = 40, 8
     sample_time, horizon = 0.05, 100
-    state_weight, action_weight, exploration_variance = 1.0, 0.1, 4.0
-    reduced_order, substeps = 24, 2
+    state_weight, action_weight = 1.0, 0.1
+    substeps = 2
 
     def __init__(self) -> None:
         self.target = np.zeros(self.n_z)
@@ -264,8 +264,8 @@ class CoupledPendulums(RatePlant):
 
     n_z, n_a = 32, 8
     sample_time, horizon = 0.1, 100
-    state_weight, action_weight, exploration_variance = 1.0, 0.1, 1.0
-    reduced_order, substeps = 24, 4
+    state_weight, action_weight = 1.0, 0.1
+    substeps = 4
 
     def __init__(self) -> None:
         self.target = np.zeros(self.n_z)
@@ -294,8 +294,7 @@ class RandomLinear(Dynamics):
 
     n_z, n_a = 64, 4
     sample_time, horizon = 1.0, 100
-    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.01
-    reduced_order = 16
+    state_weight, action_weight = 1.0, 1.0
 
     def __init__(self) -> None:
         rng = np.random.default_rng(64)

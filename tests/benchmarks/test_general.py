@@ -94,7 +94,6 @@ def test_a_case_is_a_problem_that_can_be_trained_on(name: str) -> None:
     assert np.isfinite(plant.states).all()
     if case.plant:
         expected = getattr(plants, case.plant)
-        assert own.values["reduced_order"] == expected.reduced_order
         assert (plant.n_z, plant.n_a) == (expected.n_z, expected.n_a)
 
 

@@ -45,13 +45,13 @@ def explored(equation, sample_time, steps, count, horizon=60, variance=0.1, n_z=
 
 
 @cache
-def rolled_out(name, count, horizon=80):
+def rolled_out(name, count, variance, horizon=80):
     """Explorations of a plant in NumPy, and its target."""
     plant = getattr(plants, name)()
     found = []
     for seed in range(count):
         rng = np.random.default_rng(seed)
-        actions = rng.normal(size=(horizon, plant.n_a)) * np.sqrt(plant.exploration_variance)
+        actions = rng.normal(size=(horizon, plant.n_a)) * np.sqrt(variance)
         states = [plant.initial_state(rng)]
         for a in actions:
             states.append(plant.step(states[-1][None], a[None])[0])
@@ -98,17 +98,17 @@ def test_equations_are_recovered(equation, sample_time, steps, kind, error):
 
 
 @pytest.mark.parametrize(
-    "name, count, error",
+    "name, count, variance, error",
     [
-        ("AllenCahnInhomogeneous", 5, 1e-2),
-        ("BurgersBetweenWalls", 3, 1e-3),
-        ("FitzHughNagumo", 3, 1e-3),
-        ("CoupledPendulums", 3, 1e-3),
-        ("RandomLinear", 3, 1e-2),
+        ("AllenCahnInhomogeneous", 5, 0.1, 1e-2),
+        ("BurgersBetweenWalls", 3, 0.1, 1e-3),
+        ("FitzHughNagumo", 3, 0.1, 1e-3),
+        ("CoupledPendulums", 3, 1.0, 1e-3),
+        ("RandomLinear", 3, 0.01, 1e-2),
     ],
 )
-def test_plants_that_are_no_periodic_equation_are_recovered(name, count, error):
-    rollouts, target = rolled_out(name, count)
+def test_plants_that_are_no_periodic_equation_are_recovered(name, count, variance, error):
+    rollouts, target = rolled_out(name, count, variance)
     components = getattr(getattr(plants, name), "components", 1)
     fitted = fit_field_model(rollouts[:-1], target, components=components)
     assert errors(fitted.model, rollouts[-1:], target, 2.0)[0] < error
