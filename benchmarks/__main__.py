@@ -35,6 +35,7 @@ PROGRAMS = {
     "field_models": "the selected model of the whole field and its error",
     "choices": "how often the law that a training returns is the wrong one",
     "general": "held-out plants and initial fields: first law, adapted law and best known inputs",
+    "gate": "costs of trainings, beside those of the same trainings before a change",
     "plans": "time of a step of the law predictive, on each shipped problem",
     "scale": "messages, bags, fits, memory and files as the state grows",
     "published": "tasks with published figures, which are shown beside ours",
