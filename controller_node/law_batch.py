@@ -52,8 +52,9 @@ class LawBatch:
         self, laws: Sequence[Law], target: ArrayLike, action_set: ActionSet = ANY_ACTION
     ) -> None:
         self._laws, self._action_set = list(laws), action_set
-        self._projected = ProjectedLaw([law.model.U for law in laws], target, action_set)
         rated = action_set.rated
+        bases, within = [law.model.U for law in laws], ANY_ACTION if rated else action_set
+        self._projected = ProjectedLaw(bases, target, within)
         self.compiled = self._projected if self._laws[0].compiled and not rated else None
         """The compiled form, if all environments have one and actions have no rate limits."""
         self._by_gains = np.zeros(0, dtype=np.bool_)
@@ -99,8 +100,7 @@ class LawBatch:
         laws = [
             (self._laws[i], own) for i, own in zip(index.tolist(), _vectors(theta), strict=True)
         ]
-        rated = self._action_set.rated
-        by_gains = np.array([law.has_gains(own) and not rated for law, own in laws])
+        by_gains = np.array([law.has_gains(own) for law, own in laws])
         if by_gains.any():
             none = np.zeros_like(laws[0][0].model.policy)
             gains = [
@@ -108,7 +108,8 @@ class LawBatch:
                 for (law, own), has in zip(laws, by_gains, strict=True)
             ]
             self._projected.set(np.stack(gains), index)
-        self.compiled, self._by_gains = self._projected if by_gains.all() else None, by_gains
+        whole = by_gains.all() and not self._action_set.rated
+        self.compiled, self._by_gains = self._projected if whole else None, by_gains
         if self.compiled is None:
             self._environments = [(law, law.parts(own)) for law, own in laws]
             self._begin()
@@ -176,11 +177,10 @@ class LawBatch:
                 )
             ]
         )
-        found = self._action_set.project(found, after=self._before)
         if self._by_gains.any():  # as in a batch of their own
             by_gains = self._by_gains[:, None]
             found = np.where(by_gains, self._projected.actions(states), found)
-        return found
+        return self._action_set.project(found, after=self._before)
 
 
 def _vectors(theta: Array) -> list[Array]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from pdeloop.finished_run import FinishedRun
-from pdeloop.law_form import NO_RATES
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows, pack
@@ -31,9 +30,6 @@ FORMULA = tuple("=+-@\t\r")
 _KEPT = """    double before[PDELOOP_N_A];
     for (int k = 0; k < PDELOOP_N_A; ++k)
         before[k] = a[k];
-"""
-_LIMITED = """    for (int k = 0; k < PDELOOP_N_A; ++k)
-        a[k] = fmin(fmax(a[k], before[k] - rate[k]), before[k] + rate[k]);
 """
 _TEMPLATES = Path(__file__).parent / "commands" / "template"
 
@@ -193,23 +189,19 @@ def _bounds(allowed: ActionSet, n_a: int) -> dict[str, Array]:
 
     The latter are action_rate, and action_start, a_{-1}, both (n_a,).
     """
-    parts = {"low": allowed.low, "high": allowed.high}
-    parts |= {"rate": allowed.rate, "start": allowed.start} if allowed.rated else {}
-    arrays: dict[str, Array] = {f"action_{n}": np.broadcast_to(x, n_a) for n, x in parts.items()}
+    arrays = {f"action_{name}": numbers for name, numbers in allowed.limits(n_a).items()}
     return {**arrays, "zero_mean": np.array(float(allowed.zero_mean))}
 
 
 def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
-    """The function that makes an action admissible.
-
-    ParameterError for rate limits of actions of mean zero.
-    """
-    if allowed.rated and allowed.zero_mean:
-        raise ParameterError(NO_RATES)
+    """The function that makes an action admissible."""
     own = {"static const double rate": allowed.rate, "const double pdeloop_start": allowed.start}
     low, high = (np.broadcast_to(bound, n_a) for bound in (allowed.low, allowed.high))
     balance = (_TEMPLATES / "balance.c.txt").read_text() if allowed.zero_mean else ""
-    shift = "    const double shift = pdeloop_shift(a);\n"
+    shift = "    const double shift = pdeloop_shift(a, least, most);\n"
+    ends = "low[k]", "high[k]"
+    if allowed.rated:
+        ends = "fmax(low[k], before[k] - rate[k])", "fmin(high[k], before[k] + rate[k])"
     text = Template((_TEMPLATES / "bounds.c.txt").read_text())
     return text.substitute(
         low=_numbers(low),
@@ -223,7 +215,8 @@ def _bounds_in_c(allowed: ActionSet, n_a: int) -> str:
         )
         * allowed.rated,
         taken=", const double *before" if allowed.rated else "",
-        limited=_LIMITED if allowed.rated else "",
+        least=ends[0],
+        most=ends[1],
     )
 
 

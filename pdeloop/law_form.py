@@ -4,7 +4,7 @@
     affine:    a = P(K s + constant),       s = U^T y
     observer:  a = P(K p + D s + b),        p <- F p + G s + B a + c,    p = s at first
 
-with the nearest admissible action P(a).
+with the nearest admissible action P(a), which rate limits make one near the action before.
 """
 
 from __future__ import annotations
@@ -22,11 +22,6 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
 
-NO_RATES = (
-    "actions have rate limits, which this form of a law does not know: write it as .c, if their mean "
-    "is not zero, or as .npz, where they are action_rate"
-)
-
 
 @dataclass(frozen=True, eq=False)
 class LawForm:
@@ -38,10 +33,8 @@ class LawForm:
         affine or observer.
     arrays : mapping
         By the names above.
-    low, high : (n_a,)
-        Bounds of the actions.
-    zero_mean : bool
-        Whether actions have mean zero.
+    action_set : ActionSet
+        Admissible actions.
     sample_time : float
         Time (s) of a step.
     name : str
@@ -52,9 +45,7 @@ class LawForm:
 
     kind: str
     arrays: Mapping[str, Array]
-    low: Array
-    high: Array
-    zero_mean: bool
+    action_set: ActionSet
     sample_time: float
     name: str
     spectral_radius: float
@@ -67,13 +58,11 @@ class LawForm:
     @property
     def n_a(self) -> int:
         """Actuators."""
-        return len(self.low)
+        return len(self.arrays["K"])
 
 
 def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) -> LawForm:
     """The matrices of a law; ParameterError for one that has none, or a seed that there is not."""
-    if ActionSet.of(run.values).rated:
-        raise ParameterError(NO_RATES)
     theta, m = run.theta(which, seed).ravel(), run.index(seed)
     law, model = run.laws[m], run.models[m]
     if law.has_gains(theta):
@@ -95,13 +84,10 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
             f"the law '{law.name}' has no such form; train with --law affine or observer, or write its "
             "parameters as .npz"
         )
-    allowed, n_a = ActionSet.of(run.values), run.values["n_a"]
     return LawForm(
         kind,
         arrays,
-        np.broadcast_to(allowed.low, n_a).copy(),
-        np.broadcast_to(allowed.high, n_a).copy(),
-        allowed.zero_mean,
+        ActionSet.of(run.values),
         float(run.values["sample_time"]),
         f"The {which} law of {run.values['problem']}, seed {run.seeds[m]}",
         float(np.abs(np.linalg.eigvals(loop)).max()),

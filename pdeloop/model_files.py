@@ -49,8 +49,9 @@ def fmu(law: LawForm, source: bytes) -> bytes:
     memory = "pdeloop_memory memory;"
     if law.kind == "affine":
         call, memory = "pdeloop_law(law->y, law->a)", ""
+    start = "memcpy(law->a, pdeloop_start, sizeof law->a);" if law.action_set.rated else ""
     wrapper = Template(_TEMPLATE.read_text()).substitute(
-        call=call, memory=memory, sample_time=float(law.sample_time).hex()
+        call=call, memory=memory, start=start, sample_time=float(law.sample_time).hex()
     )
     code = source + b"\n" + wrapper.encode()
     with TemporaryDirectory() as folder:
@@ -103,7 +104,8 @@ def _description(law: LawForm, code: bytes) -> str:
 def onnx(law: LawForm) -> bytes:
     """An ONNX model in float64: y (n_y,) to a (n_a,).
 
-    An observer also takes its prediction p (n_s,), and whether it has `started`, and gives p_next.
+    An observer also takes its prediction p (n_s,), a law with rate limits the action before,
+    a_before (n_a,), and both whether they have `started`; an observer also gives p_next.
 
     ParameterError without the package onnx, and for actions of mean zero.
     """
@@ -111,11 +113,12 @@ def onnx(law: LawForm) -> bytes:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ParameterError("an ONNX model needs onnx: pip install 'pdeloop[onnx]'") from error
-    if law.zero_mean:
+    if law.action_set.zero_mean:
         raise ParameterError(
             "actions of mean zero have no form in ONNX; export the law as C or --ros2"
         )
-    constants: dict[str, Array] = {"Ut": law.arrays["U"].T, "low": law.low, "high": law.high}
+    rated, limits = law.action_set.rated, law.action_set.limits(law.n_a)
+    constants: dict[str, Array] = {"Ut": law.arrays["U"].T, **limits}
     constants |= {name: array for name, array in law.arrays.items() if name != "U"}
     node, nodes = helper.make_node, []
 
@@ -131,18 +134,31 @@ def onnx(law: LawForm) -> bytes:
     def vector(name: str, size: int, kind: int = TensorProto.DOUBLE) -> Any:
         return helper.make_tensor_value_info(name, kind, [size] if size else [])
 
-    n_s = law.arrays["U"].shape[1]
+    n_s, bounds = law.arrays["U"].shape[1], ("low", "high")
     nodes.append(node("MatMul", ["Ut", "y"], ["s"]))
     inputs, outputs = [vector("y", law.n_y)], [vector("a", law.n_a)]
+    if law.kind == "observer":
+        inputs.append(vector("p", n_s))
+    if rated or law.kind == "observer":
+        inputs.append(vector("started", 0, TensorProto.BOOL))
+    if rated:
+        bounds = "least", "most"
+        inputs.append(vector("a_before", law.n_a))
+        nodes.append(node("Where", ["started", "a_before", "start"], ["before"]))
+        for near, side, change, far in (
+            ("least", "Max", "Sub", "low"),
+            ("most", "Min", "Add", "high"),
+        ):
+            nodes.append(node(change, ["before", "rate"], [f"{near}_near"]))
+            nodes.append(node(side, [f"{near}_near", far], [near]))
     if law.kind == "affine":
         computed("requested", ("K", "s"), constant="constant")
     else:
-        inputs += [vector("p", n_s), vector("started", 0, TensorProto.BOOL)]
         outputs += [vector("p_next", n_s)]
         nodes.append(node("Where", ["started", "p", "s"], ["prediction"]))
         computed("requested", ("K", "prediction"), ("D", "s"), constant="b")
-    nodes.append(node("Max", ["requested", "low"], ["raised"]))
-    nodes.append(node("Min", ["raised", "high"], ["a"]))
+    nodes.append(node("Max", ["requested", bounds[0]], ["raised"]))
+    nodes.append(node("Min", ["raised", bounds[1]], ["a"]))
     if law.kind == "observer":
         computed("p_next", ("F", "prediction"), ("G", "s"), ("B", "a"), constant="c")
     graph = helper.make_graph(
@@ -162,10 +178,11 @@ def onnx(law: LawForm) -> bytes:
 def matlab(law: LawForm) -> bytes:
     """A MATLAB file, as `load`, Simulink's State-Space block and python-control take it.
 
-    An observer is x <- A x + B [y; 1], a = C x + D [y; 1] as long as no action is at a bound, with
-    x_0 = Ut y_0; a static law is a = K y + constant. `low`, `high` and `zero_mean` say what is
-    admissible, `Ts` is the sample time, and `spectral_radius` that of the closed loop on the
-    identified model.
+    A static law is a = P(K y + constant). An observer is x <- A x + B [y; 1], a = C x + D [y; 1] as
+    long as no action is at a limit, and always a = P(C x + D [y; 1]), x <- F x + G [y; 1] + H a, with
+    x_0 = Ut y_0. `low`, `high` and `zero_mean` say what P is, with rate limits also `rate`, and
+    `start`, the action before the first; `Ts` is the sample time, and `spectral_radius` that of the
+    closed loop on the identified model.
     """
     from scipy.io import savemat
 
@@ -174,18 +191,23 @@ def matlab(law: LawForm) -> bytes:
         known: dict[str, Any] = {"K": own["K"] @ Ut, "constant": own["constant"][:, None]}
     else:
         feedthrough = np.column_stack([own["D"] @ Ut, own["b"]])
+        predicted = np.column_stack([own["G"] @ Ut, own["c"]])
         known = {
             "A": own["F"] + own["B"] @ own["K"],
-            "B": np.column_stack([own["G"] @ Ut, own["c"]]) + own["B"] @ feedthrough,
+            "B": predicted + own["B"] @ feedthrough,
             "C": own["K"],
             "D": feedthrough,
+            "F": own["F"],
+            "G": predicted,
+            "H": own["B"],
             "Ut": Ut,
         }
     content = BytesIO()
     savemat(
         content,
         known
-        | {"low": law.low[:, None], "high": law.high[:, None], "zero_mean": law.zero_mean}
+        | {name: limit[:, None] for name, limit in law.action_set.limits(law.n_a).items()}
+        | {"zero_mean": law.action_set.zero_mean}
         | {"Ts": law.sample_time, "spectral_radius": law.spectral_radius, "law": law.name},
     )
     return content.getvalue()

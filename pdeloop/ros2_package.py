@@ -95,6 +95,8 @@ def write_package(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ParameterError(f"{folder} exists; give a new folder for the package")
     law = law_form(run, which, seed)
+    limits = {"rate": np.full(law.n_a, np.inf), "start": np.zeros(law.n_a)}
+    limits |= law.action_set.limits(law.n_a)
     words = {
         "package": package,
         "name": law.name,
@@ -105,13 +107,11 @@ def write_package(
         "n_a": law.n_a,
         "sample_time": f"{law.sample_time:g}",
         "safe": [0.0] * law.n_a,
-        "low": _yaml(law.low),
-        "high": _yaml(law.high),
+        **{name: _yaml(numbers) for name, numbers in limits.items()},
     }
     numbers = {
-        "low": law.low,
-        "high": law.high,
-        "zero_mean": np.array(law.zero_mean),
+        **limits,
+        "zero_mean": np.array(law.action_set.zero_mean),
         "sample_time": np.array(law.sample_time),
         "n_y": np.array(law.n_y),
     }

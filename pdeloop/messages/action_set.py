@@ -287,6 +287,11 @@ class ActionSet:
         found: NDArray[np.bool_] = (applied <= low) | (applied >= high)
         return found
 
+    def limits(self, n_a: int) -> dict[str, Array]:
+        """low and high, and with rate limits rate and start, a_{-1}, (n_a,) each."""
+        names = ["low", "high", *["rate", "start"] * self.rated]
+        return {name: np.broadcast_to(getattr(self, name), n_a).copy() for name in names}
+
     def free(self, n_a: int) -> Array:
         """Orthonormal directions (n_a, n) in which actions can move: all, or those of mean zero.
 

@@ -34,6 +34,9 @@ SETS = {
     "rate limits": ActionSet(
         N_A, [0.0, -1.0, -np.inf, -2.0], [4.0, 2.0, 0.5, 2.0], rate=[0.3, np.inf, 0.1, 0.5]
     ),
+    "rate limits of mean zero": ActionSet(
+        N_A, [-0.4, -1.0, -0.5, -2.0], [0.4, 1.0, np.inf, 1.0], True, rate=[0.3, np.inf, 0.1, 0.5]
+    ),
     "none": ActionSet(N_A),
 }
 needs_compiler = pytest.mark.skipif(

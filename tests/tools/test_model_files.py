@@ -16,19 +16,26 @@ import pdeloop
 from pdeloop.cli import main
 from pdeloop.finished_run import FinishedRun
 from pdeloop.law_form import law_form
+from pdeloop.messages.action_set import NO_BOUND
 from pdeloop.messages.arrays import Array
 from tests.support.small import SMALL
 
-LIMIT = 0.2
+LIMIT, RATE = 0.2, 0.15
 QUICK: dict[str, Any] = {"optimizer": "two_point", "rollouts": 6, "evaluation_fields": 2}
-LAWS: dict[str, dict[str, Any]] = {"affine": {}, "observer": {"law": "observer", "sensors": 8}}
+SENSED = {"law": "observer", "sensors": 8}
+RATED = {"action_bounds": [*4 * [-LIMIT], *4 * [LIMIT], 0.0, RATE, *3 * [NO_BOUND]]}
+LAWS: dict[str, dict[str, Any]] = {
+    "affine": {"action_limit": LIMIT},
+    "observer": {"action_limit": LIMIT, **SENSED},
+    "affine-rated": RATED,
+    "observer-rated": {**RATED, **SENSED},
+}
 
 
 @pytest.fixture(scope="module", params=LAWS)
 def run(request: Any, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     out = tmp_path_factory.mktemp("runs") / request.param
-    given = {**LAWS[request.param], "action_limit": LIMIT, "horizon": 20}
-    return pdeloop.train(str(SMALL), **given, **QUICK, out=out)
+    return pdeloop.train(str(SMALL), **LAWS[request.param], horizon=20, **QUICK, out=out)
 
 
 def readings(run: FinishedRun) -> Array:
@@ -38,11 +45,22 @@ def readings(run: FinishedRun) -> Array:
 
 
 def answers(run: FinishedRun) -> Array:
-    """The actions of the law of the loop, some of them at the limit."""
+    """The actions of the law of the loop, some of them at the limits."""
     law = run.law()
     found = np.array([law(k, y[None])[0] for k, y in enumerate(readings(run))])
     assert (np.abs(found) == LIMIT).any() and (np.abs(found) < LIMIT).any()
+    moved = np.abs(np.diff(found[:, 0], prepend=0.0))
+    assert (moved.max() > RATE + 0.01) == (law_form(run).action_set.rated is False)
     return found
+
+
+def within(known: Any, requested: Array, before: Array | None) -> Array:
+    """P, as docs/deploy.md says."""
+    low, high = known["low"].ravel(), known["high"].ravel()
+    if "rate" in known:
+        a, rate = known["start"].ravel() if before is None else before, known["rate"].ravel()
+        low, high = np.maximum(low, a - rate), np.minimum(high, a + rate)
+    return np.clip(requested, low, high)
 
 
 def exported(run: FinishedRun, name: str, path: Path) -> Path:
@@ -94,13 +112,15 @@ def test_the_onnx_model_of_a_law_is_the_law(
     path = exported(run, "onnx", tmp_path / "law.onnx")
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     memory = {"p": np.zeros(run.models[0].U.shape[1]), "started": np.array(False)}
+    memory["a_before"] = np.full(run.values["n_a"], 9.0)  # not used before it has started
     known = {item.name for item in session.get_inputs()}
     found = []
     for y in readings(run):
         given = {name: array for name, array in memory.items() if name in known}
         a, *after = session.run(None, {"y": y, **given})
         found.append(a)
-        memory = {"p": after[0] if after else memory["p"], "started": np.array(True)}
+        p = after[0] if after else memory["p"]
+        memory = {"p": p, "a_before": a, "started": np.array(True)}
     np.testing.assert_allclose(found, answers(run), rtol=1e-9, atol=1e-12)
 
 
@@ -115,16 +135,25 @@ def test_the_matlab_file_of_a_law_has_its_matrices_and_its_loop(
     act = run.law()
     expected = np.array([act(k, y[None])[0] for k, y in enumerate(ys)])
     if law.kind == "affine":
-        found = np.clip(ys @ known["K"].T + known["constant"].T, known["low"].T, known["high"].T)
+        found, a = [], None
+        for y in ys:
+            a = within(known, known["K"] @ y + known["constant"].ravel(), a)
+            found.append(a)
         closed = model.A + model.B @ known["K"] @ model.U
     else:
         A, B, C, D = (known[name] for name in "ABCD")
-        x, rows = known["Ut"] @ ys[0], []
+        x, found, feed = known["Ut"] @ ys[0], [], D[:, :-1] @ model.U
         for y in ys:
             u = np.append(y, 1.0)
-            rows.append(C @ x + D @ u)
+            found.append(C @ x + D @ u)
             x = A @ x + B @ u
-        found, feed = np.array(rows), D[:, :-1] @ model.U
+        y, held, a = readings(run), [], None
+        x = known["Ut"] @ y[0]
+        for u in np.column_stack([y, np.ones(len(y))]):
+            a = within(known, C @ x + D @ u, a)
+            held.append(a)
+            x = known["F"] @ x + known["G"] @ u + known["H"] @ a
+        np.testing.assert_allclose(held, answers(run), rtol=1e-9, atol=1e-12)
         closed = np.block([[model.A + model.B @ feed, model.B @ C], [B[:, :-1] @ model.U, A]])
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert np.abs(np.linalg.eigvals(closed)).max() == pytest.approx(law.spectral_radius)

@@ -18,6 +18,7 @@ import pytest
 import pdeloop
 from pdeloop.cli import main
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.ros2_package import write_package
 from tests.support.loop_harness import Processes
@@ -25,6 +26,10 @@ from tests.support.small import SMALL
 from tests.support.small_loop import LIMIT
 
 QUICK: dict[str, Any] = {"optimizer": "two_point", "rollouts": 6, "evaluation_fields": 2}
+
+
+RATE = [0.1, np.inf, 0.25]
+SAFE = [-0.125, 0.0, 0.25]
 
 
 class Bounded(pdeloop.Dynamics):
@@ -60,22 +65,32 @@ def answers(run: FinishedRun, readings: Array) -> Array:
     return np.array([law(k, y[None])[0] for k, y in enumerate(readings)])
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    return pdeloop.train(plant=Bounded(), reduced_order=4, **QUICK, out=out)
+
+
+@pytest.mark.parametrize("rate", [[], RATE])
 @pytest.mark.parametrize("balanced", [False, True])
 def test_the_affine_law_has_the_bits_of_the_loop_within_the_bounds(
-    tmp_path: Path, balanced: bool
+    trained: FinishedRun, tmp_path: Path, balanced: bool, rate: list[float]
 ) -> None:
-    run = pdeloop.train(plant=Bounded(), reduced_order=4, **QUICK, out=tmp_path / "run")
-    bounds = [*run.values["action_bounds"][:-1], float(balanced)]
-    run = replace(run, values={**run.values, "action_bounds": bounds})
+    bounds = [*trained.values["action_bounds"][:-1], float(balanced), *rate]
+    run = replace(trained, values={**trained.values, "action_bounds": bounds})
     write_package(run, tmp_path / "law")
     readings = 3.0 * np.random.default_rng(0).standard_normal((20, 8))
     law, expected = exported(tmp_path / "law"), answers(run, readings)
-    assert np.array_equal([law(y) for y in readings], expected)
+    for _ in range(2):
+        assert np.array_equal([law(y) for y in readings], expected)
+        law.reset()
     low, high = np.array(Bounded.action_low), np.array(Bounded.action_high)
     assert (expected >= low).all() and (expected <= high).all()
     assert ((expected == low) | (expected == high)).any()
     if balanced:
         assert np.abs(expected.sum(axis=1)).max() < 1e-12
+    moved = np.abs(np.diff(expected, axis=0)).max(axis=0)
+    assert ((moved <= np.array(rate or 3 * [np.inf]) + 1e-12).all()) and (rate or moved[0] > 0.1)
 
 
 def test_the_observer_has_the_bits_of_the_loop_and_begins_anew(tmp_path: Path) -> None:
@@ -90,8 +105,9 @@ def test_the_observer_has_the_bits_of_the_loop_and_begins_anew(tmp_path: Path) -
     assert (np.abs(expected) == 0.2).any()
 
 
-def test_what_cannot_be_a_package_is_refused(tmp_path: Path, capsys: Any) -> None:
-    run = pdeloop.train(plant=Bounded(), reduced_order=4, **QUICK, out=tmp_path / "run")
+def test_what_cannot_be_a_package_is_refused(
+    trained: FinishedRun, tmp_path: Path, capsys: Any
+) -> None:
     full = tmp_path / "full"
     full.mkdir()
     (full / "own.py").touch()
@@ -99,7 +115,7 @@ def test_what_cannot_be_a_package_is_refused(tmp_path: Path, capsys: Any) -> Non
         "My-Law": "cannot be the name of a ROS 2 package",
         "full": "exists",
     }.items():
-        assert main(["export", str(run.folder), "--ros2", str(tmp_path / folder)]) == 1
+        assert main(["export", str(trained.folder), "--ros2", str(tmp_path / folder)]) == 1
         assert told in capsys.readouterr().err
     assert not (tmp_path / "My-Law").exists() and len([*full.iterdir()]) == 1
 
@@ -116,7 +132,7 @@ sender = node.create_publisher(Float64MultiArray, "measurement", 1)
 
 def listen(message):
     action = list(message.data)
-    (safe if action == [0.0, 0.0, 0.125] else heard).append(action)
+    (safe if action == [-0.125, 0.0, 0.25] else heard).append(action)
 
 node.create_subscription(Float64MultiArray, "action", listen, 10)
 
@@ -125,7 +141,8 @@ def wait(condition):
         assert time.monotonic() < limit, "nobody answers"
         rclpy.spin_once(node, timeout_sec=0.05)
 
-wait(lambda: sender.get_subscription_count() and node.count_publishers("/action"))
+wait(lambda: sender.get_subscription_count() and safe)
+heard.clear()
 for k, y in enumerate(readings):
     sender.publish(Float64MultiArray(data=y.tolist()))
     wait(lambda: len(heard) > k)
@@ -141,7 +158,13 @@ np.save(out, np.array(heard))
 def test_colcon_builds_it_and_over_topics_it_is_the_law_of_the_loop(
     loop: Processes, tmp_path: Path
 ) -> None:
-    run = pdeloop.train(plant=Bounded(), reduced_order=4, **QUICK, out=tmp_path / "run")
+
+    class Slow(Bounded):
+        """With rate limits."""
+
+        action_rate = tuple(RATE)
+
+    run = pdeloop.train(plant=Slow(), reduced_order=4, **QUICK, out=tmp_path / "run")
     package = tmp_path / "src" / "bounded_law"
     assert main(["export", str(run.folder), "--ros2", str(package)]) == 0
     manifest = ElementTree.parse(package / "package.xml").getroot()
@@ -165,12 +188,18 @@ def test_colcon_builds_it_and_over_topics_it_is_the_law_of_the_loop(
     np.save(tmp_path / "readings.npy", readings)
     (library,) = (tmp_path / "install" / "bounded_law").glob("lib/python*/site-packages")
     loop.environment["PYTHONPATH"] = str(library)
-    parameters = ["-p", "safe_action:=[0.0, 0.0, 0.125]", "-p", "timeout_samples:=3"]
+    parameters = ["-p", f"safe_action:={SAFE}", "-p", "timeout_samples:=10"]
     started = loop.program(str(node), "--ros-args", *parameters, name="law")
     files = str(tmp_path / "readings.npy"), str(tmp_path / "heard.npy")
     driver = loop.program(sys.executable, "-c", DRIVER, *files, name="rig")
     loop.wait(driver, LIMIT)
-    heard = np.load(files[1])
-    assert np.array_equal(heard, answers(run, readings))
+    heard, held = np.load(files[1]), np.array(SAFE)  # until the first measurement
+    free = replace(run, values={**run.values, "action_bounds": []})
+    for k, requested in enumerate(answers(free, readings)):
+        held = ActionSet.of(run.values).project(requested, after=held)
+        assert np.array_equal(heard[k], held)
+    # Without measurements it goes to the safe action within the rate limits.
+    returns = np.diff([*heard[19:], SAFE], axis=0)
+    assert len(returns) > 1 and (np.abs(returns) <= np.array(RATE) + 1e-12).all()
     assert "no measurement for" in loop.output(started)
     assert "must be 8 finite numbers, got 1" in loop.output(started)
