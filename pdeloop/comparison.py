@@ -72,10 +72,6 @@ class Comparison:
                 ]
             )
         lines = aligned(table)
-        if self.apart:
-            lines.append(
-                f"the costs cannot be compared: the runs differ in {', '.join(self.apart[:SHOWN])}"
-            )
         if self.differing:
             lines += [
                 "",

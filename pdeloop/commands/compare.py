@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 
 from pdeloop.commands.common import Commands, a_path, add_json, command
+from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 
@@ -19,7 +20,7 @@ def add(commands: Commands) -> None:
         description="Show the costs of finished runs in one table, each adapted policy against "
         "that of the first run on the same initial fields, with a 95 percent bootstrap interval "
         "over the fields, and the parameters in which the runs differ. Where these change the "
-        "plant, the cost or the fields, the costs are not compared.",
+        "plant, the cost or the fields, the costs are not compared, and the exit code is 1.",
         example="pdeloop compare runs/a runs/b",
     )
     compare.add_argument(
@@ -33,7 +34,7 @@ def add(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from pdeloop.comparison import compare
+    from pdeloop.comparison import SHOWN, compare
     from pdeloop.finished_run import load_run
 
     if len(options.folders) < 2:
@@ -44,4 +45,8 @@ def _compare(options: argparse.Namespace) -> int:
         print_json(content)
     else:
         print(found.text())
+    if found.apart:
+        raise ParameterError(
+            f"the costs cannot be compared: the runs differ in {', '.join(found.apart[:SHOWN])}"
+        )
     return 0

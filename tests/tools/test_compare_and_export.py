@@ -102,9 +102,12 @@ def test_a_share_that_rounds_to_zero_has_no_minus_sign(runs: dict[str, Path]) ->
 def test_costs_of_another_plant_are_not_compared(
     runs: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["compare", str(runs["plain"]), str(runs["thick"])]) == 0
-    told = capsys.readouterr().out
-    assert "the costs cannot be compared: the runs differ in physical.viscosity" in told
+    two = ["compare", str(runs["plain"]), str(runs["thick"])]
+    for words in ([], ["--json"]):
+        assert main([*two, *words]) == FAILED
+        told = capsys.readouterr()
+        assert "the costs cannot be compared: the runs differ in physical.viscosity" in told.err
+        assert told.err.count("\n") == 1 and str(runs["thick"]) in told.out
     assert compare([load_run(runs[n]) for n in ("plain", "thick")]).rows()[1]["above_first"] is None
 
 
