@@ -35,6 +35,10 @@ def plot(found: Identified) -> Figure:
     rows = 1 if found.closed_loop is None else 2
     figure = Figure(figsize=(8.0, 3.0 * rows), layout="constrained")
     axes = figure.subplots(rows, 2, squeeze=False)
+    if found.model.d is not None and found.model.d.any():
+        figure.suptitle(
+            "the model has a constant term, which is in all simulations", fontsize="medium"
+        )
     _orders(axes[0, 0], found.orders, len(found.model.A))
     step = found.sample_time or 1.0
     unit = "t (s)" if found.sample_time else "step"
@@ -61,13 +65,15 @@ def plot(found: Identified) -> Figure:
                 linewidth=0.9,
                 label=found.channels.input(j),
             )
-        axes[1, 1].set(title="its actions", xlabel=unit)
+            for end in (actions[:, j].min(), actions[:, j].max()):
+                axes[1, 1].axhline(end, color=f"C{place}", linestyle=":", linewidth=0.9)
+        axes[1, 1].set(title="its actions, and the recorded range (dotted)", xlabel=unit)
         axes[1, 1].legend(frameon=False, fontsize="small")
     return figure
 
 
 def _orders(ax: Axes, rows: Sequence[Mapping[str, float]], order: int) -> None:
-    ax.set(title="errors on held-out steps", xlabel="order $n_s$")
+    ax.set(title="errors on held-out steps", xlabel="order $n_s$", ylabel="relative to no change")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if not rows:
         ax.text(0.5, 0.5, "too few steps to hold some out", ha="center", transform=ax.transAxes)

@@ -13,6 +13,8 @@ import pytest
 
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import Measurements, read_measurements
+from pdeloop.identification import identify_data
+from pdeloop.identification_plot import plot
 from pdeloop.messages.files import FileError
 from tests.support.linear_system import linear_system, trajectory
 
@@ -267,6 +269,24 @@ def test_without_a_target_there_is_a_model_and_no_law(
         assert main(refusal) == FAILED
         error = capsys.readouterr().err
         assert told in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("offset", [0.0, 20.0])
+def test_a_picture_simulates_with_the_constant_term_and_says_so(
+    tmp_path: Path, offset: float
+) -> None:
+    shifted = [[row[0], *(str(float(z) + offset) for z in row[1:5]), *row[5:]] for row in rows()]
+    target = np.array([float(z) for z in TARGET[1:5]]) + offset
+    log = read(tmp_path, text([NAMES, *shifted]), target=target)
+    figure = plot(identify_data(log, {"reduced_order": 4, "identification": "regression"}))
+    drawn = np.array([line.get_ydata() for line in figure.axes[1].lines])
+    recorded, simulated = drawn[:4], drawn[4:]
+    np.testing.assert_array_equal(recorded, STATES.T + offset)
+    np.testing.assert_allclose(simulated, recorded, atol=0.02)
+    assert ("constant term" in (figure.get_suptitle() or "")) == (offset > 0.0)
+    low, high = ACTIONS.min(axis=0), ACTIONS.max(axis=0)
+    ends = [line.get_ydata()[0] for line in figure.axes[3].lines if line.get_linestyle() == ":"]
+    assert ends == [low[0], high[0], low[1], high[1]]
 
 
 def test_the_law_on_the_model_is_the_law_that_is_saved(
