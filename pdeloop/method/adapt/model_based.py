@@ -43,7 +43,12 @@ from pdeloop.method.adapt.belief import (
     largest_error,
 )
 from pdeloop.method.adapt.estimate import Estimate
-from pdeloop.method.adapt.initial_fields import any_state_serves, initial_fields, measured_states
+from pdeloop.method.adapt.initial_fields import (
+    ALIKE,
+    any_state_serves,
+    initial_fields,
+    measured_states,
+)
 from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress
 from pdeloop.method.adapt.renewal import renew, renew_from_states
 from pdeloop.method.adapt.replay import (
@@ -272,7 +277,45 @@ class ModelBased(Optimizer):
 
     def _next_renewal(self) -> int:
         """Own rollouts after which the law is renewed next."""
-        return self._schedule.doubled(self._records.count)
+        own, known = self._records.count, self._measurements()
+        if self._repeats:
+            return min(own + 1, self._schedule.last)
+        if (
+            own == 0
+            and len(known) > 1
+            and not self._context.noise
+            and len(initial_fields(known)) == 1
+        ):
+            return min(2, self._schedule.last)  # whether they are the same
+        return self._scheduled(own)
+
+    def _scheduled(self, own: int) -> int:
+        """The same where rollouts of a law differ."""
+        return self._schedule.doubled(own)
+
+    @property
+    def _repeats(self) -> bool:
+        """True if a law's rollouts are all the same one: every episode begins alike, without noise."""
+        known = self._measurements()
+        if self._context.noise or len(initial_fields(known)) > 1:
+            return False
+        laws: dict[bytes, list[Record]] = {}
+        for record in known[len(self._context.every_exploration) :]:
+            laws.setdefault(record.policy.tobytes(), []).append(record)
+        pairs = [(own[0].states, other.states) for own in laws.values() for other in own[1:]]
+        return bool(pairs) and all(
+            len(own) == len(other) and np.abs(own - other).max() <= ALIKE * np.abs(own).max()
+            for own, other in pairs
+        )
+
+    @property
+    def _rests(self) -> bool:
+        """True if the last two laws cost hardly less than one before them, each rolled out once."""
+        costs = list(
+            {record.policy.tobytes(): record.cost for record in self._records.all()}.values()
+        )
+        least = (1.0 - self._settings.least_gain) * min(costs[:-2], default=np.inf)
+        return self._repeats and len(costs) > 2 and min(costs[-2:]) >= least
 
     def _rollout(self, policy: Array, number: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, number))
@@ -318,7 +361,7 @@ class ModelBased(Optimizer):
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
-        final = self._records.count >= self._schedule.last
+        final = self._records.count >= self._schedule.last or self._rests
         belief = self._believe()
         known = self._measurements()
         other = believe_in_noise(self._context, known, belief, self._settings)
@@ -429,6 +472,8 @@ class ModelBased(Optimizer):
         base = self._decide(row, laws)
         self._look_back(row, self._compared(laws, base), base)
         early = "" if self._progress.replayed else _known_well(len(self._fields()))
+        if self._repeats:
+            early = "every episode begins alike, and the last two laws gained nothing"
         self._end(row, str(row["reason"]), early)
 
     def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:

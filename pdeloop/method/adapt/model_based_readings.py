@@ -28,9 +28,9 @@ class ModelBasedReadings(ModelBased):
     _unpredicted = "no model of the readings predicts the rollouts"
     _model_compares = False
 
-    def _next_renewal(self) -> int:
+    def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
-        return self._schedule.often(self._records.count)
+        return self._schedule.often(own)
 
     def _data(self) -> list[Record]:
         """All rollouts as they were measured: the model's filter knows their noise."""

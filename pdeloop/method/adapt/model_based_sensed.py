@@ -71,9 +71,9 @@ class ModelBasedSensed(ModelBasedReadings):
         model = None if belief is None else belief.model
         return model if isinstance(model, SensedModel) else None
 
-    def _next_renewal(self) -> int:
+    def _scheduled(self, own: int) -> int:
         """After as many rollouts as judge a law; on a model of the field later after twice as many."""
-        own, last = self._records.count, self._schedule.last
+        last = self._schedule.last
         if self._sensed is None:
             return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last

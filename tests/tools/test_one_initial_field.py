@@ -1,0 +1,58 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Where every episode begins alike and nothing is noisy, a second rollout of a law tells nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pdeloop
+from pdeloop.messages.arrays import Array
+
+
+class Pendulums(pdeloop.Dynamics):
+    """Five coupled pendulums, three of them driven, which are always let go at the same angles."""
+
+    n_z, n_a, horizon, sample_time, action_weight = 10, 3, 80, 0.1, 0.05
+
+    def __init__(self, spread: float = 0.0) -> None:
+        self._spread = spread
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        angles = np.array([2.0, -1.5, 1.0, 0.5, -2.0])
+        return np.concatenate([angles + self._spread * rng.standard_normal(5), np.zeros(5)])
+
+    def step(self, z: Array, a: Array) -> Array:
+        torque = np.array([a[0], 0.0, a[1], 0.0, a[2]])
+        for _ in range(4):
+            q, w = z[:5], z[5:]
+            pull = np.append(np.diff(q), 0.0) - np.append(0.0, np.diff(q))
+            w = w + 0.025 * (2.0 * pull - np.sin(q) - 0.1 * w + torque)
+            z = np.concatenate([q + 0.025 * w, w])
+        return z
+
+
+def roles(run: pdeloop.FinishedRun) -> list[int]:
+    """Rollouts of the laws, at the end of each update."""
+    return [int(row["rollouts"]) for row in run.result["history"] if "role" in row]
+
+
+def test_each_law_is_rolled_out_once_until_none_is_better() -> None:
+    with pytest.warns(pdeloop.TrainingWarning, match="every episode begins alike"):
+        run = pdeloop.train(plant=Pendulums(), seed=0, rollouts=20)
+    known = roles(run)
+    assert known[0] == 4  # two explorations, and two of the first law, which are the same
+    assert set(np.diff(known[:-1])) == {1}
+    assert run.rollouts[0]["total"] == known[-1] <= 12
+    first, adapted = (float(run.costs[name].mean()) for name in ("lqt", "adapted"))
+    assert adapted < 0.99 * first
+
+
+def test_fields_that_differ_or_noise_are_rolled_out_as_ever() -> None:
+    for plant, settings, first in (
+        (Pendulums(0.01), {}, 5),
+        (Pendulums(), {"process_noise": 1e-3}, 4),  # two of the first law, which differ
+    ):
+        run = pdeloop.train(plant=plant, seed=0, rollouts=8, **settings)
+        assert roles(run)[0] == first
+        assert run.rollouts[0]["total"] == 8
