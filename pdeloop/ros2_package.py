@@ -138,7 +138,7 @@ def write_package(
 
 def _projection() -> str:
     """The source of the methods by which actions are made admissible."""
-    methods = ActionSet.project, ActionSet._within, ActionSet._shifts, ActionSet._balance
+    methods = ActionSet.project, ActionSet.within, ActionSet._shifts, ActionSet._balance
     sources = [_bare(textwrap.dedent(inspect.getsource(method))) for method in methods]
     text = "\n".join(sources).replace("_BALANCED", repr(action_set._BALANCED))
     return textwrap.indent(text, "    ")

@@ -136,11 +136,6 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
                 f"the law '{law.name}' plans from the whole state, but {sensors} sensors measure the "
                 "plant; give --law extended_kalman"
             )
-        if ActionSet.of(values).rated:
-            raise ParameterError(
-                f"the law '{law.name}' plans without rate limits, which the plant's actions have; give "
-                "--law affine"
-            )
         if law.settings.steps > values["horizon"]:
             raise ParameterError(
                 f"parameter 'law_settings.steps' is {law.settings.steps}; expected at most the steps "

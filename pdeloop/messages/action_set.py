@@ -223,7 +223,7 @@ class ActionSet:
                 return actions
             out[...] = actions
             return out
-        low, high = self._within(after)
+        low, high = self.within(after)
         moved = actions - self._shifts(actions, low, high) if self.zero_mean else actions
         clipped: Array = np.clip(moved, low, high, out=out)
         return clipped
@@ -243,8 +243,8 @@ class ActionSet:
             held = found[k] = self.project(actions, after=held)
         return found
 
-    def _within(self, after: Array | None) -> tuple[Array, Array]:
-        """Lowest and highest actions of a step."""
+    def within(self, after: Array | None) -> tuple[Array, Array]:
+        """Lowest and highest actions of a step, after those applied before."""
         if after is None or not self.rated:
             return self.low, self.high
         return np.maximum(self.low, after - self.rate), np.minimum(self.high, after + self.rate)
@@ -266,16 +266,21 @@ class ActionSet:
     def pull_back_after(
         self, requested: Array, y: Array, after: Array | None
     ) -> tuple[Array, Array]:
-        """`pull_back` where rate limits are of the actions before, and the same by those, times y."""
-        low, high = self._within(after)
+        """`pull_back` where rate limits are of the actions before, and the same by those, times y.
+
+        At a rate limit it is that from the side to which -y points.
+        """
+        low, high = self.within(after)
         moved = requested - self._shifts(requested, low, high) if self.zero_mean else requested
-        free = (moved >= low) & (moved <= high)
+        below = (moved < low) | (moved == low) & (low > self.low) & (y > 0.0)
+        above = (moved > high) | (moved == high) & (high < self.high) & (y < 0.0)
+        free = ~(below | above | np.isnan(moved))
         pulled: Array = y * free
         if self.zero_mean:
             count = np.maximum(free.sum(axis=-1, keepdims=True), 1)
             mean = pulled.sum(axis=-1, keepdims=True) / count
             pulled, y = pulled - free * mean, y - mean
-        slow = ((moved < low) & (low > self.low)) | ((moved > high) & (high < self.high))
+        slow = (below & (low > self.low)) | (above & (high < self.high))
         return pulled, y * slow
 
     def held_back(self, applied: Array) -> NDArray[np.bool_]:
@@ -283,7 +288,7 @@ class ActionSet:
         before = np.concatenate(
             [np.broadcast_to(self.start, (1, *applied.shape[1:])), applied[:-1]]
         )
-        low, high = self._within(before)
+        low, high = self.within(before)
         found: NDArray[np.bool_] = (applied <= low) | (applied >= high)
         return found
 

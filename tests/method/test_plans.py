@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import linalg
+from scipy.optimize import LinearConstraint, minimize
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
@@ -131,6 +132,60 @@ def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:
     small = 1e-2 * np.abs(g).max()
     assert np.abs(on_v).max() < small and np.abs(g[~(low | high)]).max() < small
     assert g[low].min() > -small and g[high].max() < small
+
+
+RATED = ActionSet(N_A, [-0.4, -np.inf], [0.5, 0.6], rate=[0.3, 0.8])
+
+
+@pytest.mark.parametrize("around", [False, True])
+@pytest.mark.parametrize("model", [linear(), spectral()], ids=lambda m: m.kind)
+def test_the_gradient_is_that_of_the_cost_within_rate_limits(
+    model: FieldModel, around: bool
+) -> None:
+    own = planner(model, general_cost(), action_set=RATED, around=around)
+    rng = np.random.default_rng(0)
+    last = rng.uniform([-0.4, -0.6], [0.5, 0.6], (3, N_A))
+    z, v = own.after(rng.standard_normal((3, N_Z)), last), rng.standard_normal((3, 12, N_A))
+    moved = np.diff(own.actions_of(v, z), axis=1, prepend=last[:, None])
+    at_limit = np.isclose(np.abs(moved), RATED.rate)
+    assert (np.abs(moved) <= RATED.rate + 1e-12).all() and 0.2 < at_limit.mean() < 0.8
+    J, g, kept = own.gradient(v, z, 2)
+    np.testing.assert_allclose(J, own.costs(kept, z, 2), rtol=1e-9)
+    d = np.where(g != 0.0, rng.standard_normal(v.shape), 0.0)
+    slopes = (own.costs(v + 1e-6 * d, z, 2) - own.costs(v - 1e-6 * d, z, 2)) / 2e-6
+    np.testing.assert_allclose((g * d).sum(axis=(1, 2)), slopes, rtol=1e-5)
+
+
+def test_within_rate_limits_a_plan_saves_what_quadratic_programming_does() -> None:
+    allowed = ActionSet(N_A, -0.5, [0.3, np.inf], rate=[0.2, 0.3])
+    own = planner(linear(radius=0.9), action_set=allowed, around=False)
+    free, rng = replace(own, action_set=ActionSet(N_A)), np.random.default_rng(6)
+    last = rng.uniform(-0.3, 0.3, N_A)
+    field = rng.standard_normal((1, N_Z))
+    z = own.after(field, last[None])
+    v, (J,) = own.begin(z)
+    moves = np.kron(np.eye(12) - np.eye(12, k=-1), np.eye(N_A))
+    first, rate = np.append(last, np.zeros(11 * N_A)), np.tile(allowed.rate, 12)
+
+    def cost(w: Array) -> tuple[float, Array]:
+        of_w, g, _ = free.gradient(w.reshape(1, 12, N_A), field, 0)
+        return float(of_w[0]), g.ravel()
+
+    found = minimize(
+        cost,
+        np.zeros(12 * N_A),
+        jac=True,
+        method="SLSQP",
+        bounds=list(zip(np.tile(allowed.low, 12), np.tile(allowed.high, 12), strict=True)),
+        constraints=[LinearConstraint(moves, first - rate, first + rate)],
+        options={"ftol": 1e-10, "maxiter": 300},
+    )
+    taken = own.actions_of(v, z)[0]
+    moved = np.abs(np.diff(taken, axis=0, prepend=last[None]))
+    assert (moved <= allowed.rate + 1e-9).all() and (moved > 0.99 * allowed.rate).sum() > 2
+    (none,) = own.costs(np.zeros((1, 12, N_A)), z, 0)
+    assert found.success and found.fun * (1.0 - 1e-9) <= J
+    assert none - J > 0.99 * (none - found.fun)
 
 
 def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where_it_is_better() -> (

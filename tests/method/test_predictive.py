@@ -135,6 +135,27 @@ def test_its_memory_is_a_function_of_the_states_of_the_episode() -> None:
         assert memory.shape == (own.memory_size,)
 
 
+def test_it_plans_within_rate_limits_from_the_action_before() -> None:
+    """As the planner does by itself; what the loop clips is within the limits already."""
+    own, allowed = law(), ActionSet(N_A, -0.5, 0.4, rate=[0.1, np.inf])
+    whole = theta(own, action_set=allowed)
+    planner = own.planner(own.parts(whole))
+    assert planner.action_set == allowed
+    plan, last, expected = np.zeros((1, 10, N_A)), None, []
+    for k, z in enumerate(STATES):
+        last, plan, _ = planner.step(plan, planner.after(z[None], last), k)
+        plan = planner.shifted(plan)
+        expected.append(last[0])
+    acted = actions_of(own, whole)
+    np.testing.assert_array_equal(acted, expected)
+    batch = LawBatch([law()], np.ones(N_Z), allowed)
+    batch.set(whole[None])
+    again = [batch.actions(k, z[None])[0] for k, z in enumerate(STATES)]
+    np.testing.assert_array_equal(again, expected)
+    moved = np.abs(np.diff(expected, axis=0, prepend=[allowed.start]))
+    assert moved[:, 0].max() == pytest.approx(0.1) and moved[:, 1].max() > 0.1
+
+
 def test_a_memory_counts_how_often_the_affine_plan_was_better() -> None:
     own = law()
     parts, memory = own.parts(theta(own, iterations=0)), own.memory_start()

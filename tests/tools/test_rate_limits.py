@@ -127,11 +127,9 @@ def test_a_law_knows_its_last_action_or_asks_for_the_episode_again() -> None:
         other.actions(1, z)
 
 
-def test_what_does_not_know_them_says_so(run: pdeloop.FinishedRun) -> None:
+def test_an_archive_has_them_and_what_contradicts_them_is_refused(run: pdeloop.FinishedRun) -> None:
     with np.load(io.BytesIO(law_of(run).npz())) as kept:
         assert kept["action_rate"] == RATE and kept["action_start"] == 1.0
-    with pytest.raises(ValueError, match="'predictive' plans without rate limits"):
-        pdeloop.train(plant=Valve(), law="predictive", rollouts=24)
     with pytest.raises(ValueError, match="goes with bounds, not with action_limit"):
         pdeloop.train(plant=Valve(), action_limit=1.0, rollouts=24)
     with pytest.raises(ValueError, match="action_rate must be positive"):

@@ -183,7 +183,7 @@ class ModelBasedPredictive(Optimizer):
         fields, before = self._simulated(belief, self._affine.policy)
         horizon = self._context.horizon
         planner = replace(self._plain(belief.model, fields), around=True, steps=horizon)
-        least = np.minimum(planner.begin(fields)[1] / horizon, before)
+        least = np.minimum(planner.begin(planner.after(fields))[1] / horizon, before)
         self._share = share_saved(least, before)
         if self._share > self._law.worth and not self._affine.done:  # is that of affine laws, too?
             _, before = self._simulated(belief, self._affine.last_law())
@@ -375,9 +375,10 @@ def simulated(planner: Planner, fields: Array) -> Array:
     """Mean stage costs (F,) on the planner's own model from initial fields (F, n_z)."""
     cost, z = planner.cost, fields
     totals, plan = np.zeros(len(fields)), np.zeros((len(fields), planner.steps, len(planner.b)))
+    a = plan[:, 0]
     with np.errstate(all="ignore"):
         for k in range(cost.horizon):
-            a, plan, _ = planner.step(plan, z, k)
+            a, plan, _ = planner.step(plan, planner.after(z, a if k else None), k)
             plan = planner.shifted(plan)
             cost.add(totals, z, a, k)
             z = planner.model.step(z, a)

@@ -17,6 +17,10 @@ The search is L-BFGS in the metric of R + B^T P B, with a projected backtracking
 number of iterations. A spectral model carries out both ways over all steps in one compiled call
 (`pdeloop.solver.polynomial_sweep`).
 
+With rate limits P also depends on a_{i-1}, and states z_k are given with a_{k-1} (`Planner.after`). An
+action that its rate limit holds back is requested a step's change further, so that it follows when
+a_{i-1} changes.
+
 All functions take M plans side by side, each with the same result as alone.
 
 References
@@ -122,6 +126,13 @@ class Planner:
             least = np.minimum(J, least)
         return self.improved(best, z, k, self.first - BEFORE)
 
+    def after(self, z: Array, actions: Array | None = None) -> Array:
+        """States (M, n_z) after actions (M, n_a), or at the beginning, as the functions take them."""
+        if not self.action_set.rated:
+            return z
+        last = self.action_set.start if actions is None else actions
+        return np.hstack([z, np.broadcast_to(last, (len(z), len(self.b)))])
+
     def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array, Flags]:
         """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan.
 
@@ -150,7 +161,8 @@ class Planner:
         lost = ~np.isfinite(J)
         of_law = self._affine(z)
         base = of_law if self.around else 0.0
-        a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]))
+        after = z[:, self.model.n_z :] if self.action_set.rated else None
+        a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]), after=after)
         plan = np.where(lost[:, None, None], 0.0, plan)
         return a, plan, fell | lost
 
@@ -196,6 +208,8 @@ class Planner:
                 seen = np.where(close, actions, requested)
                 own = sweep.roll_back(seen, on_states, on_actions, K, eta)
                 g[rows] = np.where(self._leaves(actions, own), 0.0, own)
+                if self.action_set.rated:
+                    kept[rows] += self._further(z[rows], actions, own)
 
         self._sweep.each(len(z), work)
         lost = ~(
@@ -211,6 +225,16 @@ class Planner:
         up = actions >= high - _CLOSE * (1.0 + np.abs(high))
         held: Flags = (down & (g > 0.0)) | (up & (g < 0.0))
         return held
+
+    def _further(self, z: Array, actions: Array, g: Array) -> Array:
+        """What the requests of actions that a rate limit holds back are beyond them."""
+        allowed, before = self.action_set, z[:, None, self.model.n_z :]
+        low, high = allowed.within(np.concatenate([before, actions[:, :-1]], axis=1))
+        held, close = (g == 0.0) & np.isfinite(allowed.rate), _CLOSE * (1.0 + np.abs(actions))
+        down = held & (actions <= low + close) & (low > allowed.low)
+        up = held & (actions >= high - close) & (high < allowed.high)
+        found: Array = np.where(held, allowed.rate, 0.0) * (up.astype(float) - down)
+        return found
 
     def improved(
         self,
@@ -248,6 +272,9 @@ class Planner:
                 todo = todo[~good]
                 t[todo] *= SHORTER
             s, y = new_v - v, new_g - g
+            if self.action_set.rated:  # requests beyond a limit say nothing about curvature
+                free = (g != 0.0) & (new_g != 0.0)
+                s, y = s * free, y * free
             product = (s * y).sum(axis=(1, 2))
             curved = product > 1e-14 * np.maximum((g * g).sum(axis=(1, 2)), 1e-300)
             pairs = [*pairs[1 - MEMORY :], (s, y, np.where(curved, product, np.inf))]
@@ -293,7 +320,7 @@ class Planner:
         return states, actions
 
     def _affine(self, z: Array) -> Array:
-        a: Array = np.einsum("mi,ji->mj", z, self.K) + self.b
+        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], self.K) + self.b
         return a
 
     @cached_property

@@ -58,8 +58,8 @@ class Predictive(Law):
     identifies one writes it into theta, with the cost, the admissible actions, H and the constants of
     the search: `model_based` does. theta is then longer than `size`; zeros at its end mean nothing.
 
-    Its memory is the plan for the next steps, and how often the affine law's plan was the cheaper one
-    on the model, so that the search began with that.
+    Its memory is the plan for the next steps, the action applied last, and how often the affine law's
+    plan was the cheaper one on the model, so that the search began with that.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd ed., 2017, chapter 2.
     """
@@ -86,7 +86,7 @@ class Predictive(Law):
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]
-        return self.longest * self.n_a + 1
+        return (self.longest + 1) * self.n_a + 1
 
     def start(self) -> Parts:
         """K_a and K_b of the model, (n_a, n_s) each, and no plan."""
@@ -120,6 +120,8 @@ class Predictive(Law):
             "terminal": np.array(planner.terminal),
             "search": np.array([planner.steps, planner.iterations, planner.first, planner.starts]),
         }
+        if actions.rated:
+            arrays["rate"] = np.broadcast_to(actions.rate, n_a)
         numbers = packed(arrays)
         if len(numbers) > MOST_NUMBERS:
             raise ValueError(
@@ -163,13 +165,16 @@ class Predictive(Law):
             cost = Cost(n_z, n_a, self.horizon, state_weight=q, action_weight=r, target=target)
         low, high = checked_array(arrays, "bounds", "f", (2, n_a), finite=False)
         zero_mean = bool(checked_array(arrays, "zero_mean", "b", ()))
+        rate: Array = np.full(n_a, np.inf)
+        if "rate" in arrays:
+            rate = checked_array(arrays, "rate", "f", (n_a,), finite=False)
         steps, iterations, first, starts = checked_array(arrays, "search", "i", (4,)).tolist()
         if not (1 <= steps <= self.longest and iterations >= 0 and first >= 0 and starts >= 1):
             raise ValueError(f"its plans have {steps} steps; expected 1 to {self.longest}")
         return Planner(
             model,
             cost,
-            ActionSet(n_a, low, high, zero_mean),
+            ActionSet(n_a, low, high, zero_mean, rate=rate),
             *self._feedback(theta),
             around=bool(checked_array(arrays, "around", "b", ())),
             steps=steps,
@@ -195,6 +200,7 @@ class Predictive(Law):
         _, plan, fell = self._planned(theta, z, memory, k)
         after = np.zeros(self.memory_size)
         after[: plan[1:].size] = plan[1:].ravel()
+        after[-1 - self.n_a : -1] = action
         after[-1] = memory[-1] + fell
         return after
 
@@ -227,8 +233,9 @@ class Predictive(Law):
         known = self._plans.get(key)
         if known is None:
             planner, H = self.planner(theta), self.longest
-            plan = memory[:-1].reshape(1, H, self.n_a)[:, : planner.steps]
-            a, plan, fell = planner.step(plan, z[None], k)
+            plan = memory[: H * self.n_a].reshape(1, H, self.n_a)[:, : planner.steps]
+            last = memory[None, H * self.n_a : -1] if k else None
+            a, plan, fell = planner.step(plan, planner.after(z[None], last), k)
             known = self._plans[key] = a[0], plan[0], bool(fell[0])
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)

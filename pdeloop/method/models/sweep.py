@@ -66,8 +66,9 @@ class Sweep(Protocol):
     ) -> tuple[Array, Array, Array]:
         """States [z; p] (M, H + 1, n_z + n_p), [r; u] (M, H, n_a + n_p) and a (M, H, n_a).
 
-        start (M, n_z + n_p); v as [r; u]; K (n_a + n_p, n_z + n_p); b (n_a + n_p,); e (M, H, n_z) or
-        None; kept: whether `roll_back` will follow. What is not finite is NaN or infinite from then on.
+        start (M, n_z + n_p), after which a_{-1} may stand; v as [r; u]; K (n_a + n_p, n_z + n_p);
+        b (n_a + n_p,); e (M, H, n_z) or None; kept: whether `roll_back` will follow. What is not finite
+        is NaN or infinite from then on.
         """
 
     def roll_back(
@@ -119,6 +120,7 @@ class ModelSweep:
     def __init__(self, model: FieldModel, action_set: ActionSet, B: Array) -> None:
         self._model, self._set, self._B = model, action_set, B
         self._states = self._actions = np.empty((0, 0, 0))
+        self._before = action_set.start
 
     def each(self, count: int, work: Callable[[Sweep, slice], None]) -> None:
         work(self, slice(0, count))
@@ -134,12 +136,13 @@ class ModelSweep:
         kept: bool = True,
     ) -> tuple[Array, Array, Array]:
         (M, H, _), n_a, n_z = v.shape, self._B.shape[1], self._model.n_z
-        states, requested = np.empty((M, H + 1, start.shape[1])), np.empty(v.shape)
+        states, requested = np.empty((M, H + 1, len(K.T))), np.empty(v.shape)
         actions, lost = np.empty((M, H, n_a)), np.full(M, H + 1)
-        states[:, 0] = start
+        states[:, 0], last = np.split(start, [len(K.T)], axis=1)
+        self._before = last if last.size else self._set.start
         for k in range(H):
             own = requested[:, k] = np.einsum("mi,ji->mj", states[:, k], K) + b + v[:, k]
-            before = actions[:, k - 1] if k else self._set.start
+            before = actions[:, k - 1] if k else self._before
             a = actions[:, k] = self._set.project(own[:, :n_a], after=before)
             z = self._model.step(states[:, k, :n_z], a)
             states[:, k + 1, :n_z] = z if e is None else z + e[:, k]
@@ -165,7 +168,7 @@ class ModelSweep:
             )
             g = g + on_actions[:, k] + np.einsum("mj,ji->mi", mu, self._B)
             if self._set.rated:
-                before = self._actions[:, k - 1] if k else self._set.start
+                before = self._actions[:, k - 1] if k else self._before
                 found[:, k, :n_a], later = self._set.pull_back_after(
                     requested[:, k], g + later, before
                 )
