@@ -22,6 +22,10 @@ EXPLORED, HELD = 10, 8
 QUIET = 1e-3
 """Standard deviation of these actions: so small that what they begin is still linear."""
 ORDER = 8
+MODES = 10, 20
+"""POD modes of an exploration from convection that the law explored from rest is projected on."""
+EXCITED = 0.3
+"""Variance of the exploration from convection."""
 
 
 def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
@@ -48,6 +52,7 @@ def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
     yield row("proportional to the column mean of v", [_proportional(convection, plant)], 0)
     whole: list[EpisodeRecord] = []
     probed: list[EpisodeRecord] = []
+    projected: dict[int, list[EpisodeRecord]] = {count: [] for count in MODES}
     points = convection.grid.equally_spaced(PROBES)
     places = (points + convection.grid.points * np.arange(3)[:, None]).ravel()
     every = np.arange(convection.grid.size)
@@ -60,11 +65,17 @@ def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
             K = pdeloop.track(model, **weights).K_a @ model.U.T
             held = _feedback(K, rest[seen], seen)
             found.append(pdeloop.rollout(plant, held, [0]))
+            if seen is every:
+                for count, own in projected.items():
+                    V = _modes(convection, seed, count)
+                    own.append(pdeloop.rollout(plant, _feedback(K @ V @ V.T, rest, every), [0]))
     short = f"{EXPLORED} of {HELD} actions"
     yield row(f"LQR explored from rest, order {ORDER}", whole, short)
+    for count, own in projected.items():
+        yield row(f"the same on {count} POD modes of convection", own, short)
     yield row("the same with 4 x 4 probes", probed, short)
     for budget in budgets:
-        how = {"reduced_order": 10, "exploration_variance": 0.3}
+        how = {"reduced_order": 10, "exploration_variance": EXCITED}
         made = [trained(lambda: Convection(cells), seed, budget, **how) for seed in range(seeds)]
         found = [pdeloop.rollout(plant, law, [0]) for law, _ in made]
         yield row(f"{name_of(budget)} from convection", found, max(spent for _, spent in made))
@@ -82,6 +93,13 @@ def _explored(convection: Convection, seed: int) -> list[tuple[Array, Array]]:
     resting = np.tile(convection.target, (EXPLORED, 1))
     episode = pdeloop.rollout(short, lambda k, z: QUIET * drawn[k], resting)
     return [(episode.states[:, m], episode.actions[:, m]) for m in range(EXPLORED)]
+
+
+def _modes(convection: Convection, seed: int, count: int) -> Array:
+    """Orthonormal POD modes (n_z, count) of one exploration from convection."""
+    explored = pdeloop.problem(plant=convection, exploration_variance=EXCITED).explore(seed)
+    V: Array = np.linalg.svd(explored[0] - convection.target, full_matrices=False)[2][:count].T
+    return V
 
 
 def _proportional(convection: Convection, plant: DynamicsPlant) -> EpisodeRecord:
