@@ -125,9 +125,7 @@ def measured_names(run: FinishedRun, n_y: int) -> list[str]:
     grid = Grid.parse(run.values["grid"])
     if run.values["sensors"]:
         return [f"y{i + 1}" for i in range(n_y)]
-    return [
-        f"{name}{i + 1}" for name in grid.components for i in range(n_y // len(grid.components))
-    ]
+    return [f"{part.name}{i + 1}" for part in grid.parts for i in range(part.axis.size)]
 
 
 def write_minari(run: FinishedRun, name: str) -> None:

@@ -68,7 +68,7 @@ class Frames:
         grid, count = plant.grid, len(titles)
         self._flat = len(grid.axes) > 1
         kept = 0 if fields is None else 1
-        rows = len(grid.components) * (1 if self._flat else 1 + kept)
+        rows = len(grid.parts) * (1 if self._flat else 1 + kept)
         with rc_context(STYLE):
             wide = 2.2 if self._flat or count > 1 else 4.0
             high = 1.75 if self._flat else 1.3
@@ -93,8 +93,8 @@ class Frames:
             self._shows: list[list[Show]] = [[] for _ in titles]
             self._bars: list[tuple[Any, Axes]] = []
             for c, (title, colour) in enumerate(zip(titles, colours, strict=True)):
-                for i in range(len(grid.components)):
-                    own = axes[i * rows // len(grid.components) :, c].tolist()
+                for i in range(len(grid.parts)):
+                    own = axes[i * rows // len(grid.parts) :, c].tolist()
                     self._shows[c].append(self._begin(own, c, i, colour))
                 axes[0, c].set_title(title, fontsize=9)
                 self._bars.append(_actions(axes[-1, c], plant, colour, largest))
@@ -112,11 +112,12 @@ class Frames:
         (height, width, 3)
             Red, green and blue of each pixel.
         """
+        grid = self._plant.grid
         for shows, state in zip(self._shows, states, strict=True):
-            for show, values in zip(shows, self._plant.grid.fields(state), strict=True):
-                show(step, values)
+            for i, show in enumerate(shows):
+                show(step, grid.fields(state)[i] if self._flat else state[grid.part(i)])
         if self._moving is not None:
-            target = self._plant.grid.fields(self._moving[step])
+            target = grid.fields(self._moving[step])
             for picture, values in zip(self._pictures, target, strict=False):
                 picture.set_data(planes.middle(values))
         for (bars, ax), own in zip(self._bars, actions, strict=True):
@@ -147,12 +148,11 @@ class Frames:
     def _line(self, ax: Axes, column: int, component: int, colour: str) -> Show:
         """A field on one axis, or a plain vector, as a curve over its dashed target."""
         grid, target = self._plant.grid, self._target(component)
-        axis = grid.line
         mark_places(ax, self._plant, component)
-        own, moving = grid.part(component), self._moving
+        (name, own, axis), moving = grid.parts[component], self._moving
         (dashes,) = ax.plot(axis.points, target, "--", color="0.45", lw=1)
         (line,) = ax.plot(axis.points, target, color=colour, lw=1.5)
-        ax.set(ylabel=grid.components[component], xlabel=axis.label, xlim=(0, axis.length))
+        ax.set(ylabel=name, xlabel=axis.label, xlim=(0, axis.length))
         ax.set_ylim(_around(self._span(component)))
         if self._fields is not None:
             with np.errstate(invalid="ignore"):
@@ -169,9 +169,9 @@ class Frames:
     def _past(self, ax: Axes, column: int, component: int) -> Show:
         """The same in space and time, up to the current step."""
         assert self._fields is not None
-        own = self._plant.grid.part(component)
+        _, own, axis = self._plant.grid.parts[component]
         whole = self._fields[column, :, own].T
-        axis, end = self._plant.grid.line, self._plant.sample_time * (whole.shape[1] - 1)
+        end = self._plant.sample_time * (whole.shape[1] - 1)
         low, high = field_range(self._fields[..., own], self._span(component))
         so_far = np.full_like(whole, np.nan)
         extent = (0.0, end, 0.0, axis.length)

@@ -61,15 +61,14 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
         with matplotlib.rc_context(STYLE):
             return planes.episode(plant, episode, environment)
     times = plant.sample_time * np.arange(steps + 1)
-    components, axis = plant.grid.components, plant.grid.line
-    extent = (0.0, times[-1], 0.0, axis.length)
+    parts = plant.grid.parts
     with matplotlib.rc_context(STYLE):
         moving = moving_target(plant)
         each = 1 if moving is None else 2
-        figure = Figure(figsize=(6.4, 1.6 + 1.7 * each * len(components)))
-        *maps, below = figure.subplots(each * len(components) + 1, 1, sharex=True)
-        for i, name in enumerate(components):
-            own, ax = plant.grid.part(i), maps[each * i]
+        figure = Figure(figsize=(6.4, 1.6 + 1.7 * each * len(parts)))
+        *maps, below = figure.subplots(each * len(parts) + 1, 1, sharex=True)
+        for i, (name, own, axis) in enumerate(parts):
+            ax, extent = maps[each * i], (0.0, times[-1], 0.0, axis.length)
             field, target = episode.fields[:, environment, own], plant.field_target[own]
             low, high = field_range(field, target if moving is None else moving[:, own])
             if moving is not None:

@@ -37,13 +37,12 @@ def _draw(values: Mapping[str, Any], path: Path) -> None:
         figure = planes.fields(plant, fields[0], fields[1])
         figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")
         return
-    names, axis = grid.components, grid.line
-    figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
+    parts = grid.parts
+    figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(parts)), layout="constrained")
     actuated = 0
-    for i, (ax, name) in enumerate(
-        zip(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names, strict=True)
-    ):
-        own, x = grid.part(i), axis.points
+    every = figure.subplots(len(parts), 1, sharex=not grid.lengths, squeeze=False)[:, 0]
+    for i, (ax, (name, own, axis)) in enumerate(zip(every, parts, strict=True)):
+        x = axis.points
         ax.plot(x, fields[1:, own].T, color="0.7", linewidth=0.8)
         ax.plot(x, fields[0, own], color="0.35", label="initial field: mean, and five drawn")
         ax.plot(x, plant.field_target[own], color="black", linestyle="--", label="target")

@@ -38,10 +38,11 @@ def key_of(frame: Frame) -> Key:
 
 
 @lru_cache(maxsize=16)
-def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
+def rows_of(n_z: int, components: int = 1, lengths: tuple[int, ...] = ()) -> NDArray[np.intp]:
     """Indices of the grid points that are kept of a state.
 
-    They are evenly spaced, at most ROWS in each of the first MAX_COMPONENTS components.
+    They are evenly spaced, at most ROWS in each of the first MAX_COMPONENTS components. Of components
+    of different lengths equally many are kept, so that points of the shorter ones are there twice.
 
     Examples
     --------
@@ -49,7 +50,16 @@ def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
     [0, 1, 2, 3, 4, 5]
     >>> len(rows_of(1000))
     256
+    >>> rows_of(5, 2, (3, 2)).tolist()
+    [0, 1, 2, 3, 3, 4]
     """
+    if lengths:
+        kept, ends = min(max(lengths), ROWS), np.cumsum(lengths)
+        own = [
+            end - n + np.linspace(0, n - 1, kept).round().astype(np.intp)
+            for n, end in list(zip(lengths, ends, strict=True))[:MAX_COMPONENTS]
+        ]
+        return np.concatenate(own)
     n_x = n_z // components
     points = np.linspace(0, n_x - 1, min(n_x, ROWS)).round().astype(np.intp)
     return (n_x * np.arange(min(components, MAX_COMPONENTS))[:, None] + points).ravel()
@@ -88,7 +98,8 @@ class EpisodeSamples:
     horizon
         Steps that are expected; the columns are enough for them.
     grid
-        Of the state, if it is known; it matters on two axes or more.
+        Of the state, if it is known; it matters on two axes or more, or with fields of different
+        lengths.
 
     Attributes
     ----------
@@ -98,6 +109,8 @@ class EpisodeSamples:
         Steps of a column.
     fields, actions
         What was seen, (COLUMNS, rows) and (COLUMNS, n_a); NaN where nothing was.
+    rows
+        Indices in the state of the rows of `fields`.
     z, z_first
         The newest state (n_z,), and the first that was seen.
     plane
@@ -119,16 +132,21 @@ class EpisodeSamples:
     ) -> None:
         self.batch, n_z = frame.values.shape
         self.key, self.environment = key_of(frame), min(environment, self.batch - 1)
+        known = grid is not None and grid.size == n_z
+        lengths = tuple(n for _, n in grid.lengths) if known and grid is not None else ()
         self.components = components if components > 0 and n_z % components == 0 else 1
+        if lengths:
+            self.components = len(lengths)
         self.first = self.last = frame.step
         self.stride = 1
         self._horizon = horizon
         while horizon >= COLUMNS * self.stride:
             self.stride *= 2
-        self.fields = _empty(len(rows_of(n_z, self.components)))
+        self.rows = rows_of(n_z, self.components, lengths)
+        self.fields = _empty(len(self.rows))
         self.actions = _empty(0)
         self.z = self.z_first = np.array(frame.values[self.environment], dtype=np.float64)
-        planar = grid is not None and len(grid.axes) > 1 and grid.size == n_z
+        planar = known and grid is not None and len(grid.axes) > 1
         self._grid = grid if planar else None
         self.plane = plane_of(grid)[1] if planar and grid is not None else None
         self.sample_time = 0.0
@@ -154,7 +172,7 @@ class EpisodeSamples:
         column = self._column(frame.step)
         if frame.step > self.first:
             self.sample_time = (frame.time - self._begun) / (frame.step - self.first)
-        self.fields[column] = z[rows_of(len(z), self.components)]
+        self.fields[column] = z[self.rows]
         if frame.step >= self.last:
             self.last, self.z = frame.step, z
         self.version = next(_VERSIONS)
@@ -181,7 +199,7 @@ class EpisodeSamples:
     def picture(self, z: NDArray[np.float64], component: int) -> NDArray[np.float64]:
         """A state's numbers of a component as they are drawn: a curve, or a plane row by row."""
         if self._grid is None:
-            return z[rows_of(len(z), self.components)[self.part(component)]]
+            return z[self.rows[self.part(component)]]
         return z[self._grid.part(component)][plane_of(self._grid)[0]]
 
     def _column(self, step: int) -> int:

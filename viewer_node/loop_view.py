@@ -19,7 +19,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Grid
 from pdeloop.messages.topics import VOID, CostColumn
-from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
+from viewer_node.episode_samples import EpisodeSamples, Key, key_of
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import LoopNodes
 from viewer_node.operation import Operation
@@ -260,7 +260,7 @@ class LoopView:
         target = self.target_of(shown.key)
         known = np.empty(0)
         if target is not None and target.size == shown.z.size:
-            known = target[rows_of(len(target), shown.components)][part]
+            known = target[shown.rows][part]
         low, high = field_range(seen[:: max(1, seen.size // 20_000)], known)
         size = STEADY * max(high - low, before[1] - before[0])
         same = abs(low - before[0]) <= size and abs(high - before[1]) <= size

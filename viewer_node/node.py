@@ -61,10 +61,12 @@ class ViewerNode:
             horizon=values["horizon"],
             weights=weights,
             curve_from_topics=False,
-            components=self._grid.components,
+            components=[part.name for part in self._grid.parts],
             path=path_of(values),
         )
-        kept = min(len(self._grid.components), MAX_COMPONENTS)
+        if self._grid.lengths:
+            self._view.grid = self._grid
+        kept = min(len(self._grid.parts), MAX_COMPONENTS)
         self._ranges: list[Range] = [(0.0, 1.0)] * kept
         self._coloured = 0.0
         self._diagnostics = ViewerDiagnostics(self._view)

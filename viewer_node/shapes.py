@@ -65,7 +65,7 @@ def shape_of(grid: Grid, state: Array, ranges: Sequence[Range], *, beside: bool 
         return Shape(np.stack([x, state], axis=1))
     if len(grid.axes) > 1:
         return _cells(grid, state, ranges, beside)
-    lines = [np.stack([grid.line.points, values], axis=1) for values in grid.fields(state)]
+    lines = [np.stack([axis.points, state[own]], axis=1) for _, own, axis in grid.parts]
     if len(lines) == 1:
         return Shape(lines[0])
     return Shape(np.concatenate([_pairs(line) for line in lines]), pairs=True)

@@ -6,8 +6,9 @@ from __future__ import annotations
 import json
 import math
 import operator
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,15 @@ class Axis:
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
 
-@dataclass(frozen=True)
+class Part(NamedTuple):
+    """A field of a state: its name, its numbers in the state, and what it is drawn over."""
+
+    name: str
+    numbers: slice
+    axis: Axis
+
+
+@dataclass(frozen=True, init=False)
 class Grid:
     """The layout of a state: one component after the other, each in C order over the axes.
 
@@ -97,14 +106,26 @@ class Grid:
         Unit of the values.
     numbers : int
         Size of a plain vector.
+    lengths : tuple of (str, int)
+        Names and lengths of fields of different lengths, which follow each other in a plain vector;
+        otherwise none.
+    fields : mapping of str to (int, int)
+        As an argument: the first number and the end of each field of a state, as of staggered ones, in
+        place of `components` and `numbers`. Fields of one length are components.
 
     Raises
     ------
     ValueError
-        There are neither axes nor numbers, or both, or no components; or an axis is of another class.
+        There are neither axes nor numbers, or both, or no components; an axis is of another class; or
+        fields overlap, leave a gap or do not fit the axes.
 
     Examples
     --------
+    >>> staggered = Grid(fields={"height": (0, 32), "flow": (32, 63)})
+    >>> staggered.size, [part.name for part in staggered.parts]
+    (63, ['height', 'flow'])
+    >>> Grid(fields={"u": (0, 4), "v": (4, 8)}).components
+    ('u', 'v')
     >>> Grid((Axis("y", 1.0, 21, periodic=False), Axis("x", 2.0, 41, periodic=False)), ("u", "v")).size
     1722
     >>> Grid.vector(4).shape
@@ -115,8 +136,39 @@ class Grid:
     components: tuple[str, ...] = ("u",)
     unit: str = ""
     numbers: int = 0
+    lengths: tuple[tuple[str, int], ...] = field(init=False, default=())
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        axes: Axis | Sequence[Axis] = (),
+        components: str | Sequence[str] = ("u",),
+        unit: str = "",
+        numbers: int = 0,
+        *,
+        fields: Mapping[str, tuple[int, int]] | None = None,
+    ) -> None:
+        lengths: tuple[tuple[str, int], ...] = ()
+        if fields is not None:
+            lengths = _lengths(fields)
+            equal = len({length for _, length in lengths}) == 1
+            if axes and not equal:
+                raise ValueError(
+                    "fields of different lengths have no axes in common: leave them out"
+                )
+            components = [name for name, _ in lengths] if equal else ("z",)
+            numbers = 0 if axes else lengths[0][1] if equal else sum(n for _, n in lengths)
+            lengths = () if equal else lengths
+        given = axes, components, unit, numbers, lengths
+        for name, value in zip(
+            ("axes", "components", "unit", "numbers", "lengths"), given, strict=True
+        ):
+            object.__setattr__(self, name, value)
+        self._check()
+        size = max(end for _, end in fields.values()) if fields else self.size
+        if size != self.size:
+            raise ValueError(f"fields have {size} numbers, but the axes have {self.size}")
+
+    def _check(self) -> None:
         axes = (self.axes,) if isinstance(self.axes, Axis) else tuple(self.axes)
         named = (self.components,) if isinstance(self.components, str) else tuple(self.components)
         object.__setattr__(self, "axes", axes)
@@ -184,7 +236,8 @@ class Grid:
     def text(self) -> str:
         """The text of the parameter; see `parse`."""
         axes = [[a.name, a.length, a.size, a.periodic, a.walls, a.unit] for a in self.axes]
-        return json.dumps([axes, list(self.components), self.unit, self.numbers])
+        parts = [axes, list(self.components), self.unit, self.numbers]
+        return json.dumps([*parts, self.lengths] if self.lengths else parts)
 
     @classmethod
     def parse(cls, text: str) -> Grid:
@@ -210,7 +263,20 @@ class Grid:
         True
         """
         try:
-            axes, components, unit, numbers = parse_json(text)
+            axes, components, unit, numbers, *lengths = parse_json(text)
+            if lengths:
+                (named,) = lengths
+                ends = np.cumsum([int(length) for _, length in named]).tolist()
+                ranges = zip(named, [0, *ends], ends, strict=False)
+                own = {str(name): (begin, end) for (name, _), begin, end in ranges}
+                if (
+                    not ends
+                    or axes
+                    or len(own) != len(named)
+                    or not 0 < ends[-1] == numbers <= MAX_NUMBERS
+                ):
+                    raise ValueError("its fields do not fit its numbers")
+                return cls(unit=str(unit), fields=own)
             grid = cls(
                 tuple(
                     Axis(str(name), float(length), int(size), bool(periodic), bool(walls), str(own))
@@ -273,8 +339,23 @@ class Grid:
         """
         return states.reshape(*states.shape[:-1], len(self.components), *self.shape)
 
+    @property
+    def parts(self) -> list[Part]:
+        """The fields of a state, one after the other: its components, or those of `lengths`."""
+        if not self.lengths:
+            n = self.points
+            return [
+                Part(name, slice(i * n, (i + 1) * n), self.line)
+                for i, name in enumerate(self.components)
+            ]
+        ends = np.cumsum([length for _, length in self.lengths]).tolist()
+        return [
+            Part(name, slice(end - n, end), Axis("number", float(n), n, unit=""))
+            for (name, n), end in zip(self.lengths, ends, strict=True)
+        ]
+
     def part(self, component: int) -> slice:
-        """The slice of a component in a state.
+        """The slice of a component, or of a field of another length than others, in a state.
 
         Parameters
         ----------
@@ -285,7 +366,7 @@ class Grid:
         -------
         slice
         """
-        return slice(component * self.points, (component + 1) * self.points)
+        return self.parts[component].numbers
 
     def equally_spaced(self, count: int) -> NDArray[np.int64]:
         """Indices, within a component, of points that are equally spaced over the grid.
@@ -362,6 +443,32 @@ class Grid:
             return max(distances) / min(distances)
 
         return min(found, key=unequal)
+
+
+def _lengths(fields: Mapping[str, tuple[int, int]]) -> tuple[tuple[str, int], ...]:
+    """Names and lengths of fields in the order of their numbers; ValueError unless they are a state."""
+    ranges = []
+    for name, ends in fields.items():
+        try:
+            begin, after = (operator.index(number) for number in ends)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"the field {shown(name)} must have two whole numbers, its first and its end, got "
+                f"{shown(ends)}"
+            ) from None
+        ranges.append((begin, after, str(name)))
+    found, end = list[tuple[str, int]](), 0
+    for begin, after, name in sorted(ranges):
+        if begin != end or after <= begin:
+            raise ValueError(
+                f"the field {shown(name)} must begin at {end} and end after it, as fields neither "
+                f"overlap nor leave a gap, got {begin} to {after}"
+            )
+        found.append((name, after - begin))
+        end = after
+    if not found:
+        raise ValueError("a state must have at least one field, got none")
+    return tuple(found)
 
 
 def axes_of(text: str) -> tuple[int, ...]:

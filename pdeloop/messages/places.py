@@ -57,20 +57,24 @@ def boxes_of(grid: Grid, supports: Array) -> list[Box]:
     ((-1.5, 0.5),)
     ((0.5, 2.5),)
     """
-    axes = grid.axes or (grid.line,)
-    found = []
+    parts, found = grid.parts, []
     for support in np.abs(supports[:, :MOST]).T:
         largest = float(support.max())
         if not 0.0 < largest < math.inf:
             continue
-        fields = grid.fields(support)
-        component = int(np.unravel_index(int(support.argmax()), fields.shape)[0])
-        inside = fields[component] >= 0.5 * largest
+        at = int(support.argmax())
+        component = next(i for i, part in enumerate(parts) if at < part.numbers.stop)
+        _, own, line = parts[component]
+        axes: tuple[Axis, ...] = (line,)
+        field = support[own]
+        if len(grid.axes) > 1:
+            axes, field = grid.axes, field.reshape(grid.shape)
+        inside = field >= 0.5 * largest
         others = [
             tuple(d for d in range(inside.ndim) if d != direction)
             for direction in range(inside.ndim)
         ]
-        sides = [_side(a, inside.any(axis=own)) for a, own in zip(axes, others, strict=True)]
+        sides = [_side(a, inside.any(axis=rest)) for a, rest in zip(axes, others, strict=True)]
         found.append(Box(component, tuple(sides)))
     return found
 

@@ -232,7 +232,7 @@ def component_names(values: Mapping[str, Any]) -> list[str]:
         return ["y", *(f"y {k} ago" for k in range(1, count))]
     if values.get("grid"):
         with contextlib.suppress(ValueError):
-            return list(Grid.parse(str(values["grid"])).components)
+            return [part.name for part in Grid.parse(str(values["grid"])).parts]
     equation = EQUATIONS.get(str(values.get("equation")))
     return ["u"] if equation is None else list(equation.components)
 

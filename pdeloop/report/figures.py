@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.grid import Part
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.order import OrderStudy
 from pdeloop.report import planes
@@ -29,9 +30,9 @@ def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: the fields in space and time, the actions, the final profiles."""
     if len(problem.plant.grid.axes) > 1:
         return planes.behaviour(problem)
-    shown, components = problem.behaviours, problem.plant.grid.components
+    shown, parts = problem.behaviours, problem.plant.grid.parts
     plant, moving = problem.plant, moving_target(problem.plant)
-    count, fields = len(shown) + (moving is not None), len(components)
+    count, fields = len(shown) + (moving is not None), len(parts)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
         2 * fields + 1,
@@ -63,10 +64,9 @@ def behaviour(problem: ProblemData) -> Figure:
         grid[0, -1].set_title("target")
         for ax in grid[fields:, -1]:
             ax.set_axis_off()
-    for i, name in enumerate(components):
-        own = problem.plant.grid.part(i)
-        _maps(figure, problem, own, grid[i], name, float(times[-1]))
-        _profiles(problem, i, grid[fields + 1 + i, : len(shown)].tolist(), name)
+    for i, part in enumerate(parts):
+        _maps(figure, problem, part, grid[i], float(times[-1]))
+        _profiles(problem, i, grid[fields + 1 + i, : len(shown)].tolist())
     figure.legend(
         *grid[fields + 1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3
     )
@@ -74,11 +74,12 @@ def behaviour(problem: ProblemData) -> Figure:
 
 
 def _maps(
-    figure: Figure, problem: ProblemData, own: slice, axes: Sequence[Axes], name: str, end: float
+    figure: Figure, problem: ProblemData, part: Part, axes: Sequence[Axes], end: float
 ) -> None:
-    """A component of the state in space and time."""
+    """A field of the state in space and time."""
+    name, own, axis = part
     fields = [b.states[:, own] for b in problem.behaviours]
-    target, axis = problem.plant.field_target[own], problem.plant.grid.line
+    target = problem.plant.field_target[own]
     moving = moving_target(problem.plant)
     low, high = field_range(np.stack(fields), target if moving is None else moving[:, own])
     fields += [] if moving is None else [moving[:, own]]
@@ -93,10 +94,10 @@ def _maps(
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
-def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes], name: str) -> None:
+def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes]) -> None:
     """Its initial and final profiles, the target, and where actuators act and sensors measure."""
-    own = problem.plant.grid.part(component)
-    axis, moving = problem.plant.grid.line, moving_target(problem.plant)
+    name, own, axis = problem.plant.grid.parts[component]
+    moving = moving_target(problem.plant)
     target = problem.plant.field_target[own] if moving is None else moving[-1, own]
     for ax, b in zip(axes, problem.behaviours, strict=True):
         mark_places(ax, problem.plant, component)

@@ -34,7 +34,10 @@ def mark_places(ax: Axes, plant: Plant, component: int) -> None:
     if len(plant.grid.axes) > 1:
         _on_a_plane(ax, plant.grid, supports, points)
         return
-    x, below = plant.grid.line.points, ax.get_xaxis_transform()
+    _, own, axis = plant.grid.parts[component]
+    x, below = axis.points, ax.get_xaxis_transform()
+    if plant.grid.lengths:
+        points = points[(points >= own.start) & (points < own.stop)] - own.start
     for j, support in enumerate([] if supports is None else supports.T):
         if support.any():
             height, grey = HEIGHT * support / support.max(), ("0.55", "0.75")[j % 2]

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from pdeloop.messages.grid import Axis, Grid
+from pdeloop.messages.places import boxes_of
 
 
 def test_the_points_of_an_axis_are_on_a_circle_on_walls_or_in_cells() -> None:
@@ -32,6 +35,52 @@ def test_a_plain_vector_has_no_axes() -> None:
     grid = Grid.vector(5)
     assert (grid.shape, grid.size, grid.axes, grid.is_circle) == ((5,), 5, (), False)
     assert grid.equally_spaced(2).tolist() == [1, 3]
+
+
+def test_fields_of_different_lengths_follow_each_other_in_a_vector() -> None:
+    grid = Grid(fields={"flow": (3, 5), "height": (0, 3)})
+    assert (grid.shape, grid.size, grid.axes, grid.is_circle) == ((5,), 5, (), False)
+    z = np.arange(5.0)
+    found = {part.name: (z[part.numbers].tolist(), part.axis.size) for part in grid.parts}
+    assert found == {"height": ([0.0, 1.0, 2.0], 3), "flow": ([3.0, 4.0], 2)}
+    assert list(found) == ["height", "flow"] and grid.part(1) == slice(3, 5)
+    assert Grid.parse(grid.text) == grid != Grid.vector(5)
+    boxes = boxes_of(grid, np.eye(5)[:, [1, 4]])
+    assert [(box.component, box.sides) for box in boxes] == [(0, ((0.5, 1.5),)), (1, ((0.5, 1.5),))]
+
+
+def test_fields_of_one_length_are_components() -> None:
+    fields, axis = {"u": (0, 4), "v": (4, 8)}, Axis("x", 2.0, 4)
+    assert Grid(fields=fields) == Grid((), ("u", "v"), numbers=4)
+    assert Grid(axis, fields=fields) == Grid(axis, ("u", "v"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"a": (0, 3), "b": (2, 5)}, "'b' must begin at 3 .* got 2 to 5"),
+        ({"a": (0, 3), "b": (4, 5)}, "'b' must begin at 3 .* nor leave a gap, got 4 to 5"),
+        ({"a": (1, 3)}, "'a' must begin at 0"),
+        ({"a": (0, 0)}, "end after it"),
+        ({"a": (0, 2.5)}, "two whole numbers, its first and its end"),
+        ({"a": 3}, "two whole numbers"),
+        ({}, "at least one field, got none"),
+    ],
+)
+def test_fields_that_are_no_state_are_refused(fields: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Grid(fields=fields)
+
+
+def test_fields_that_do_not_fit_the_axes_are_refused() -> None:
+    with pytest.raises(ValueError, match="fields have 8 numbers, but the axes have 6"):
+        Grid(Axis("x", 1.0, 3), fields={"u": (0, 4), "v": (4, 8)})
+    with pytest.raises(ValueError, match="different lengths have no axes in common"):
+        Grid(Axis("x", 1.0, 3), fields={"u": (0, 3), "v": (3, 5)})
+    whole = Grid(fields={"u": (0, 3), "v": (3, 5)}).text
+    for wrong in (whole.replace("5", "6"), whole.replace('["u", 3], ["v", 2]', "")):
+        with pytest.raises(ValueError, match="does not describe a grid: its fields do not fit"):
+            Grid.parse(wrong)
 
 
 def test_places_on_two_axes_are_as_far_apart_along_both() -> None:

@@ -62,7 +62,12 @@ def test_a_batch_draws_each_of_its_environments() -> None:
 
 @pytest.mark.parametrize(
     "grid",
-    [Grid.vector(6), Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))), Grid.interval(1.0, 3, "uv")],
+    [
+        Grid.vector(6),
+        Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))),
+        Grid.interval(1.0, 3, "uv"),
+        Grid(fields={"u": (0, 4), "v": (4, 6)}),
+    ],
 )
 def test_states_of_any_grid_are_drawn(grid: Grid) -> None:
     class Any6(pdeloop.Dynamics):

@@ -13,12 +13,13 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+import pdeloop
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.colour_scale import DARK
 from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.method.reduce.order import study_orders
 from pdeloop.report.dark import BACK, INK, darken
-from pdeloop.report.data import gather
+from pdeloop.report.data import gather, of_run
 from pdeloop.report.learning import bars
 from pdeloop.report.style import FIELD_MAP, STYLE
 from tests.support.small import SMALL, parameters
@@ -73,6 +74,42 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
     # the actions of eight actuators are a picture with a colour bar.
     maps = re.findall(r'<g id="axes_\d+">', svg)
     assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2 + 1
+
+
+class Canal(pdeloop.Dynamics):
+    """Depths in five reaches, and flows over the edges between."""
+
+    grid = pdeloop.Grid(fields={"depth": (0, 5), "flow": (5, 9)})
+    n_a, horizon, target = 1, 6, (1.0, 2.0, 3.0, 4.0, 5.0, *4 * (0.0,))
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(9)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        inflow = np.r_[a, z[5:]] - np.r_[z[5:], 0.0]
+        return np.r_[z[:5] + 0.1 * inflow, 0.9 * z[5:] - 0.1 * np.diff(z[:5])]
+
+
+def test_fields_of_different_lengths_are_each_a_profile_of_their_own(tmp_path):
+    from pdeloop.data_sets import measured_names
+    from pdeloop.report.figures import behaviour
+
+    quick = {"optimizer": "two_point", "rollouts": 5, "evaluation_fields": 1, "reduced_order": 3}
+    run = pdeloop.train(plant=Canal(), **quick)
+    plant = pdeloop.problem(plant=Canal()).plant()
+    episode = pdeloop.rollout(plant, run.law(), [0])
+    depth, flow, *_ = pdeloop.plot_episode(plant, episode).axes
+    for ax, own in ((depth, slice(0, 5)), (flow, slice(5, 9))):
+        np.testing.assert_array_equal(ax.images[0].get_array(), episode.fields[:, 0, own].T)
+    figure = behaviour(of_run(run))
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    for name, own in (("depth", slice(0, 5)), ("flow", slice(5, 9))):
+        (at,) = (i for i, label in enumerate(labels) if label == f"{name}(x, T)")
+        curves = {line.get_label(): line.get_ydata() for line in figure.axes[at].lines}
+        np.testing.assert_array_equal(curves["target"], Canal.target[own])
+        assert f"{name}(x, t)" in labels
+    names = [*(f"depth{i}" for i in range(1, 6)), *(f"flow{i}" for i in range(1, 5))]
+    assert measured_names(run, 9) == names
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])

@@ -13,6 +13,7 @@ import pytest
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.grid import Axis, Grid
 from pdeloop.messages.places import Box, text_of
+from pdeloop.monitor.node import component_names
 from tests.support.viewed import frame, state
 from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, axes_of, bounds_of, path_of, places_of
@@ -82,6 +83,22 @@ def test_a_field_on_two_axes_is_sent_as_it_is_now_and_was_at_first():
     np.testing.assert_array_equal(first[:, :, [0, -1]], grid.fields(z)[:, :, [0, -1]])
     np.testing.assert_array_equal(np.diff(first[..., 0]), [[200.0], [200.0]])
     np.testing.assert_array_equal(parts["target"][1][:384], -first.ravel())
+
+
+def test_fields_of_different_lengths_have_a_panel_each():
+    grid, page, sent = Grid(fields={"depth": (0, 3), "flow": (3, 5)}), Page(), {}
+    page.take_parameters({"grid": grid.text, "actuators": "[]"})
+    view, z = page.view, np.arange(5.0)
+    view.components = component_names({"grid": grid.text})
+    assert view.components == ["depth", "flow"]
+    view.target(frame(-z), 0.0)
+    view.state(frame([z]), 0.0)
+    page.refresh(0.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    header, numbers = parts["episode"]
+    assert header["panels"] == [0, 1] and header["rows"] == 3
+    np.testing.assert_array_equal(numbers[:6], [0, 1, 2, 3, 3, 4])
+    np.testing.assert_array_equal(parts["target"][1][:6], [0, -1, -2, -3, -3, -4])
 
 
 def test_the_target_is_there_before_the_first_state():

@@ -29,7 +29,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
 from pdeloop.messages.places import parse
-from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
+from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples
 from viewer_node.loop_view import SILENT, LoopView, path_of
 from viewer_node.operation import Call
 
@@ -309,7 +309,7 @@ class Page:
         panels = self._of_shown(shown)
         z_r = np.empty(0)
         if target is not None and target.size == shown.z.size:
-            rows = target[rows_of(len(target), shown.components)]
+            rows = target[shown.rows]
             z_r = np.concatenate(
                 [shown.picture(target, i) for i in panels] + [rows[shown.part(i)] for i in panels]
             )
@@ -321,7 +321,7 @@ class Page:
         panels, last = self._of_shown(shown), len(self.view.path) - 1
         end = max(self.view.horizon, shown.last, 1)
         steps = np.minimum(np.arange(shown.first, end + 1, shown.stride), last)
-        rows = self.view.path[:, rows_of(shown.z.size, shown.components)][steps]
+        rows = self.view.path[:, shown.rows][steps]
         own = np.stack([rows[:, shown.part(i)] for i in panels], axis=1)
         header = {"part": "path", "columns": len(steps), "begin": shown.first}
         return _pack({**header, "stride": shown.stride, "panels": panels}, own.ravel())
