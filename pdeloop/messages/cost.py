@@ -193,6 +193,14 @@ class Cost:
         return np.broadcast_to(scaled, (self.horizon, scaled.shape[1]))
 
     @property
+    def state_weights(self) -> Array | None:
+        """W with (y - y_r)^T Q (y - y_r) = |W (z - z_r)|^2, (n_r, n_z), or its diagonal, (n_z,).
+
+        None where it is a multiple of the identity, or where states cost nothing before the last one.
+        """
+        return self._state.factor
+
+    @property
     def action_matrix(self) -> Array:
         """R, (n_a, n_a)."""
         return _matrix(self.action_weight, self.n_a)
@@ -257,6 +265,12 @@ class _Square:
             self._E = self.scaled(output.T).T if weight.ndim < 2 else self._root @ output
         elif weight.ndim == 2:
             self._E = self._root
+
+    @property
+    def factor(self) -> Array | None:
+        """E, or its diagonal; None for a multiple of the identity, or zero."""
+        found = self._root if self._E is None else self._E
+        return found if found.ndim and found.any() else None
 
     def scaled(self, values: Array) -> Array:
         """W times the rows of values (..., n_y)."""

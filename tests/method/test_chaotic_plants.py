@@ -62,7 +62,9 @@ def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_the
     trajectory = Trajectory(records[0].states, records[0].actions)
     context = Context(np.eye(12)[:, :1], np.zeros(12), 1.0, 1.0, 80, trajectory)
 
-    def judged(known: Context, own: Any, first: str = "", parts: int = 1) -> Belief:
+    def judged(
+        known: Context, own: Any, first: str = "", parts: int = 1, most: float = np.inf
+    ) -> Belief:
         rollouts = [belief._measured(known, record) for record in own]
         if parts > 1:
             rollouts = [part for rollout in rollouts for part in belief.pieces(rollout, parts)]

@@ -194,6 +194,11 @@ class Context:
         """The exploration of the reduced model first."""
         return (self.exploration, *self.further)
 
+    @property
+    def weights(self) -> Array | None:
+        """W of the state's part |W (z - z_r)|^2 of the cost; None: a multiple of the identity."""
+        return None if self.cost is None else self.cost.state_weights
+
     def actuators(self, n_a: int) -> Actuators:
         """What is declared of the n_a actuators."""
         centres = np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)

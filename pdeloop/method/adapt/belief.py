@@ -121,7 +121,11 @@ class Belief:
 
 
 def believe(
-    context: Context, records: Sequence[Record], first: str = "", parts: int = 1
+    context: Context,
+    records: Sequence[Record],
+    first: str = "",
+    parts: int = 1,
+    most: float = np.inf,
 ) -> Belief | None:
     """The model that predicts the rollouts best, or None where none can be fitted.
 
@@ -135,6 +139,8 @@ def believe(
         The kind that is tried first, the one selected before; empty: none.
     parts : int
         Pieces of equal length that are predicted in place of a rollout.
+    most : float
+        Largest E with which a model is used.
     """
     if _reads(context):
         return _of_readings(context, records)
@@ -150,6 +156,8 @@ def believe(
         first=first,
         line=context.line,
         shape=context.shape,
+        weights=context.weights,
+        most=most,
     )
     if found is None:
         return None
@@ -176,11 +184,10 @@ def also_in_pieces(
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
     parts = [part for rollout in rollouts for part in pieces(rollout, _PIECES)]
     # What it was fitted to is predicted better than what it was not, and takes no other fit.
-    worst = context.field_models.worst
-    known = errors(whole.model, parts, context.target, worst, context.noise)
+    known = _errors(context, whole.model, parts)
     if not (len(known) and known.mean() <= most):
         return whole
-    found = believe(context, records, whole.model.kind, _PIECES)
+    found = believe(context, records, whole.model.kind, _PIECES, most)
     return replace(found, whole=False) if found and found.error <= most else whole
 
 
@@ -228,6 +235,12 @@ def also_around(
     return found if found and _predicts_others(context, near, found, settings) else belief
 
 
+def _errors(context: Context, model: FieldModel, rollouts: Sequence[Measured]) -> Array:
+    """E of each rollout."""
+    worst = context.field_models.worst
+    return errors(model, rollouts, context.target, worst, context.noise, context.weights)
+
+
 def _predicts_others(
     context: Context, records: Sequence[Record], belief: Belief, settings: ImprovementSettings
 ) -> bool:
@@ -237,7 +250,7 @@ def _predicts_others(
         if len(record.actions):
             rollout = limited(_measured(context, record), context.action_set)
             groups.setdefault(record.policy.tobytes(), []).append(rollout)
-    worst, found = context.field_models.worst, []
+    found = []
     for group in groups:
         others = [rollout for name in groups if name != group for rollout in groups[name]]
         model = others and fit_kind(
@@ -250,7 +263,7 @@ def _predicts_others(
         )
         if not model:
             return False
-        found.append(errors(model, groups[group], context.target, worst, context.noise).mean())
+        found.append(_errors(context, model, groups[group]).mean())
     return bool(np.mean(found) <= largest_error(context, settings))
 
 
@@ -264,8 +277,9 @@ def _of_parts(
     """The model of the beginnings `near` of rollouts, if it predicts them; else `belief`."""
     if sum(len(record.states) for record in records) == sum(len(own.states) for own in near):
         return belief
-    found = believe(context, [own for own in near if len(own.actions)])
-    return found if found and found.error <= largest_error(context, settings) else belief
+    most = largest_error(context, settings)
+    found = believe(context, [own for own in near if len(own.actions)], most=most)
+    return found if found and found.error <= most else belief
 
 
 def _reads(context: Context) -> bool:

@@ -391,7 +391,8 @@ class ModelBased(Optimizer):
         """The model that predicts the rollouts; the kind selected before is tried first."""
         before = self._progress.belief
         kind = "" if before is None else before.model.kind
-        return believe(self._context, self._measurements(), kind)
+        most = largest_error(self._context, self._settings)
+        return believe(self._context, self._measurements(), kind, 1, most)
 
     def _take_noise(self, noise: float) -> None:
         """Go on as if this measurement noise had been declared; 0: it was as declared."""

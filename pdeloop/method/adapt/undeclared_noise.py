@@ -36,5 +36,6 @@ def believe_in_noise(
         better_than=np.inf if declared else error,
         declared=declared,
         action_set=context.action_set,
+        weights=context.weights,
     )
     return None if found is None else (Belief(found[0].model, found[0].error, 1), found[1])

@@ -22,13 +22,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Measured, Samples, saturated
 from pdeloop.method.models.denoising import cleaned_states
 from pdeloop.method.models.kinds import Kind, kinds_of
-from pdeloop.method.models.prediction import (
-    errors,
-    one_step,
-    pieces,
-    predicted,
-    usable,
-)
+from pdeloop.method.models.noise_level import share_of_noise
+from pdeloop.method.models.prediction import errors, one_step, pieces, predicted, usable
 from pdeloop.method.models.settings import DEFAULTS, REPRODUCED_NOISY, FieldModelSettings
 from pdeloop.process.one_thread import one_thread
 
@@ -99,6 +94,8 @@ def fit_field_model(
     knows_noise: bool = False,
     scale: Scale | None = None,
     by_scale: bool = False,
+    weights: Array | None = None,
+    most: float = np.inf,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -129,13 +126,17 @@ def fit_field_model(
         Of the errors `own` of the result, always of rollouts or pieces that it was not fitted to.
     by_scale : bool
         Whether E is relative to this scale instead of the distance to the target.
+    weights : (n_z,) or (n, n_z) array, optional
+        W of E (`prediction.errors`), in which the numbers of a state count as in the cost.
+    most : float
+        Largest E with which a model is used: one of fewer unknowns is no better than others above it.
     """
     rollouts = [limited(rollout, action_set) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
     if noise:
         rollouts = with_clean(rollouts, noise, components, line=line)
-        enough = _GROWN * _share_of_noise(rollouts, target, noise)
+        enough = _GROWN * share_of_noise(noise, [r.states for r in rollouts], target, weights)
         enough = min(enough, REPRODUCED_NOISY)
         settings = replace(settings, reproduced=max(settings.reproduced, enough))
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
@@ -149,7 +150,7 @@ def fit_field_model(
             least = min(judged.values(), default=np.inf)
             if not least > kind.needed:
                 continue
-            found = _error(kind, rollouts, target, settings, least, noise, scale)
+            found = _error(kind, rollouts, target, settings, least, noise, scale, weights)
             if found is not None:
                 error, own[kind] = found
                 error = own[kind].simulated if by_scale else error
@@ -158,7 +159,8 @@ def fit_field_model(
                     break
         if not judged:
             return None
-        near = settings.better * min(judged.values())
+        least = min(judged.values())
+        near = min(settings.better * least, max(least, most))
         good = [
             kind
             for kind, error in judged.items()
@@ -169,7 +171,7 @@ def fit_field_model(
             if model is not None:
                 if scale and len(rollouts) == 1 and not kind.unknowns[0]:
                     cut = pieces(rollouts[0], settings.folds)
-                    held = _error(kind, cut, target, settings, np.inf, noise, scale)
+                    held = _error(kind, cut, target, settings, np.inf, noise, scale, weights)
                     own[kind] = held[1] if held else UNKNOWN
                 seen = [(kind.name, error) for kind, error in judged.items()]
                 return FittedModel(model, judged[kind], seen, own[kind])
@@ -194,14 +196,6 @@ def fit_kind(
         return _fitted(kinds[name], rollouts, noise)
 
 
-def _share_of_noise(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
-    """Variance of noise over that of z - z_r."""
-    sums = np.zeros(2)
-    for rollout in usable(rollouts):
-        sums += rollout.states.size * noise**2, np.sum((rollout.states - target) ** 2)
-    return float(sums[0] / sums[1]) if sums[1] else np.inf
-
-
 def with_clean(
     rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
 ) -> list[Measured]:
@@ -219,6 +213,7 @@ def _error(
     least: float,
     noise: float,
     scale: Scale | None,
+    weights: Array | None,
 ) -> tuple[float, Accuracy] | None:
     """E of a kind, its mean over the rollouts, and its accuracy on a scale if there is one.
 
@@ -237,7 +232,7 @@ def _error(
             return None
         own = usable(own)
         parts.append((model, own, predicted(model, own)))
-        found += errors(model, own, target, settings.worst, noise, None, parts[-1][2]).tolist()
+        found += errors(model, own, target, settings.worst, noise, weights, parts[-1][2]).tolist()
         if found and np.mean(found) > _HOPELESS * max(least, settings.reproduced):
             break
     if not found:
@@ -265,7 +260,8 @@ def accuracy_of(
     """The accuracy of models, each with rollouts to judge it by and what it predicts of them."""
     found, sums = list[float](), np.zeros(2)
     for model, own, simulated in parts:
-        found += errors(model, own, scale.reference, worst, noise, scale.units, simulated).tolist()
+        own_weights = 1.0 / scale.units
+        found += errors(model, own, scale.reference, worst, noise, own_weights, simulated).tolist()
         sums += one_step(model, own, scale.units)
     with np.errstate(all="ignore"):
         return Accuracy(float(np.mean(found)), float(np.sqrt(sums[0] / sums[1])))

@@ -23,6 +23,7 @@ import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.models.prediction import weighing
 from pdeloop.method.models.settings import NOISE_MISJUDGED
 from pdeloop.method.models.whiteness import correlations
 
@@ -62,13 +63,23 @@ def contradicting_noise(trajectories: Sequence[Array], declared: float) -> float
     return most if declared > NOISE_MISJUDGED * most else 0.0
 
 
-def share_of_noise(noise: float, trajectories: Sequence[Array], target: Array) -> float:
-    """The part of sum |z - z_r|^2 over measured states that noise of this size is.
+def share_of_noise(
+    noise: float,
+    trajectories: Sequence[Array],
+    target: Array,
+    weights: Array | None = None,
+) -> float:
+    """The part of sum |W (z - z_r)|^2 over measured states that noise of this size is.
 
     Nothing predicts it, so that a model without noise that has a smaller E says that there is none.
+
+    weights: W, as for `prediction.errors`.
     """
-    size = np.mean([np.mean((z - target) ** 2) for z in trajectories if np.isfinite(z).all()])
-    return float(noise**2 / max(size, 1e-300))
+    seen = weighing(weights)
+    own = target.size if weights is None else float(np.sum(weights**2))
+    known = [z for z in trajectories if np.isfinite(z).all()]
+    size = float(np.mean([np.sum(seen(z - target) ** 2) / len(z) for z in known]))
+    return float(noise**2 * own / max(size, 1e-300))
 
 
 def rows_of(states: Array, shape: Sequence[int]) -> list[Array]:

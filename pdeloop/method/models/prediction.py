@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -46,13 +46,13 @@ def errors(
     target: Array,
     worst: float,
     noise: float = 0.0,
-    units: Array | None = None,
+    weights: Array | None = None,
     simulated: Sequence[Array] | None = None,
 ) -> Array:
-    """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
+    """E = sum |W error|^2 / sum |W (z - z_r)|^2 of each rollout, at most `worst`.
 
-    Both sums are of the numbers of a state in `units` (n_z,), if there are any. simulated: what the
-    model predicts, if it is known.
+    weights: W, a matrix (n, n_z) or its diagonal (n_z,); None: the identity. simulated: what the model
+    predicts, if it is known.
 
     Of a rollout that ends in values that are not finite, those before count; one without two finite
     states is left out. The expected contribution of measurement noise is subtracted from both sums, as
@@ -61,19 +61,26 @@ def errors(
     kept = usable(rollouts)
     simulated = predicted(model, kept) if simulated is None else simulated
     found = np.full(len(kept), float(worst))
-    own = 1.0 if units is None else units
-    variance = noise**2 * float(np.mean(1.0 / np.square(own)))
+    seen = weighing(weights)
+    share = noise**2 * (target.size if weights is None else float(np.sum(weights**2)))
     for i, (rollout, states) in enumerate(zip(kept, simulated, strict=True)):
         if len(states) == len(rollout.states):
             with np.errstate(all="ignore"):
-                error = float(np.sum(((states - rollout.states) / own) ** 2))
-                size = float(np.sum(((rollout.states - target) / own) ** 2))
+                error = float(np.sum(seen(states - rollout.states) ** 2))
+                size = float(np.sum(seen(rollout.states - target) ** 2))
                 if noise:
-                    share = variance * states.size
-                    error, size = max(error - share, 0.0), max(size - share, share)
+                    noisy = share * len(states)
+                    error, size = max(error - noisy, 0.0), max(size - noisy, noisy)
                 relative = np.divide(error, size)
             found[i] = min(worst, float(np.nan_to_num(relative, nan=worst)))
     return found
+
+
+def weighing(weights: Array | None) -> Callable[[Array], Array]:
+    """x -> W x of rows x (..., n_z); weights: as for `errors`."""
+    if weights is None:
+        return lambda values: values
+    return lambda values: values * weights if weights.ndim == 1 else values @ weights.T
 
 
 def one_step(model: FieldModel, rollouts: Sequence[Measured], units: Array) -> Array:

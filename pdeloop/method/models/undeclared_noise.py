@@ -55,6 +55,7 @@ def fit_undeclared_noise(
     better_than: float = np.inf,
     declared: float = 0.0,
     action_set: ActionSet = ANY_ACTION,
+    weights: Array | None = None,
 ) -> tuple[FittedModel, float] | None:
     """An equation fitted for measurement noise, and the noise; None where there is no such noise.
 
@@ -75,6 +76,8 @@ def fit_undeclared_noise(
         large, or as small.
     action_set : ActionSet
         Admissible actions, the nearest of which is applied.
+    weights : array, optional
+        As for `fit_field_model`.
     """
     states = [np.asarray(rollout.states) for rollout in rollouts]
     noise = noise_level(states)
@@ -82,7 +85,7 @@ def fit_undeclared_noise(
     if (
         not noise
         or not misjudged
-        or better_than < PREDICTED * share_of_noise(noise, states, target)
+        or better_than < PREDICTED * share_of_noise(noise, states, target, weights)
     ):
         return None
     found = fit_field_model(
@@ -92,6 +95,7 @@ def fit_undeclared_noise(
         noise=noise,
         action_set=action_set,
         knows_noise=True,
+        weights=weights,
     )
     if found is None or found.error > most or not found.error < better_than:
         return None

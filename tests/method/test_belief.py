@@ -1,0 +1,65 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models are chosen by what the cost sees of their errors."""
+
+import numpy as np
+import pytest
+
+from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt.base import Context, Record, Trajectory
+from pdeloop.method.adapt.belief import believe
+from pdeloop.method.models import Measured
+from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.prediction import errors
+
+N_Z, N_A, STEPS = 9, 2, 40
+
+
+def rooms(rng: np.random.Generator, level: float) -> list[Record]:
+    """Rollouts of eight states x' = A x + B a, and of a pressure that hardly moves from a level."""
+    A = np.diag(rng.uniform(0.6, 0.95, 8)) + 0.05 * rng.standard_normal((8, 8))
+    B = rng.standard_normal((8, N_A))
+    records = []
+    for _ in range(6):
+        z, actions = [np.append(rng.standard_normal(8), level)], rng.standard_normal((STEPS, N_A))
+        for a in actions:
+            z.append(np.append(A @ z[-1][:8] + B @ a, level + 0.1 * np.tanh(z[-1][0])))
+        records.append(Record(np.zeros((N_A, 2)), np.inf, np.array(z), actions))
+    return records
+
+
+@pytest.mark.parametrize("level", [0.0, 1e5])
+def test_numbers_that_cost_nothing_have_no_say_in_the_choice_of_a_model(level: float) -> None:
+    records = rooms(np.random.default_rng(0), level)
+    cost = Cost(N_Z, N_A, STEPS, state_weight=np.append(np.ones(8), 0.0))
+    known = [Trajectory(record.states, record.actions) for record in records]
+    context = Context(
+        np.eye(N_Z)[:, :1], np.zeros(N_Z), 1.0, 1.0, STEPS, known[0], further=known[1:], cost=cost
+    )
+    belief = believe(context, records)
+    assert belief is not None
+    assert belief.error < 1e-3
+    before, after = (np.concatenate([own.states[i:][:STEPS] for own in records]) for i in (0, 1))
+    actions = np.concatenate([own.actions for own in records])
+    missed = belief.model.step(before, actions) - after
+    change = after - before
+    assert np.sum(missed[:, :8] ** 2) < 1e-4 * np.sum(change[:, :8] ** 2)
+
+
+def test_errors_are_the_same_in_other_units() -> None:
+    """Q in other units is that of the same cost."""
+    rng = np.random.default_rng(1)
+    model = LinearModel("linear", 0.5 * np.eye(2), np.ones((2, 1)), np.zeros(2))
+    rollout = Measured(rng.standard_normal((6, 2)), rng.standard_normal((5, 1)))
+    units = np.array([1e3, 1e-1])
+    other = LinearModel("linear", 0.5 * np.eye(2), units[:, None] * model.B, np.zeros(2))
+    moved = Measured(rollout.states * units, rollout.actions)
+    target, q = np.array([0.3, -0.2]), np.array([2.0, 5.0])
+    expected = errors(model, [rollout], target, 9.0, weights=np.sqrt(q))
+    for weight in (q / units**2, np.diag(q / units**2)):
+        cost = Cost(2, 1, 5, state_weight=weight)
+        found = errors(other, [moved], target * units, 9.0, weights=cost.state_weights)
+        assert found == pytest.approx(expected, rel=1e-9)
+    output = Cost(2, 1, 5, output=np.sqrt(q) / units * np.eye(2))
+    found = errors(other, [moved], target * units, 9.0, weights=output.state_weights)
+    assert found == pytest.approx(expected, rel=1e-9)
+    assert Cost(2, 1, 5, state_weight=4.0).state_weights is None
