@@ -15,7 +15,9 @@ from benchmarks.families import equations, plants
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models.base import Samples
 from pdeloop.method.models.kinds import NEAR_RIDGES, kinds_of
+from pdeloop.method.models.linear import fit_linear
 from pdeloop.method.models.prediction import errors
 from tests.support.plants import plant_of
 
@@ -236,3 +238,22 @@ def test_kinds_for_large_states_have_no_matrix_of_their_size():
     near = {prefix + name for prefix in ("", "two-") for name in NEAR_RIDGES}
     assert small - large == {"linear", "linear1e-4", "two-convolution"} | near
     assert "convolution" not in {kind.name for kind in kinds_of(514, 2, settings)}
+
+
+def test_an_offset_changes_no_linear_model() -> None:
+    """Kelvin and degrees Celsius: what a ridge holds at zero is no offset of the data."""
+    rng = np.random.default_rng(11)
+    A, B = 0.95 * np.eye(3) + 0.02 * rng.standard_normal((3, 3)), 0.3 * rng.standard_normal((3, 2))
+    z, actions = [rng.standard_normal(3)], 0.5 + 0.2 * rng.standard_normal((80, 2))
+    for a in actions:
+        z.append(A @ z[-1] + B @ a)
+    states = np.array(z)
+    celsius, kelvin = (
+        fit_linear(Samples.of([Measured(own, actions)]), kind="linear", ridge=1e-4)
+        for own in (states, states + 273.15)
+    )
+    assert celsius is not None and kelvin is not None
+    np.testing.assert_allclose(kelvin.A, celsius.A, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(kelvin.B, celsius.B, rtol=1e-6, atol=1e-9)
+    moved = kelvin.step(states[:1] + 273.15, actions[:1]) - 273.15
+    np.testing.assert_allclose(moved, celsius.step(states[:1], actions[:1]), atol=1e-9)

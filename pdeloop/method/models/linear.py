@@ -84,23 +84,25 @@ def add_products(rows: Array, matrix: Array, totals: Array) -> None:
 
 
 def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | None:
-    """Least squares on the change of the state.
+    """Least squares on the change of the state, about the mean state and action.
 
     ridge: of normalised columns; those of the state have one unit, each input its own.
     """
-    n_z, n_a = samples.before.shape[1], samples.actions.shape[1]
-    columns = np.hstack([samples.before, samples.actions, np.ones((len(samples), 1))])
+    n_z, change = samples.before.shape[1], samples.after - samples.before
+    columns = np.hstack([samples.before, samples.actions])
+    mean, moved = columns.mean(axis=0), change.mean(axis=0)  # an offset is nothing to hold at zero
+    columns = columns - mean
     scale = np.sqrt(np.mean(columns**2, axis=0))
-    scale[:n_z] = np.sqrt(np.mean(samples.before**2))
+    scale[:n_z] = np.sqrt(np.mean(scale[:n_z] ** 2))
     scale = np.where(scale > 0.0, scale, 1.0)
     columns = columns / scale
     gram = columns.T @ columns / len(samples) + ridge * np.eye(len(scale))
-    moment = columns.T @ (samples.after - samples.before) / len(samples)
+    moment = columns.T @ (change - moved) / len(samples)
     found = np.linalg.solve(gram, moment) / scale[:, None]
     if not np.isfinite(found).all():
         return None
-    A, B = np.eye(n_z) + found[:n_z].T, found[n_z : n_z + n_a].T
-    return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, found[-1])))
+    A, B, constant = np.eye(n_z) + found[:n_z].T, found[n_z:].T, moved - mean @ found
+    return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))
 
 
 def fit_convolution(
