@@ -75,7 +75,7 @@ def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
         yield row(f"the same on {count} POD modes of convection", own, short)
     yield row("the same with 4 x 4 probes", probed, short)
     for budget in budgets:
-        how = {"reduced_order": 10, "exploration_variance": EXCITED}
+        how = {"reduced_order": MODES[-1], "exploration_variance": EXCITED}
         made = [trained(lambda: Convection(cells), seed, budget, **how) for seed in range(seeds)]
         found = [pdeloop.rollout(plant, law, [0]) for law, _ in made]
         yield row(f"{name_of(budget)} from convection", found, max(spent for _, spent in made))
