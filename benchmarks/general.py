@@ -51,6 +51,7 @@ REFERENCES = {
     "limit": "best known",
     "lqr": "LQR of the linearisation",
     "mpc": "its linear MPC",
+    "sindy": "MPC on SINDy, 20 rollouts",
 }
 
 
@@ -152,7 +153,7 @@ def train(
         found = {**means, "by_field": by_field, "spent": done.rollouts[0], "seconds": seconds}
         if name in PROCESS_CASES:
             plant = process.PLANTS[PROCESS_CASES[name].plant]()
-            found |= reference_costs(plant, evaluation_seeds(evaluation, fields))
+            found |= reference_costs(plant, evaluation_seeds(evaluation, fields), seed)
         return found
 
     task_row = {"case": name, "budget": budget, "seed": seed, "law": law}

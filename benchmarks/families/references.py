@@ -7,6 +7,9 @@ With e = z - z_0 at an operating point f(z_0, a_0), e_{k+1} = A e_k + B a_k + d:
 - linear model predictive control within the bounds, over `STEPS` steps and with that law's cost to go
   behind them, solved by OSQP. Without bounds it is the same law.
 
+Where pysindy is installed (extra `rivals`), also nonlinear model predictive control on the model of
+SINDy with control, which knows nothing but twenty rollouts (`benchmarks.families.sindy`).
+
 References
 ----------
 Rawlings, Mayne, Diehl, "Model Predictive Control", 2nd edition, section 1.3. Stellato et al., "OSQP: an
@@ -16,6 +19,7 @@ operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +27,7 @@ from scipy import sparse
 
 import pdeloop
 from benchmarks.families.process import Process
+from benchmarks.families.sindy import sindy_cost
 from pdeloop.episode import Law, rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
@@ -110,16 +115,20 @@ def predictive_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> L
     return law
 
 
-def reference_costs(plant: Process, seeds: Sequence[int]) -> dict[str, float]:
-    """Mean costs of both controllers from the initial states of these seeds."""
-    built = pdeloop.problem(plant=plant).plant()
+def reference_costs(plant: Process, seeds: Sequence[int], seed: int) -> dict[str, float]:
+    """Mean costs of these controllers from the initial states of these seeds; seed: of rollouts."""
+    problem = pdeloop.problem(plant=plant)
+    built = problem.plant()
     model, cost = linearisation(plant), built.cost
     admissible = ActionSet(plant.n_a, plant.action_low, plant.action_high, plant.zero_mean)
     laws = {
         "lqr": clipped_law(model, cost, admissible),
         "mpc": predictive_law(model, cost, admissible),
     }
-    return {
+    found = {
         name: float(rollout(built, law, seeds, keep=False).costs.mean.mean())
         for name, law in laws.items()
     }
+    if find_spec("pysindy"):
+        found["sindy"] = sindy_cost(built, problem, seeds, seed)
+    return found

@@ -12,6 +12,7 @@ import pytest
 import scipy  # whose modules load when they are used
 
 import pdeloop
+from benchmarks.families.sindy import fitted
 from pdeloop.method.design.lqg import kalman_filter
 from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.reduce.subspace import subspace_model
@@ -92,6 +93,30 @@ def test_discrete_sindy() -> None:
         sindy.fit([z for z, _ in parts], t=1, u=[np.vstack([a, last]) for _, a in parts])
         found = sindy.coefficients()
         agrees(pdeloop.ReducedModel(found[:, :3], found[:, 3:]), *parts[0])
+
+
+@needs("pysindy", "pysindy")
+def test_the_rival_of_the_process_family_finds_products() -> None:
+    """A plant of products of state and action is that of its model, whatever the units."""
+    rng, units = np.random.default_rng(3), np.array([1.0, 300.0])
+
+    def step(z: Any, a: Any) -> Any:
+        x, y = (z - 20.0) / units
+        return 20.0 + units * np.array(
+            [0.9 * x + 0.1 * x * a[0] + 0.2 * a[1], 0.8 * y + 0.1 * x * x]
+        )
+
+    data = []
+    for _ in range(6):
+        z, a = [20.0 + units * rng.standard_normal(2)], rng.uniform(0.0, 2.0, (60, 2))
+        for own in a:
+            z.append(step(z[-1], own))
+        data.append((np.array(z), a))
+    model = fitted(data)
+    states = 20.0 + units * rng.standard_normal((5, 2))
+    actions = rng.uniform(0.0, 2.0, (5, 2))
+    after = [step(z, a) for z, a in zip(states, actions, strict=True)]
+    np.testing.assert_allclose(model.step(states, actions), after, rtol=1e-3, atol=1e-3 * 300)
 
 
 @needs("nfoursid", "nfoursid")
