@@ -174,6 +174,17 @@ class ActionSet:
             name = "exploration_mean" if "exploration_mean" in str(error) else "action_bounds"
             raise ParameterError(f"parameter '{name}': {error}") from error
 
+    def inside(self, a: Array) -> Array:
+        """The admissible action nearest to one (n_a,) that is two standard deviations from all bounds.
+
+        Examples
+        --------
+        >>> ActionSet(3, 0.0, 8.0).inside(np.array([0.0, 3.0, 9.0]))
+        array([2., 3., 6.])
+        """
+        own = 2.0 * np.sqrt(self.exploration_variance) * self.exploration_scale
+        return self.project(np.clip(a, self.low + own, self.high - own))
+
     def _set_exploration(self, *, given: bool) -> None:
         two, most = np.isfinite(self.high - self.low), np.sqrt(UNBOUNDED_VARIANCE)
         with np.errstate(invalid="ignore"):

@@ -159,7 +159,8 @@ PROBLEM = _section(
     ),
     Spec("exploration_mean", [], -1e300, 1e300, nodes="CT").means(
         "operating point around which actions are explored, one number for each actuator; empty: the "
-        "middle of action_bounds, two standard deviations inside where there is one bound, else 0"
+        "cost's a_r if it is not 0, else the middle of action_bounds, or 0 where there are none, two "
+        "standard deviations inside"
     ),
     Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
         "step size eta of two_point from the LQT warm start"

@@ -113,6 +113,19 @@ def test_what_a_plant_says_itself_stands_in_the_parameters(own: Path) -> None:
     assert plant.horizon == 9 and plant.target.tolist() == [1.0] * 5
 
 
+def test_explorations_are_around_the_actions_that_cost_nothing() -> None:
+    class Heated(Ageing):
+        n_a, action_low, action_high = 3, 0.0, 8.0
+        action_target = np.array([3.0, 0.0, 8.0])
+
+    problem = pdeloop.problem(plant=Heated(1.0))
+    assert problem.values["exploration_mean"] == [3.0, 2.0, 6.0]  # two standard deviations inside
+    given = pdeloop.problem(plant=Heated(1.0), exploration_mean=[1.0, 1.0, 1.0])
+    assert given.values["exploration_mean"] == [1.0, 1.0, 1.0]
+    Heated.action_target = 0.0
+    assert not pdeloop.problem(plant=Heated(1.0)).values["exploration_mean"]
+
+
 def test_a_function_may_make_the_plant(own: Path) -> None:
     values = values_of(own, "rods", **{"physical.count": 3.0})
     assert values["physical.count"] == 3 and type(values["physical.count"]) is int
