@@ -280,7 +280,8 @@ def designed(
         )
     truncated = settings.identification == "dmdc"
     known: Sequence[tuple[ArrayLike, ArrayLike]] = trajectories
-    free = settings.action_set.free(settings.n_a)
+    n_a = settings.n_a
+    free = settings.action_set.free(n_a)
     if settings.action_set.zero_mean:  # only their differences show an effect
         known = [(states, actions @ free) for states, actions in trajectories]
     model = identify(
@@ -321,6 +322,8 @@ def designed(
             settings=settings.method,
             models=settings.field_models,
             axes=axes_of(settings.grid),
+            # An order that the data suggest is that of the regression: K senses n_a directions.
+            order=0 if settings.reduced_order else max(model.n_s, min(2 * n_a, target.size)),
             **weights,
         )
     if unsolved is not None:

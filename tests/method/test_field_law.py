@@ -13,7 +13,13 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.method.design import lqt
-from pdeloop.method.design.field_law import FieldLaw, field_law, linearisation_point, states_under
+from pdeloop.method.design.field_law import (
+    FieldLaw,
+    aim_of,
+    field_law,
+    linearisation_point,
+    states_under,
+)
 from pdeloop.method.design.finite_horizon import finite_horizon
 from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.models import affine_law
@@ -253,6 +259,40 @@ def test_the_units_of_the_states_change_nothing() -> None:
         rows = designed(rod_log(1, scale), FAR * scale, how).rows
         laws.append(np.column_stack([rows.K_a @ rows.U.T * scale, rows.K_b @ rows.s_r]))
     np.testing.assert_allclose(laws[1], laws[0], rtol=1e-5, atol=1e-6)
+
+
+def test_a_law_of_the_suggested_order_senses_what_all_actuators_need() -> None:
+    """POD modes are those of the largest numbers: here of a pressure that costs nothing."""
+    rng, logs = np.random.default_rng(7), []
+    for z, a in rod_log(4):
+        pressure = 1e4 + np.cumsum(50.0 * rng.standard_normal(len(z)))
+        logs.append((np.column_stack([z + 0.02 * rng.standard_normal(z.shape), pressure]), a))
+    target = np.append(FAR / 8.0, 0.0)
+    cost = Cost(5, 2, 120, state_weight=[1, 1, 1, 1, 0], action_weight=0.001, target=target)
+    how = DesignSettings(2, 0, 1.0, 0.001, identification="field", cost=cost.texts)
+    rows = designed(logs[:1], target, how, further=logs[1:]).rows
+    assert rows.U.shape[1] >= 4
+    z = np.append(np.zeros(4), 1e4)
+    for _ in range(200):
+        a = rows.K_a @ rows.U.T @ z + rows.K_b @ rows.s_r
+        z[:4] = ROD @ z[:4] + HEATERS @ a
+    best = lqt.track(ReducedModel(ROD, HEATERS, np.eye(4)), state_weight=1.0, action_weight=0.001)
+    rest = np.zeros(4)
+    for _ in range(200):
+        rest = ROD @ rest + HEATERS @ (best.K_a @ rest + best.K_b @ target[:4])
+    np.testing.assert_allclose(z[:4], rest, atol=0.15)
+
+
+def test_what_costs_nothing_is_linearised_where_it_was_measured() -> None:
+    mean, target = np.array([278.0, 279.0, 3.0]), np.array([275.0, 0.0, 0.0])
+    for cost in (
+        Cost(3, 1, 5, state_weight=[2.0, 0.0, 0.0]),
+        Cost(3, 1, 5, state_weight=np.diag([2.0, 0.0, 0.0])),
+        Cost(3, 1, 5, output=[[3.0, 0.0, 0.0]]),
+    ):
+        assert cost.state_weights is not None
+        found = aim_of(mean, target, cost.state_weights)
+        np.testing.assert_allclose(found, [275.0, 279.0, 3.0], rtol=1e-12)
 
 
 def test_every_accepted_model_judges_every_law() -> None:

@@ -16,7 +16,8 @@ and without control. If U has too few columns for both, all are POD modes.
 No model is the only judge of its own law. The model of the whole field and the reduced one are accepted
 by their errors on parts of the data that they were not fitted to, relative to the variation of the data
 and to the error of the other one. Every accepted model predicts the cost of both laws, and the law with
-the lower of their worst predictions is used. All errors are of numbers in units of their own variation.
+the lower of their worst predictions is used. Where neither is accepted, the model of the whole field is
+if it is the more accurate one. All errors are of numbers in units of their own variation.
 
 References
 ----------
@@ -197,6 +198,7 @@ def best_model(
     noise: float = 0.0,
     models: FieldModelSettings = MODEL_DEFAULTS,
     axes: tuple[int, ...] = (),
+    weights: Array | None = None,
 ) -> tuple[FittedModel | None, float, list[Measured]]:
     """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
 
@@ -206,7 +208,8 @@ def best_model(
     looked for before. A target far outside of the data makes every error small, so a model that does
     not reproduce what the data do is chosen again by that. The work grows with the third power of the
     size of the state, so there is a largest one. Last, what the model was chosen by. axes: as for
-    `field_law`; noise that was not declared is looked for on one axis alone.
+    `field_law`; noise that was not declared is looked for on one axis alone. weights: as for
+    `fit_field_model`.
     """
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
     if len(target) > _FIELD_LARGEST:
@@ -225,6 +228,8 @@ def best_model(
             shape=shape,
             scale=scale,
             by_scale=by_scale,
+            weights=weights,
+            most=max(settings.field_error, NOISY) if noise else settings.field_error,
         )
 
     whole = fitted(rollouts)
@@ -238,6 +243,7 @@ def best_model(
             better_than=np.inf if noise else error,
             declared=noise,
             action_set=action_set,
+            weights=weights,
         )
         if misjudged is not None:
             return *misjudged, rollouts
@@ -298,8 +304,9 @@ def field_law(
     settings: IdentificationSettings = DEFAULTS,
     models: FieldModelSettings = MODEL_DEFAULTS,
     axes: tuple[int, ...] = (),
+    order: int = 0,
 ) -> FieldLaw:
-    """A law from a model of the whole field, with as many modes as another has.
+    """A law from a model of the whole field, with as many modes as another has, or as asked for.
 
     Parameters
     ----------
@@ -323,9 +330,12 @@ def field_law(
         How models are fitted and one is chosen.
     axes : tuple of int
         Points of each axis of the fields; of one axis, or none, they need not be known.
+    order : int
+        Modes of the law; 0: as many as `other` has.
     """
+    weights = None if cost is None else cost.state_weights
     fitted, found, rollouts = best_model(
-        trajectories, target, action_set, settings, noise, models, axes
+        trajectories, target, action_set, settings, noise, models, axes, weights
     )
     if fitted is None or found:
         return FieldLaw(fitted, noise=found)
@@ -338,13 +348,16 @@ def field_law(
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
     most = max(settings.field_error, NOISY) if noise else settings.field_error
     accepted = _accepted(known, most, models.better)
-    report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
-    if fitted.error > settings.field_error:
-        return report
     model = fitted.model
+    if not accepted and _is_better(fitted.own, regression):
+        accepted = [model]
+    elif fitted.error > most:
+        accepted = [judge for judge in accepted if judge is not model]
+    report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
     if not any(judge is model for judge in accepted):
         return report
-    point, remark = linearisation_point(trajectories, target, fitted, models.reproduced)
+    aim = target if weights is None else aim_of(scale.reference, target, weights)
+    point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
     A, B = model.linearise(point, np.zeros(model.n_a))
     drift = model.step(point[None], np.zeros((1, model.n_a)))[0] - point
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
@@ -374,7 +387,7 @@ def field_law(
     best = saturated(affine_law(K, b - K @ point), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
-    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, n_s)
+    U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, order or n_s)
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)
@@ -424,6 +437,19 @@ def _accepted(
         for model, own in models
         if own.simulated <= min(most, simulated) and own.one_step <= once
     ]
+
+
+def aim_of(mean: Array, target: Array, weights: Array) -> Array:
+    """The state nearest to the mean one that costs what the target does; weights: as for `errors`."""
+    if weights.ndim == 1:
+        return np.where(weights > 0.0, target, mean)
+    aim: Array = mean + linalg.pinv(weights) @ (weights @ (target - mean))
+    return aim
+
+
+def _is_better(own: Accuracy, other: Accuracy) -> bool:
+    """True if a model predicts more than nothing, and all of it better than another one does."""
+    return own.simulated < min(1.0, other.simulated) and own.one_step < other.one_step
 
 
 def linearisation_point(
