@@ -12,6 +12,8 @@ COSTLIER = 3
 """Exit code where a law costs more than no control."""
 LITTLE = 0.05
 """Share of the cost without control; a law that saves less of it hardly controls."""
+FAR_OFF = 0.2
+"""Difference of a predicted cost from the measured one, relative to that, which is told."""
 REPEATS = 1e-6
 """Relative difference of the costs of one law on the same fields that is no rounding."""
 IDLE = (
@@ -218,8 +220,25 @@ def _acting(summary: Row) -> list[str]:
     return lines
 
 
+def mispredicted(summary: Row) -> list[str]:
+    """What the model predicted of the last law and what was measured, where they are far apart."""
+    lines, first, several = [], summary["seed"], summary["seeds"] > 1
+    for seed in range(first, first + summary["seeds"]):
+        rows = [row for row in summary.get("history", []) if row.get("seed") == seed]
+        judged = [row for row in rows if row.get("role") == "judging"] or [{}]
+        cost, predicted = judged[-1].get("cost"), judged[-1].get("predicted")
+        if cost and predicted and abs(predicted - cost) > FAR_OFF * cost:
+            who = f"seed {seed}: " if several else ""
+            lines.append(
+                f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g}: "
+                "the model does not hold where that law leads; more rollouts teach it, and declared "
+                "noise (measurement_noise) is no state"
+            )
+    return lines
+
+
 def reasons(summary: Row) -> list[str]:
-    """Why seeds kept their first law, have no control or left rollouts over."""
+    """Why seeds kept their first law, have no control, left rollouts over or were predicted wrongly."""
     kept: dict[str, list[int]] = {}
     early: dict[str, list[int]] = {}
     for m, (own, changed) in enumerate(
@@ -234,7 +253,7 @@ def reasons(summary: Row) -> list[str]:
         f"  {f'seed {_listed(seeds)}: ' if several else alone}{reason}"
         for alone, seeds_of in (("the optimiser says: ", kept), ("", early))
         for reason, seeds in seeds_of.items()
-    ]
+    ] + [f"  {text}" for text in mispredicted(summary)]
 
 
 def against_lqt(reduction: float) -> str:

@@ -219,6 +219,22 @@ def test_how_much_an_adaptation_gained_is_said_with_its_interval() -> None:
     )
 
 
+def test_a_law_that_costs_more_than_its_model_predicts_is_said() -> None:
+    """With both costs, also where another law is returned, and of each seed alone."""
+    judged = {"event": "adapted", "seed": 7, "role": "judging", "cost": 3044.0, "predicted": 303.0}
+    right = judged | {"seed": 8, "predicted": 3000.0}
+    own = {"verdict": "better", "reason": "it is better"}
+    earlier = judged | {"role": "renewing", "predicted": 1.0}
+    alone = summary(seed=7, seeds=1, changed=[True], outcome=[own], history=[earlier, judged])
+    told = "of the last law the model predicts 303, the plant shows 3044"
+    assert any(line.startswith(f"  {told}") for line in closing_lines("kdv", alone, ""))
+    both = summary(seed=7, changed=[True, True], outcome=[own, own], history=[judged, right])
+    lines = [line for line in closing_lines("kdv", both, "") if "the plant shows" in line]
+    assert len(lines) == 1 and lines[0].startswith(f"  seed 7: {told}")
+    fine = summary(seed=8, seeds=1, changed=[True], outcome=[own], history=[earlier, right])
+    assert not any("the plant shows" in line for line in closing_lines("kdv", fine, ""))
+
+
 def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_law() -> None:
     why = "9 of 20 rollouts were not used: more fields would not change the law"
     own = {"verdict": "better", "reason": "it is better", "early": why}
