@@ -231,8 +231,8 @@ def mispredicted(summary: Row) -> list[str]:
             who = f"seed {seed}: " if several else ""
             lines.append(
                 f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g}: "
-                "the model does not hold where that law leads; more rollouts teach it, and declared "
-                "noise (measurement_noise) is no state"
+                "the model does not hold where that law leads; train with more rollouts, and declare "
+                "measurement_noise if there is noise"
             )
     return lines
 
