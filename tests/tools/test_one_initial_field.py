@@ -50,7 +50,7 @@ def test_each_law_is_rolled_out_once_until_none_is_better() -> None:
 
 def test_fields_that_differ_or_noise_are_rolled_out_as_ever() -> None:
     for plant, settings, first in (
-        (Pendulums(0.01), {}, 5),
+        (Pendulums(0.1), {}, 5),
         (Pendulums(), {"process_noise": 1e-3}, 4),  # two of the first law, which differ
     ):
         run = pdeloop.train(plant=plant, seed=0, rollouts=8, **settings)

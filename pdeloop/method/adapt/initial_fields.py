@@ -41,8 +41,8 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop
 
 _MEASURED_SHARE = 0.5
 """Weight of the measured fields, where there are drawn ones."""
-ALIKE = 1e-9
-"""Relative difference up to which states are the same but for rounding."""
+ALIKE = 1e-2
+"""Difference of initial fields, relative to how far states move, up to which they may be one."""
 KEPT = 0.99
 """Share of the variance whose directions are drawn from."""
 # A field is moved by this share of its distance to another one; without control the costs of a chaotic
@@ -54,9 +54,17 @@ _MOVED, _CHANGED = 1e-2, 4.5e-2
 def initial_fields(records: Sequence[Record]) -> Array:
     """The measured initial fields, each once, (n, n_z)."""
     fields = [record.states[0] for record in records]
-    every = np.stack(list({field.tobytes(): field for field in fields}.values()))
-    # In the coordinates of a basis that grows, a field is the same but for rounding.
-    return every[:1] if np.abs(every - every[0]).max() <= ALIKE * np.abs(every).max() else every
+    return np.stack(list({field.tobytes(): field for field in fields}.values()))
+
+
+def begin_alike(records: Sequence[Record]) -> bool:
+    """True if initial fields differ by little of how far states move from them.
+
+    In the coordinates of a basis that grows (`in_coordinates`) one field is nearly the same each time.
+    """
+    fields = np.stack([record.states[0] for record in records])
+    moved = max(float(np.abs(record.states - record.states[0]).max()) for record in records)
+    return bool(np.abs(fields - fields[0]).max() <= ALIKE * moved)
 
 
 def measured_states(records: Sequence[Record], count: int) -> Array:

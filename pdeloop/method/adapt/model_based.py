@@ -44,8 +44,8 @@ from pdeloop.method.adapt.belief import (
 )
 from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.initial_fields import (
-    ALIKE,
     any_state_serves,
+    begin_alike,
     initial_fields,
     measured_states,
 )
@@ -89,6 +89,8 @@ _REACH = 3.0
 """Magnitude of the states that a model must describe, in terms of the largest one measured before."""
 _NONE_ROLLOUTS = 2
 """Rollouts without control on fields of the first law, where no model tells what they cost."""
+_REPEATS = 1e-9
+"""Relative difference of the costs of one law up to which its rollouts are the same one."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
@@ -280,12 +282,7 @@ class ModelBased(Optimizer):
         own, known = self._records.count, self._measurements()
         if self._repeats:
             return min(own + 1, self._schedule.last)
-        if (
-            own == 0
-            and len(known) > 1
-            and not self._context.noise
-            and len(initial_fields(known)) == 1
-        ):
+        if own == 0 and len(known) > 1 and not self._context.noise and begin_alike(known):
             return min(2, self._schedule.last)  # whether they are the same
         return self._scheduled(own)
 
@@ -296,17 +293,13 @@ class ModelBased(Optimizer):
     @property
     def _repeats(self) -> bool:
         """True if a law's rollouts are all the same one: every episode begins alike, without noise."""
-        known = self._measurements()
-        if self._context.noise or len(initial_fields(known)) > 1:
+        laws: dict[bytes, list[float]] = {}
+        for record in self._records.all():
+            laws.setdefault(record.policy.tobytes(), []).append(record.cost)
+        pairs = [own for own in laws.values() if len(own) > 1 and np.isfinite(own).all()]
+        if self._context.noise or not pairs or not begin_alike(self._measurements()):
             return False
-        laws: dict[bytes, list[Record]] = {}
-        for record in known[len(self._context.every_exploration) :]:
-            laws.setdefault(record.policy.tobytes(), []).append(record)
-        pairs = [(own[0].states, other.states) for own in laws.values() for other in own[1:]]
-        return bool(pairs) and all(
-            len(own) == len(other) and np.abs(own - other).max() <= ALIKE * np.abs(own).max()
-            for own, other in pairs
-        )
+        return all(np.ptp(own) <= _REPEATS * abs(own[0]) for own in pairs)
 
     @property
     def _rests(self) -> bool:
@@ -357,7 +350,8 @@ class ModelBased(Optimizer):
 
     def _fields(self) -> Array:
         """Initial fields of all rollouts."""
-        return initial_fields(self._data())
+        fields = initial_fields(self._data())
+        return fields[:1] if self._repeats else fields
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
