@@ -111,8 +111,9 @@ def test_the_known_optimum_of_a_linear_quadratic_plant_is_reached() -> None:
     # Over the horizon the law of the algebraic equation is optimal but for its last steps.
     assert plant.cost(optimizer.policy) <= 1.005 * best
     assert rows[-1]["chosen"] == ADAPTED and rows[-1]["predicted_change"] < 0.0
-    assert [row["rollouts"] for row in rows] == [4, 15, 18]
-    assert all(row["mismatch"] < 1e-6 for row in rows[:-1])
+    # Of a law that a model made three rollouts show whether it costs what that says, before the rest.
+    assert [row["rollouts"] for row in rows] == [4, 7, 15, 18]
+    assert all(row["mismatch"] < 1e-6 for row in (rows[0], rows[2]))
     for row in rows[1:]:  # said before the rollouts were fitted
         assert row["predicted"] == pytest.approx(row["cost"], rel=1e-3)
 
@@ -314,7 +315,7 @@ def test_a_large_budget_ends_once_the_fields_are_known() -> None:
     settings = ModelBasedSettings(enough_fields=12)
     optimizer = make(plant, rollouts=100, settings=settings)
     rows = finished(plant, optimizer)
-    assert [row["rollouts"] for row in rows] == [4, 10, 13]
+    assert [row["rollouts"] for row in rows] == [4, 7, 10, 13]
     assert "fields would not change" in rows[-1]["early"]
     assert not any("early" in row for row in rows[:-1])
 

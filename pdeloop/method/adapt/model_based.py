@@ -89,6 +89,8 @@ _REACH = 3.0
 """Magnitude of the states that a model must describe, in terms of the largest one measured before."""
 _NONE_ROLLOUTS = 2
 """Rollouts without control on fields of the first law, where no model tells what they cost."""
+_FAR_OFF = 0.1
+"""Share of a measured cost by which it exceeds the predicted one where the law is renewed at once."""
 _REPEATS = 1e-9
 """Relative difference of the costs of one law up to which its rollouts are the same one."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
@@ -225,7 +227,10 @@ class ModelBased(Optimizer):
         if progress.replayed:
             return self._on_known_fields()
         if progress.stage == RENEWING:
-            laws = [progress.policy] * (self._next_renewal() - own)
+            count = self._next_renewal() - own
+            laws = [progress.policy] * (
+                min(count, self._schedule.judging) if self._is_new else count
+            )
         else:
             laws = [progress.policy] * (self._schedule.judging - progress.none_is_close)
             laws += [self._none] * progress.none_is_close
@@ -258,7 +263,7 @@ class ModelBased(Optimizer):
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts, and carry out the next stage."""
-        asked = self.ask()
+        asked, due = self.ask(), self._next_renewal()
         require_results(results, len(asked))
         for result in results:
             self._records.validated_samples(result)
@@ -270,15 +275,26 @@ class ModelBased(Optimizer):
                 for rollout, result in zip(asked, results, strict=True)
             ]
             row = self._measured(added)
-            if self._progress.stage == RENEWING:
-                self._renew(row)
-            else:
+            if self._progress.stage != RENEWING:
                 self._judge(row)
+            elif (
+                self._progress.replayed
+                or self._records.count >= due
+                or _is_worse_than_predicted(row)
+            ):
+                self._renew(row)
         diverged = sum(not result.usable for result in results)
         return row | {"rollouts": self._records.count, "diverged": diverged}
 
+    @property
+    def _is_new(self) -> bool:
+        """True if a model made the law, and no rollout has shown yet whether it costs as much."""
+        progress, known = self._progress, self._records.all()
+        made = progress.belief is not None and self._model_compares
+        return made and not any(np.array_equal(own.policy, progress.policy) for own in known)
+
     def _next_renewal(self) -> int:
-        """Own rollouts after which the law is renewed next."""
+        """Own rollouts after which the law is renewed next, unless it costs more than predicted."""
         own, known = self._records.count, self._measurements()
         if self._repeats:
             return min(own + 1, self._schedule.last)
@@ -537,6 +553,12 @@ class ModelBased(Optimizer):
         if self._progress.belief is not None:
             self._progress.belief.check(self._context)
         self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
+
+
+def _is_worse_than_predicted(row: Row) -> bool:
+    """True if rollouts diverged, or cost far more than the model said."""
+    cost = float(row.get("cost", np.inf))
+    return not cost - float(row.get("predicted", cost)) <= _FAR_OFF * abs(cost)
 
 
 def _known_well(fields: int) -> str:

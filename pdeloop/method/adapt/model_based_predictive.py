@@ -158,7 +158,7 @@ class ModelBasedPredictive(Optimizer):
             with one_thread():
                 if self._affine.done:
                     self._begin_judging(row)
-                elif not self._kept and self._affine.can_spare(self._judging):
+                elif "model" in row and not self._kept and self._affine.can_spare(self._judging):
                     self._look(row)
             return row
         diverged = sum(not result.usable for result in results)

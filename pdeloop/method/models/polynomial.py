@@ -8,7 +8,7 @@ POD modes V of y, w = [V_q^T y; (a - m_a) / s_a] with the q leading ones, and al
 
 A heater's I^2, a flow that carries a temperature, a conductance that a valve changes are such products.
 The scale makes the fit independent of units. The ridges of A and of H, and q, are those of the smallest
-error in predicting pieces of rollouts that were left out.
+error in predicting rollouts that were left out, and pieces of them.
 
 References
 ----------
@@ -236,7 +236,9 @@ def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
     n_z = samples.before.shape[1]
     if n_z > LARGEST_STATE or len(samples) < 4 * _PARTS:
         return None
-    cuts = _pieces(samples)
+    cuts = _pieces(samples, len(samples))
+    if len(cuts) < _PARTS:
+        cuts = _pieces(samples, _PIECE)
     ridges = list(product(LINEAR_RIDGES, PRODUCT_RIDGES))
     leading = [q for i, q in enumerate(LEADING) if not i or LEADING[i - 1] < n_z]
     errors = np.zeros((len(leading), len(ridges)))
@@ -247,10 +249,12 @@ def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
             return None
         rest = np.concatenate([np.arange(begin, end) for begin, end in others])
         data = _Scaled.of(_rows(samples, rest))
-        pieces = _Pieces.of(samples, own, data.scale)
+        # Whole rollouts tell what is unstable, and pieces what is wrong where nothing predicts those.
+        short = [(k, min(k + _PIECE, end)) for begin, end in own for k in range(begin, end, _PIECE)]
+        both = [_Pieces.of(samples, each, data.scale) for each in (own, short)]
         for i, q in enumerate(leading):
             for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
-                errors[i, j] += _error(model, pieces, data.scale)
+                errors[i, j] += sum(_error(model, pieces, data.scale) for pieces in both)
     i, j = divmod(int(np.argmin(errors)), len(ridges))
     data = _Scaled.of(samples)
     return data.fits(data.empty(kind, leading[i]), [ridges[j]])[0]
@@ -260,12 +264,12 @@ def _rows(samples: Samples, rows: NDArray[np.int64]) -> Samples:
     return Samples(samples.before[rows], samples.actions[rows], samples.after[rows])
 
 
-def _pieces(samples: Samples) -> list[tuple[int, int]]:
-    """Begin and end of rows that follow each other in time, at most `_PIECE` long."""
+def _pieces(samples: Samples, most: int) -> list[tuple[int, int]]:
+    """Begin and end of rows that follow each other in time, at most so many."""
     joined = (samples.after[:-1] == samples.before[1:]).all(axis=1)
     cuts, begin = [], 0
     for end in range(1, len(samples) + 1):
-        if end == len(samples) or not joined[end - 1] or end - begin == _PIECE:
+        if end == len(samples) or not joined[end - 1] or end - begin == most:
             cuts.append((begin, end))
             begin = end
     return cuts
