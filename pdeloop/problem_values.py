@@ -32,8 +32,9 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     plant, values = complete(training_parameters(name, given), compiled=False)
     if plant.cost.target.ndim > 1 or _drifts(plant):  # which the plant itself may say
         values |= training_parameters(name, given, constants=True)
-    resting = plant.cost.action_target
-    if resting.any() and not values["exploration_mean"]:
+    resting, limits = plant.cost.action_target, (plant.action_set.low, plant.action_set.high)
+    limited = any(np.isfinite(limit).any() for limit in limits)
+    if limited and resting.any() and not values["exploration_mean"]:
         values["exploration_mean"] = plant.action_set.inside(resting).tolist()
     if _is_order_sought(name, given, plant, values):
         values["reduced_order"] = 0

@@ -51,7 +51,7 @@ def trained(plant: Callable[[], Dynamics], seed: int, rollouts: int, **how: Any)
     """The affine law of a training, and how many rollouts it took; of one, that of the exploration."""
     if rollouts == 1:
         return first_law(plant(), seed, **how), 1
-    run, spent = training(plant, seed, rollouts, **how)
+    run, spent = training(plant, seed, rollouts, law="affine", **how)
     return pdeloop.projected_law(DynamicsPlant(plant()), run.models[0].U, run.policies[0]), spent
 
 

@@ -158,9 +158,9 @@ PROBLEM = _section(
         "squared"
     ),
     Spec("exploration_mean", [], -1e300, 1e300, nodes="CT").means(
-        "operating point around which actions are explored, one number for each actuator; empty: the "
-        "cost's a_r if it is not 0, else the middle of action_bounds, or 0 where there are none, two "
-        "standard deviations inside"
+        "operating point around which actions are explored, one number for each actuator; empty: with "
+        "action_bounds the cost's a_r if it is not 0, else their middle, two standard deviations "
+        "inside; without, 0"
     ),
     Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
         "step size eta of two_point from the LQT warm start"
