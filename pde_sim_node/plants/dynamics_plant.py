@@ -60,6 +60,12 @@ class DynamicsPlant(BatchPlant):
             for name, number in zip(WEIGHTS, cost.size, strict=True):
                 given[name] = number
             super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
+            aim = cost.field_target if cost.output is not None else cost.target
+            if (largest := float(np.abs(aim).max())) > self.divergence_bound:
+                raise ValueError(
+                    f"the target has the magnitude {largest:g}, and rollouts beyond divergence_bound, "
+                    f"{self.divergence_bound:g}, count as diverged; set divergence_bound above it"
+                )
             bounds = dynamics.action_low, dynamics.action_high, dynamics.zero_mean
             self.action_set = ActionSet(self.n_a, *bounds, rate=dynamics.action_rate)
         except ValueError as error:

@@ -183,3 +183,13 @@ def test_a_parameter_that_a_class_takes_for_an_attribute_is_named(name: str, mea
         ValueError, match=f"Own sets '{name}', which a plant does not have; .*{meant}"
     ):
         DynamicsPlant(type("Own", (Linear,), {name: 3.0})())
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_target_beyond_the_divergence_bound_is_told(moving: bool) -> None:
+    """A furnace in degrees: each of its rollouts would count as diverged."""
+    target = np.tile([0.0, 1150.0, 0.0], (7, 1)) if moving else np.array([0.0, -1150.0, 0.0])
+    own = {"target": target, "horizon": 6}
+    with pytest.raises(ValueError, match=r"Own: the target has the magnitude 1150, .*_bound, 100,"):
+        DynamicsPlant(type("Own", (Linear,), own)())
+    assert DynamicsPlant(type("Own", (Linear,), {**own, "divergence_bound": 1e4})()).horizon == 6

@@ -232,7 +232,7 @@ class _Scaled:
 
 
 def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
-    """The polynomial that predicts pieces of rollouts best that it was not fitted to."""
+    """The polynomial that predicts rollouts, and pieces of them, best that it was not fitted to."""
     n_z = samples.before.shape[1]
     if n_z > LARGEST_STATE or len(samples) < 4 * _PARTS:
         return None
@@ -251,7 +251,8 @@ def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
         data = _Scaled.of(_rows(samples, rest))
         # Whole rollouts tell what is unstable, and pieces what is wrong where nothing predicts those.
         short = [(k, min(k + _PIECE, end)) for begin, end in own for k in range(begin, end, _PIECE)]
-        both = [_Pieces.of(samples, each, data.scale) for each in (own, short)]
+        cut = [own] if own == short else [own, short]
+        both = [_Pieces.of(samples, each, data.scale) for each in cut]
         for i, q in enumerate(leading):
             for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
                 errors[i, j] += sum(_error(model, pieces, data.scale) for pieces in both)
