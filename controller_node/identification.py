@@ -37,6 +37,10 @@ from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
 
+SMALL = 12
+"""Size of a state up to which a law knows all of it unless another order is asked for: POD modes are
+those of large numbers, whatever their units."""
+
 
 @dataclass(frozen=True)
 class DesignSettings:
@@ -284,14 +288,24 @@ def designed(
     free = settings.action_set.free(n_a)
     if settings.action_set.zero_mean:  # only their differences show an effect
         known = [(states, actions @ free) for states, actions in trajectories]
-    model = identify(
-        known,
-        method="dmdc" if truncated else "regression",
-        n_s=min(model_order(asdict(settings)), target.size),
-        p=settings.dmdc_rank if truncated else 0,
-        channels=channels,
-        settings=settings.method,
-    )
+    asked = min(model_order(asdict(settings)), target.size)
+
+    def identified(n_s: int) -> ReducedModel:
+        return identify(
+            known,
+            method="dmdc" if truncated else "regression",
+            n_s=n_s,
+            p=settings.dmdc_rank if truncated else 0,
+            channels=channels,
+            settings=settings.method,
+        )
+
+    try:
+        model = identified(asked or target.size * (target.size <= SMALL))
+    except ValueError:  # the data do not determine all of a small state
+        if asked or target.size > SMALL:
+            raise
+        model = identified(0)
     if settings.action_set.zero_mean:
         model = replace(model, B=model.B @ free.T)
     unsolved: DesignError | None = None
@@ -323,7 +337,9 @@ def designed(
             models=settings.field_models,
             axes=axes_of(settings.grid),
             # An order that the data suggest is that of the regression: K senses n_a directions.
-            order=0 if settings.reduced_order else max(model.n_s, min(2 * n_a, target.size)),
+            order=0
+            if settings.reduced_order
+            else max(model.n_s, min(max(2 * n_a, SMALL), target.size)),
             **weights,
         )
     if unsolved is not None:

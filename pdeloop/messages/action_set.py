@@ -17,7 +17,9 @@ and a_{-1} is the middle between two bounds, otherwise the point nearest to 0 th
 Explorations are drawn around an operating point within the bounds, P(m + D x) with x ~ N(0, v I): m is
 the middle between two bounds, and otherwise the point nearest to 0 that is two standard deviations from
 the bound. D is the size of each actuator's standard deviation relative to the largest: a quarter of
-half the range between two bounds, and sqrt(0.1) otherwise. Without declared bounds m = 0 and D = I.
+half the range between two bounds, and sqrt(0.1) otherwise; about a given m it is half the distance from
+the nearest bound where that is less, but no less than half of that. Without declared bounds m = 0 and
+D = I.
 
 References
 ----------
@@ -175,15 +177,19 @@ class ActionSet:
             raise ParameterError(f"parameter '{name}': {error}") from error
 
     def inside(self, a: Array) -> Array:
-        """The admissible action nearest to one (n_a,) that is two standard deviations from all bounds.
+        """The operating point next to an action (n_a,) about which little of an exploration is clipped.
+
+        The action itself if it is a standard deviation from its bounds; else two of them from there.
 
         Examples
         --------
-        >>> ActionSet(3, 0.0, 8.0).inside(np.array([0.0, 3.0, 9.0]))
-        array([2., 3., 6.])
+        >>> ActionSet(3, 0.0, 8.0).inside(np.array([0.0, 1.5, 9.0]))
+        array([2. , 1.5, 6. ])
         """
-        own = 2.0 * np.sqrt(self.exploration_variance) * self.exploration_scale
-        return self.project(np.clip(a, self.low + own, self.high - own))
+        own = np.sqrt(self.exploration_variance) * self.exploration_scale
+        near = np.minimum(a - self.low, self.high - a) < own
+        moved = np.clip(a, self.low + 2.0 * own, self.high - 2.0 * own)
+        return self.project(np.where(near, moved, a))
 
     def _set_exploration(self, *, given: bool) -> None:
         two, most = np.isfinite(self.high - self.low), np.sqrt(UNBOUNDED_VARIANCE)
@@ -191,6 +197,9 @@ class ActionSet:
             own = np.where(two, 0.5 * EXPLORED * (self.high - self.low), most)
             middle = np.where(two, 0.5 * (self.low + self.high), 0.0)
             inside = np.clip(middle, self.low + 2.0 * own, self.high - 2.0 * own)
+        if given:
+            free = np.minimum(self.exploration_mean - self.low, self.high - self.exploration_mean)
+            own = np.clip(0.5 * free, 0.5 * own, own)
         if two.any():
             self.exploration_variance = float(own.max()) ** 2
         self.exploration_scale = own / max(float(own.max()), 1e-300)

@@ -10,7 +10,7 @@ import pytest
 
 from pdeloop.method.adapt import Context, Trajectory, belief, model_based, renewal
 from pdeloop.method.adapt.base import Record
-from pdeloop.method.adapt.belief import Belief, also_in_pieces
+from pdeloop.method.adapt.belief import Belief, also_in_parts
 from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.renewal import Renewal, renew_from_states
 from pdeloop.method.adapt.settings import ModelBasedSettings
@@ -63,17 +63,26 @@ def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_the
     context = Context(np.eye(12)[:, :1], np.zeros(12), 1.0, 1.0, 80, trajectory)
 
     def judged(
-        known: Context, own: Any, first: str = "", parts: int = 1, most: float = np.inf
-    ) -> Belief:
+        known: Context,
+        own: Any,
+        first: str = "",
+        parts: int = 1,
+        most: float = np.inf,
+        near: float = np.inf,
+        linear: bool = False,
+    ) -> Belief | None:
+        if near < np.inf:
+            return None
         rollouts = [belief._measured(known, record) for record in own]
         if parts > 1:
             rollouts = [part for rollout in rollouts for part in belief.pieces(rollout, parts)]
         return Belief(model, belief.errors(model, rollouts, known.target, 2.0).mean(), 1)
 
     monkeypatch.setattr(belief, "believe", judged)
-    assert judged(context, records).error > SETTINGS.believed
-    found = also_in_pieces(context, records, judged(context, records), SETTINGS)
-    assert found.whole == whole
+    first = judged(context, records)
+    assert first is not None and first.error > SETTINGS.believed
+    found = also_in_parts(context, records, first, SETTINGS)
+    assert found is not None and found.whole == whole
     assert (found.error <= SETTINGS.believed) == (not whole)
     again = Belief.of(found.state())
     assert again is not None and (again.whole, again.error) == (found.whole, found.error)

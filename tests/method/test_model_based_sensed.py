@@ -219,7 +219,7 @@ def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far
 
 def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
     _, context = small()
-    other = Context(**{**vars(context), "periodic": False})
+    other = replace(context, periodic=False)
     assert ModelBased.for_context(other) is ModelBasedReadings
 
 

@@ -12,6 +12,7 @@ everything that `restore` needs to continue as if nothing had happened, to the l
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -193,6 +194,11 @@ class Context:
     def every_exploration(self) -> Sequence[Trajectory]:
         """The exploration of the reduced model first."""
         return (self.exploration, *self.further)
+
+    @cached_property
+    def largest(self) -> float:
+        """The largest magnitude of a number of the states that were explored."""
+        return max(float(np.abs(own.states).max()) for own in self.every_exploration)
 
     @property
     def weights(self) -> Array | None:

@@ -18,26 +18,25 @@ from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.adapt.replayed_loop import ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
 from pdeloop.method.adapt.settings import BELIEVED_NOISY, ImprovementSettings
-from pdeloop.method.adapt.trajectories import within
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models import FieldModel, Measured, affine_law, fit_field_model
-from pdeloop.method.models.choice import fit_kind, limited
+from pdeloop.method.models.choice import scale_of
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.prediction import errors, pieces
+from pdeloop.method.models.prediction import NEAR, beginnings, errors, pieces
 from pdeloop.method.models.readings import ReadingsModel, fit_readings
 from pdeloop.method.models.sensed import SensedModel
+from pdeloop.method.models.settings import FAR
 
 _PIECES = 8
 """Pieces of a rollout that a model of a chaotic plant must predict."""
 _CHAOTIC_GROWTH = 20.0
 """Minimum ratio of the errors on whole rollouts and on pieces."""
 
+MOST_ONCE = 0.3
+"""Largest error of single steps of a model: what rests is predicted by any model, and costs much."""
+
 _MODEL = "model."
-FEWEST = 2
-"""Rollouts of a law that say how near to the target it keeps the state."""
-LEAST = 1e-6
-"""Least unit of a number of the state, relative to the largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +52,20 @@ class Belief:
         Fields in a state.
     whole : bool
         False: it predicts pieces of rollouts, of a chaotic plant, to E.
+    near : float
+        A linear model up to so many times the distance of initial states from the target; infinite: of
+        all that was measured, or of beginnings that it predicts as well.
+    once : float
+        Error of single steps relative to the change in them, on rollouts that it was not fitted to; 0
+        where noise hides it, or it is not known.
     """
 
     model: FieldModel
     error: float
     components: int
     whole: bool = True
+    near: float = np.inf
+    once: float = 0.0
 
     def state(self) -> State:
         """The model, its error and its components, as the arrays of a checkpoint."""
@@ -66,6 +73,8 @@ class Belief:
         numbers = {"error": np.array(self.error), "components": np.array(self.components)}
         if not self.whole:
             numbers["whole"] = np.array(self.whole)
+        if self.near < np.inf:
+            numbers["near"] = np.array(self.near)
         return numbers | arrays
 
     @classmethod
@@ -77,7 +86,8 @@ class Belief:
         error = float(checked_array(state, "error", "f", ()))
         components = int(checked_array(state, "components", "i", ()))
         whole = "whole" not in state or bool(checked_array(state, "whole", "b", ()))
-        return cls(model, error, components, whole)
+        near = float(checked_array(state, "near", "f", ())) if "near" in state else np.inf
+        return cls(model, error, components, whole, near)
 
     def check(self, context: Context) -> None:
         """ValueError if the model has another plant's size, which compiled code does not check."""
@@ -98,6 +108,7 @@ class Belief:
             context.action_set,
         )
         on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
+        on["reach"] = FAR * context.largest
         if isinstance(self.model, ReadingsModel):
             assert isinstance(context.law, Observer)
             seen = self.model.U.T
@@ -126,6 +137,8 @@ def believe(
     first: str = "",
     parts: int = 1,
     most: float = np.inf,
+    near: float = np.inf,
+    linear: bool = False,
 ) -> Belief | None:
     """The model that predicts the rollouts best, or None where none can be fitted.
 
@@ -141,12 +154,18 @@ def believe(
         Pieces of equal length that are predicted in place of a rollout.
     most : float
         Largest E with which a model is used.
+    near : float
+        Rollouts end where they are so many times as far from the target as any at its first state.
+    linear : bool
+        Only linear models, of short pieces.
     """
     if _reads(context):
         return _of_readings(context, records)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
     if parts > 1:
         rollouts = [part for rollout in rollouts for part in pieces(rollout, parts)]
+    if near < np.inf:
+        rollouts = beginnings(rollouts, context.target, near, context.weights, short=linear)
     found = fit_field_model(
         rollouts,
         context.target,
@@ -158,128 +177,92 @@ def believe(
         shape=context.shape,
         weights=context.weights,
         most=most,
+        linear=linear,
+        scale=None if context.noise or not rollouts else scale_of([own.states for own in rollouts]),
     )
     if found is None:
         return None
-    return Belief(found.model, found.error, 2 if found.model.kind.startswith("two-") else 1)
+    components = 2 if found.model.kind.startswith("two-") else 1
+    once = 0.0 if context.noise else found.own.one_step
+    near, error = (near, once) if linear else (np.inf, found.error)
+    return Belief(found.model, error, components, near=near, once=once)
 
 
-def largest_error(context: Context, settings: ImprovementSettings) -> float:
-    """The largest E of a model that laws are improved on."""
-    return BELIEVED_NOISY if context.noise else settings.believed
+def is_believed(context: Context, belief: Belief | None, settings: ImprovementSettings) -> bool:
+    """True if laws are improved on a model."""
+    return belief is not None and belief.error <= largest_error(context, settings, belief.near)
 
 
-def also_in_pieces(
-    context: Context, records: Sequence[Record], whole: Belief, settings: ImprovementSettings
-) -> Belief:
-    """A model that predicts pieces of rollouts where the best one of whole rollouts, `whole`, does not.
+def largest_error(context: Context, settings: ImprovementSettings, near: float = np.inf) -> float:
+    """The largest E of a model that laws are improved on; near: as for `believe`.
 
-    Else `whole` itself. Of a chaotic plant small errors grow, so that those of pieces are far smaller;
-    those of a plant that is described badly add up.
+    What leaves the target at once says little of the plant, which a law that keeps it there does.
     """
-    most = largest_error(context, settings)
-    if whole.error <= most or _reads(context):
+    return BELIEVED_NOISY if context.noise or near < np.inf else settings.believed
+
+
+def also_in_parts(
+    context: Context,
+    records: Sequence[Record],
+    whole: Belief | None,
+    settings: ImprovementSettings,
+) -> Belief | None:
+    """A model of parts of rollouts where the best one of whole rollouts, `whole`, predicts too little.
+
+    Else `whole` itself. Explorations of an unstable plant, and a wrong first law, lead to where no
+    model follows, and no good law leads: their beginnings near to the target are predicted. Those of a
+    chaotic plant are predicted in pieces. Where the plant leaves the target at once, a linear model of
+    short pieces near to it is the beginning of a law that keeps it there, of which more is measured.
+    """
+    believed = whole and is_believed(context, whole, settings)
+    if _reads(context) or (whole and believed and whole.once <= MOST_ONCE):
         return whole
-    most = min(most, whole.error / _CHAOTIC_GROWTH)
+    return (
+        _near(context, records, settings, linear=False)
+        or (whole and not believed and _in_pieces(context, records, whole, settings))
+        or _near(context, records, settings, linear=True)
+        or whole
+    )
+
+
+def _in_pieces(
+    context: Context, records: Sequence[Record], whole: Belief, settings: ImprovementSettings
+) -> Belief | None:
+    """A model that predicts pieces of rollouts of a chaotic plant, where small errors grow.
+
+    They are far smaller than those of whole rollouts; those of a plant that is described badly add up.
+    """
+    most = min(largest_error(context, settings), whole.error / _CHAOTIC_GROWTH)
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
     parts = [part for rollout in rollouts for part in pieces(rollout, _PIECES)]
     # What it was fitted to is predicted better than what it was not, and takes no other fit.
     known = _errors(context, whole.model, parts)
     if not (len(known) and known.mean() <= most):
-        return whole
+        return None
     found = believe(context, records, whole.model.kind, _PIECES, most)
-    return replace(found, whole=False) if found and found.error <= most else whole
+    return replace(found, whole=False) if found and found.error <= most else None
 
 
-def also_near(
-    context: Context,
-    records: Sequence[Record],
-    belief: Belief | None,
-    settings: ImprovementSettings,
-    limit: float,
+def _near(
+    context: Context, records: Sequence[Record], settings: ImprovementSettings, *, linear: bool
 ) -> Belief | None:
-    """A model of rollouts up to where a state exceeds this magnitude, where none predicts whole ones.
-
-    Else `belief` itself. A first law may drive the plant to where no model follows, and no good law
-    leads.
-    """
-    if _reads(context):
-        return belief
-    return _of_parts(context, [within(own, limit) for own in records], records, belief, settings)
-
-
-def also_around(
-    context: Context,
-    records: Sequence[Record],
-    belief: Belief | None,
-    settings: ImprovementSettings,
-    law: Array,
-) -> Belief | None:
-    """A model of what stays as near to the target as a law's rollouts, where none predicts the rest.
-
-    Else `belief` itself. Explorations of an unstable plant lead far from the target, and are then most
-    of what a model is judged by. Near to it there may be little excitation left, and a model then knows
-    the plant under its laws alone: rollouts of each law must be predicted by those of the others.
-    """
-    own = [record for record in records if record.usable and np.array_equal(record.policy, law)]
-    if len(own) < FEWEST or _reads(context):
-        return belief
-    away = np.concatenate([record.states for record in own]) - context.target
-    if not away.any():
-        return belief
-    units = np.sqrt(np.mean(away**2, axis=0))
-    units = np.maximum(units, LEAST * max(float(units.max()), 1e-300))
-    limit = float(np.abs(away / units).max())
-    near = [within(record, limit, context.target, units) for record in records]
-    found = _of_parts(context, near, records, None, settings)
-    return found if found and _predicts_others(context, near, found, settings) else belief
+    """The best model of beginnings near to the target, of regions of several sizes."""
+    most = BELIEVED_NOISY if linear else largest_error(context, settings)
+    rollouts = [_measured(context, own) for own in records if len(own.actions)]
+    sizes: dict[int, float] = {}
+    for near in (np.inf, *NEAR):  # of several in which the same is measured the largest
+        parts = beginnings(rollouts, context.target, near, context.weights)
+        sizes.setdefault(sum(len(own.actions) for own in parts), near)
+    regions = [near for near in sizes.values() if near < np.inf]
+    found = [believe(context, records, near=near, linear=linear) for near in regions]
+    good = [own for own in found if own and own.error <= most and own.once <= MOST_ONCE]
+    return min(good, key=lambda own: own.error, default=None)
 
 
 def _errors(context: Context, model: FieldModel, rollouts: Sequence[Measured]) -> Array:
     """E of each rollout."""
     worst = context.field_models.worst
     return errors(model, rollouts, context.target, worst, context.noise, context.weights)
-
-
-def _predicts_others(
-    context: Context, records: Sequence[Record], belief: Belief, settings: ImprovementSettings
-) -> bool:
-    """True if a model of this kind predicts rollouts of laws that it was not fitted to."""
-    groups: dict[bytes, list[Measured]] = {}
-    for record in records:
-        if len(record.actions):
-            rollout = limited(_measured(context, record), context.action_set)
-            groups.setdefault(record.policy.tobytes(), []).append(rollout)
-    found = []
-    for group in groups:
-        others = [rollout for name in groups if name != group for rollout in groups[name]]
-        model = others and fit_kind(
-            belief.model.kind,
-            others,
-            settings=context.field_models,
-            noise=context.noise,
-            line=context.line,
-            shape=context.shape,
-        )
-        if not model:
-            return False
-        found.append(_errors(context, model, groups[group]).mean())
-    return bool(np.mean(found) <= largest_error(context, settings))
-
-
-def _of_parts(
-    context: Context,
-    near: Sequence[Record],
-    records: Sequence[Record],
-    belief: Belief | None,
-    settings: ImprovementSettings,
-) -> Belief | None:
-    """The model of the beginnings `near` of rollouts, if it predicts them; else `belief`."""
-    if sum(len(record.states) for record in records) == sum(len(own.states) for own in near):
-        return belief
-    most = largest_error(context, settings)
-    found = believe(context, [own for own in near if len(own.actions)], most=most)
-    return found if found and found.error <= most else belief
 
 
 def _reads(context: Context) -> bool:

@@ -32,9 +32,13 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
+from pdeloop.method.design.finite_horizon import finite_horizon_of
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.models import FieldModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
+
+LARGEST = 512
+"""Numbers of a state up to which Riccati equations are solved, with work of its third power."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +122,14 @@ class ClosedLoop(ClosedLoopProblem):
         is the same in every simulation of as many fields.
     cost : Cost or None
         Another quadratic cost in place of that of q, r and z_r.
+    reach : float
+        Magnitude of a state beyond which a simulation counts as not finite.
     """
 
     model: FieldModel = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
     cost: Cost | None = field(default=None, kw_only=True)
+    reach: float = field(default=np.inf, kw_only=True)
 
     @property
     def constants(self) -> int:
@@ -177,8 +184,8 @@ class ClosedLoop(ClosedLoopProblem):
         n_z, n_a = self.model.n_z, self.model.n_a
         offsets = self._offsets(fields)
         states, _, actions = rolled(self._sweep, n_a, *self._rolled(theta, fields, offsets))
-        known = np.isfinite(states).all(axis=2)
         with np.errstate(all="ignore"):
+            known = (np.abs(states) <= min(self.reach, np.finfo(np.float64).max)).all(axis=2)
             costs = self._cost_and_slopes(states, actions, fields)[0]
         costs[~(np.all(known, axis=1) & np.isfinite(costs))] = np.inf
         known = np.logical_and.accumulate(known, axis=1)
@@ -308,6 +315,25 @@ class ClosedLoop(ClosedLoopProblem):
         changed = theta.copy()
         changed[:n_a, n_f:] -= excess.T
         return changed
+
+    def designed(self) -> Array | None:
+        """The LQ-tracking law of the model linearised at the target, as far as U knows the state.
+
+        None for a law with memory, and where the model has none.
+        """
+        cost, model = self._stage, self.model
+        if len(self.memory_input) or model.n_z != len(self.U) or model.n_z > LARGEST:
+            return None
+        a, target = cost.action_target, self.target
+        with np.errstate(all="ignore"):
+            A, B = model.linearise(target, a)
+            drift = model.step(target[None], a[None])[0] - target - B @ a
+            try:
+                K, b = finite_horizon_of(A, B, drift, cost, target)
+            except (np.linalg.LinAlgError, ValueError):
+                return None
+        theta = np.hstack([K @ self.U, np.tile((b - K @ target)[:, None], self.constants)])
+        return theta if np.isfinite(theta).all() else None
 
     def calmer(self, theta: Array, share: float) -> Array:
         """The law with this share of the gains of its actions, and the same action at the target."""

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.closed_loop import LARGEST, ClosedLoop
 from pdeloop.method.adapt.settings import ImprovementSettings
 from pdeloop.method.design.finite_horizon import action_curvature
 
@@ -38,8 +38,6 @@ _HALVINGS = 12
 
 FAR = 10.0
 """The cost of a law without a finite one, per cost of the law to begin with."""
-LARGEST = 512
-"""Numbers of a state up to which R + B^T P B is worked out; its work grows with their third power."""
 
 
 @dataclass(frozen=True, eq=False)

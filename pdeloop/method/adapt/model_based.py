@@ -36,10 +36,9 @@ from pdeloop.method.adapt.base import (
 )
 from pdeloop.method.adapt.belief import (
     Belief,
-    also_around,
-    also_in_pieces,
-    also_near,
+    also_in_parts,
     believe,
+    is_believed,
     largest_error,
 )
 from pdeloop.method.adapt.estimate import Estimate
@@ -56,7 +55,6 @@ from pdeloop.method.adapt.replay import (
     GROWS,
     LARGEST_TRUST,
     SHRINKS,
-    best_measured,
     best_on_same_fields,
     costs_by_field,
     step,
@@ -71,8 +69,8 @@ from pdeloop.method.adapt.verdict import (
     FIRST,
     NONE,
     beats_no_control,
+    cheaper_law,
     choose,
-    earlier_law,
     evidence_of,
     evidence_of_rollouts,
     measured_change,
@@ -149,8 +147,9 @@ class ModelBased(Optimizer):
         ]
         self._before = [*explored, *context.measured]
         self._schedule = Schedule(len(self._before), rollouts, self._settings)
-        self._reach = _REACH * max(float(np.abs(known.states).max()) for known in self._before)
-        self._records = Records(self._reach)
+        self._records = Records(
+            _REACH * max(float(np.abs(own.states).max()) for own in self._before)
+        )
         self._progress = Progress(self._first.copy())
 
     @classmethod
@@ -378,13 +377,8 @@ class ModelBased(Optimizer):
         if other is not None:
             belief, row["noise"] = other
             self._take_noise(other[1])
-        elif belief is not None and not self._is_believed(belief):
-            belief = also_in_pieces(self._context, known, belief, self._settings)
-        if belief is None or not self._is_believed(belief):
-            belief = also_near(self._context, known, belief, self._settings, self._reach)
-        if belief is None or not self._is_believed(belief):
-            best = best_measured(self._records.all(), self._first)
-            belief = also_around(self._context, known, belief, self._settings, best)
+        else:
+            belief = also_in_parts(self._context, known, belief, self._settings)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
@@ -413,7 +407,7 @@ class ModelBased(Optimizer):
 
     def _is_believed(self, belief: Belief) -> bool:
         """True if the law is improved on this model."""
-        return belief.error <= largest_error(self._context, self._settings)
+        return is_believed(self._context, belief, self._settings)
 
     def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
         """A step along measured rollouts from the law that is best on fields of the first one."""
@@ -518,7 +512,7 @@ class ModelBased(Optimizer):
         if progress.belief is not None and self._model_compares and not progress.replayed:
             loop = progress.belief.loop(self._context)
         confidence, fields = self._settings.confidence, self._fields()
-        found = earlier_law(loop, progress.policy, list(laws.values()), known, fields, confidence)
+        found = cheaper_law(loop, progress.policy, known, fields, confidence)
         if found is None:
             return
         law, saved = found

@@ -275,11 +275,13 @@ def _descent(
 
     Its arguments are these laws, measured fields and how many to draw.
     """
-    curvature = curvature_of(loop)
+    curvature, designed = curvature_of(loop), loop.designed()
+    others = [] if designed is None else [designed]
 
     def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
         drawn = mixtures(fields, most, rng, components, periodic=periodic)
         every, weights = weighted(fields, drawn)
+        starts = [*starts, *others]
         if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
             starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
         start = cheapest(loop, starts, every, weights)

@@ -179,18 +179,6 @@ class Records:
         return states[:length], actions[: max(length - 1, 0)]
 
 
-def within(
-    record: Record, limit: float, centre: Array | float = 0.0, units: Array | float = 1.0
-) -> Record:
-    """The rollout up to the first state of which a number is farther from `centre`, in units."""
-    far = np.abs((record.states - centre) / units).max(axis=1) > limit
-    if not far.any():
-        return record
-    length = int(np.argmax(far))
-    actions = record.actions[: max(length - 1, 0)]
-    return replace(record, states=record.states[:length], actions=actions)
-
-
 def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
     """Denoised rollouts.
 

@@ -173,7 +173,10 @@ def evidence_of(
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}
     for name, law in laws.items():
-        excess = _excess(loop, law, [r for r in records if np.array_equal(r.policy, law)])
+        own = [r for r in records if np.array_equal(r.policy, law)]
+        excess = _excess(loop, law, own)
+        if any(record.usable for record in own) and not np.isfinite(excess).any():
+            return evidence_of_rollouts(laws, base, records)  # the model knows nothing of this law
         same = name != base and np.array_equal(law, laws[base])
         if same or not (len(excess) or name == base):
             continue
@@ -227,30 +230,29 @@ def _difference(own: Mapping[int, float], base: Mapping[int, float]) -> Estimate
     return mean_of(np.array(list(finite.values()))) - mean_of(np.array(list(others.values())))
 
 
-def earlier_law(
+def cheaper_law(
     loop: ClosedLoop | None,
     chosen: Array,
-    others: Sequence[Array],
     records: Sequence[Record],
     fields: Array,
     confidence: float,
 ) -> tuple[Array, Estimate] | None:
-    """The measured law, of none that was compared before, that beats the chosen one beyond chance.
+    """The measured law that beats the chosen one beyond chance.
 
     The difference is that of rollouts, and on a model that of its costs corrected by rollouts, as in
     `evidence_of`; the estimate with the smaller error counts. A law that was measured is so never lost
     to one that a model promised more of.
 
-    others: the laws that were compared; loop: of the model, or none; fields: as for `evidence_of`.
+    loop: of the model, or none; fields: as for `evidence_of`.
 
     Returns
     -------
     law, its change against the chosen one, or None
     """
     laws = {record.policy.tobytes(): record.policy for record in records}
-    known = {law.tobytes() for law in (chosen, *others)}
+    laws.pop(chosen.tobytes(), None)
     found: tuple[Array, Estimate] | None = None
-    for law in (law for key, law in laws.items() if key not in known):
+    for law in laws.values():
         if sum(np.array_equal(record.policy, law) for record in records) < 2:
             continue
         estimates = [measured_change(records, law, chosen)]

@@ -48,12 +48,20 @@ from pdeloop.method.models import (
     fit_field_model,
 )
 from pdeloop.method.models.base import Law, Samples, saturated
-from pdeloop.method.models.choice import UNKNOWN, Accuracy, Scale, accuracy_of, limited, turns
+from pdeloop.method.models.choice import (
+    UNKNOWN,
+    Accuracy,
+    Scale,
+    accuracy_of,
+    limited,
+    scale_of,
+    turns,
+)
 from pdeloop.method.models.denoising import smoothed
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.prediction import NEAR, beginnings, predicted, usable
 from pdeloop.method.models.prediction import pieces as cut
-from pdeloop.method.models.prediction import predicted, usable
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
@@ -84,8 +92,6 @@ NOISY = 0.3
 FAR = 3.0
 """Distance of the target from the mean state, relative to that of the farthest measured state, above
 which it is outside of the data."""
-LEAST = 1e-6
-"""Least unit of a number of the state, relative to the largest: what hardly moves has no say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +205,7 @@ def best_model(
     models: FieldModelSettings = MODEL_DEFAULTS,
     axes: tuple[int, ...] = (),
     weights: Array | None = None,
-) -> tuple[FittedModel | None, float, list[Measured]]:
+) -> tuple[FittedModel | None, float, list[Measured], float]:
     """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
 
     The noise is what the model was fitted for where another, or none, was declared; 0: as declared.
@@ -213,11 +219,14 @@ def best_model(
     """
     rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
     if len(target) > _FIELD_LARGEST:
-        return None, 0.0, rollouts
-    scale, line = variation(trajectories), len(axes) < 2
+        return None, 0.0, rollouts, 0.0
+    scale, line = scale_of([states for states, _ in trajectories]), len(axes) < 2
+    most = max(settings.field_error, NOISY) if noise else settings.field_error
     shape = () if line or len(target) % math.prod(axes) else axes
 
-    def fitted(data: Sequence[Measured], by_scale: bool = False) -> FittedModel | None:
+    def fitted(
+        data: Sequence[Measured], by_scale: bool = False, linear: bool = False
+    ) -> FittedModel | None:
         return fit_field_model(
             data,
             target,
@@ -229,7 +238,8 @@ def best_model(
             scale=scale,
             by_scale=by_scale,
             weights=weights,
-            most=max(settings.field_error, NOISY) if noise else settings.field_error,
+            most=most,
+            linear=linear,
         )
 
     whole = fitted(rollouts)
@@ -246,18 +256,27 @@ def best_model(
             weights=weights,
         )
         if misjudged is not None:
-            return *misjudged, rollouts
+            return *misjudged, rollouts, most
     data, best = rollouts, whole
-    if error > settings.field_error:
-        parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
-        found = fitted(parts)
-        if found is not None and found.error < error:
-            data, best, error = parts, found, found.error
+    parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
+    found = fitted(parts) if error > settings.field_error else None
+    if found is not None and found.error < error:
+        data, best, error = parts, found, found.error
+    exact = best is not None and (noise or best.own.one_step <= NOISY)
+    for linear in (False, True):
+        if exact and error <= most:
+            break
+        near = [beginnings(rollouts, target, limit, weights, short=linear) for limit in NEAR]
+        known = [(own, parts) for parts in near if (own := fitted(parts, linear=linear))]
+        known = [pair for pair in known if linear or pair[0].error <= most]
+        own, parts = min(known, key=lambda pair: pair[0].own.one_step, default=(None, parts))
+        if own is not None and own.own.one_step <= NOISY:
+            return own, 0.0, parts, NOISY
     if best is not None and error <= settings.field_error < best.own.simulated:
         again = fitted(data, by_scale=True)
         if again is not None and again.own.simulated < best.own.simulated:
             best = again
-    return best, 0.0, data
+    return best, 0.0, data, most
 
 
 def regression_accuracy(
@@ -334,19 +353,18 @@ def field_law(
         Modes of the law; 0: as many as `other` has.
     """
     weights = None if cost is None else cost.state_weights
-    fitted, found, rollouts = best_model(
+    fitted, found, rollouts, most = best_model(
         trajectories, target, action_set, settings, noise, models, axes, weights
     )
     if fitted is None or found:
         return FieldLaw(fitted, noise=found)
-    n_s, scale = other.U.shape[1], variation(trajectories)
+    n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
     limits = [limited(rollout, action_set) for rollout in rollouts]
     with one_thread():
         regression = regression_accuracy(
             limits, n_s, scale, models, noise, constant=other.d is not None
         )
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    most = max(settings.field_error, NOISY) if noise else settings.field_error
     accepted = _accepted(known, most, models.better)
     model = fitted.model
     if not accepted and _is_better(fitted.own, regression):
@@ -413,14 +431,6 @@ def field_law(
     return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)
 
 
-def variation(trajectories: Sequence[Trajectory]) -> Scale:
-    """The mean state, and the standard deviation of every number of the state."""
-    states = np.concatenate([states for states, _ in trajectories])
-    spread = states.std(axis=0)
-    units = np.maximum(spread, max(LEAST * float(spread.max()), 1e-300))
-    return Scale(states.mean(axis=0), units)
-
-
 def _accepted(
     models: Sequence[tuple[FieldModel, Accuracy]], most: float, better: float
 ) -> list[FieldModel]:
@@ -465,7 +475,7 @@ def linearisation_point(
     something of other states as well.
     """
     states = np.concatenate([states for states, _ in trajectories])
-    mean, units = variation(trajectories)
+    mean, units = scale_of([states for states, _ in trajectories])
     away = np.linalg.norm((states - mean) / units, axis=1)
     far = float(np.linalg.norm((target - mean) / units) / max(away.max(), 1e-300))
     if far <= FAR or isinstance(fitted.model, LinearModel | LowRankModel):

@@ -21,7 +21,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Measured, Samples, saturated
 from pdeloop.method.models.denoising import cleaned_states
-from pdeloop.method.models.kinds import Kind, kinds_of
+from pdeloop.method.models.kinds import LINEAR_RIDGES, Kind, kinds_of
 from pdeloop.method.models.noise_level import share_of_noise
 from pdeloop.method.models.prediction import errors, one_step, pieces, predicted, usable
 from pdeloop.method.models.settings import DEFAULTS, REPRODUCED_NOISY, FieldModelSettings
@@ -32,6 +32,8 @@ _HOPELESS = 20.0
 _GROWN = 10.0
 """E that the noise of an initial state may lead to, per share of the noise in the states."""
 
+LEAST_UNIT = 1e-6
+"""Least unit of a number of the state, relative to the largest: what hardly moves has no say."""
 FEWEST_SAMPLES = 4
 
 
@@ -43,6 +45,14 @@ class Scale(NamedTuple):
 
     reference: Array
     units: Array
+
+
+def scale_of(states: Sequence[Array]) -> Scale:
+    """The mean state, and the standard deviation of every number of the state."""
+    every = np.concatenate(states)
+    spread = every.std(axis=0)
+    units = np.maximum(spread, max(LEAST_UNIT * float(spread.max()), 1e-300))
+    return Scale(every.mean(axis=0), units)
 
 
 class Accuracy(NamedTuple):
@@ -96,6 +106,7 @@ def fit_field_model(
     by_scale: bool = False,
     weights: Array | None = None,
     most: float = np.inf,
+    linear: bool = False,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -130,6 +141,8 @@ def fit_field_model(
         W of E (`prediction.errors`), in which the numbers of a state count as in the cost.
     most : float
         Largest E with which a model is used: one of fewer unknowns is no better than others above it.
+    linear : bool
+        Try only linear models.
     """
     rollouts = [limited(rollout, action_set) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
@@ -140,6 +153,8 @@ def fit_field_model(
         enough = min(enough, REPRODUCED_NOISY)
         settings = replace(settings, reproduced=max(settings.reproduced, enough))
     kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
+    if linear:
+        kinds = [kind for kind in kinds if kind.name in LINEAR_RIDGES]
     if knows_noise:
         kinds = [kind for kind in kinds if kind.fit_noisy is not None]
     kinds.sort(key=lambda kind: kind.name != first)
@@ -176,24 +191,6 @@ def fit_field_model(
                 seen = [(kind.name, error) for kind, error in judged.items()]
                 return FittedModel(model, judged[kind], seen, own[kind])
     return None
-
-
-def fit_kind(
-    name: str,
-    rollouts: Sequence[Measured],
-    *,
-    settings: FieldModelSettings = DEFAULTS,
-    noise: float = 0.0,
-    line: bool = True,
-    shape: tuple[int, ...] = (),
-) -> FieldModel | None:
-    """The model of one kind, fitted to all rollouts; None where it cannot be. Arguments: as above."""
-    if noise:
-        rollouts = with_clean(rollouts, noise, line=line)
-    n_z = rollouts[0].states.shape[1]
-    kinds = {kind.name: kind for kind in kinds_of(n_z, 1, settings, line=line, shape=shape)}
-    with one_thread():
-        return _fitted(kinds[name], rollouts, noise)
 
 
 def with_clean(

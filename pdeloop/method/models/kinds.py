@@ -24,7 +24,7 @@ from pdeloop.method.models.spectral_fit import fit_spectral
 from pdeloop.method.models.symbols import Form
 
 _FEWEST_POINTS = 8
-"""Minimum number of grid points of a spectral model."""
+"""Minimum number of points of a field."""
 NEAR_NEEDED = 0.05
 """Least E of the other kinds above which models of neighbours are tried."""
 _SPARSE_NUMBERS = 40
@@ -152,7 +152,7 @@ def _several_fields(
     n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
 ) -> list[Kind]:
     """Kinds of fields that stand one after the other; `prefix` is that of their names."""
-    if n_z % components or n_z // components < 3:
+    if n_z % components or n_z // components < _FEWEST_POINTS:
         return []
     kinds: list[Kind] = []
     if components > 1 and n_z <= DENSE:

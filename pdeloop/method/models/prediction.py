@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Law, Measured, Samples
 
+NEAR = (10.0, 3.0, 1.0)
+"""Distances from the target, relative to the largest of initial states, up to which a model is sought
+where none predicts whole rollouts."""
+_SHORT = 8
+"""Steps of a piece of them, at most."""
+
 
 def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
     """z_0 .. z_L of each rollout from its z_0 as it is best known, under its law or else its actions.
@@ -124,6 +130,32 @@ def pieces(rollout: Measured, count: int) -> list[Measured]:
         for begin, end in pairwise(edges)
         if end > begin
     ]
+
+
+def beginnings(
+    rollouts: Sequence[Measured],
+    target: Array,
+    limit: float,
+    weights: Array | None = None,
+    *,
+    short: bool = False,
+) -> list[Measured]:
+    """Each rollout up to where |W (z - z_r)| exceeds `limit` times that of any first state.
+
+    weights: as for `errors`; short: in pieces along which what is unstable hardly grows.
+    """
+    seen, rollouts = weighing(weights), [own for own in rollouts if len(own.states)]
+    with np.errstate(all="ignore"):
+        away = [np.linalg.norm(seen(own.states - target), axis=1) for own in rollouts]
+    most = limit * max((float(own[0]) for own in away), default=0.0)
+    found = []
+    for own, sizes in zip(rollouts, away, strict=True):
+        end = _leading((sizes <= most)[:, None])
+        if end > 1:
+            clean = None if own.clean is None else own.clean[:end]
+            begun = Measured(own.states[:end], own.actions[: end - 1], own.law, clean)
+            found += pieces(begun, -(-len(begun.actions) // _SHORT) if short else 1)
+    return found
 
 
 def _later(law: Law | None, steps: int) -> Law | None:
