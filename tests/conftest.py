@@ -24,6 +24,7 @@ from pdeloop.method.laws.registry import OWN_LAWS
 from tests.support import leftovers
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.compiled import COMPILED
+from tests.support.domains import share_domains
 from tests.support.forked_workers import fork_workers
 from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
@@ -43,6 +44,10 @@ LONG = (
 )
 """Files with the longest tests over topics. One of them at the end leaves the other workers idle."""
 
+# The user's ROS settings do not reach the tests, nor the fixtures that several tests share.
+ROS_SETTINGS = ("ROS_DOMAIN_ID", "FASTRTPS_DEFAULT_PROFILES_FILE", "PDELOOP_NETWORK")
+for name in ROS_SETTINGS:
+    os.environ.pop(name, None)
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False  # for the tests themselves, whose asserts each worker would rewrite
@@ -55,6 +60,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 def temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The temporary folder of whatever the tests run, of this worker alone; see `leftovers`."""
     folder = tmp_path_factory.mktemp("tmp", numbered=False)  # short: sockets are in it
+    share_domains(folder)
     os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
     return folder
 
@@ -87,8 +93,8 @@ def _compiled(tmp_path_factory: pytest.TempPathFactory, temporary_folder: Path) 
 
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The user's ROS settings do not reach the tests, and no test those after it."""
-    for name in ("ROS_DOMAIN_ID", "FASTRTPS_DEFAULT_PROFILES_FILE", "PDELOOP_NETWORK"):
+    """What one test sets in the environment does not reach those after it."""
+    for name in ROS_SETTINGS:
         monkeypatch.delenv(name, raising=False)
     for kind in (OWN_EQUATIONS, OWN_LAWS, OWN_OPTIMIZERS, OWN_PLANTS):
         # Set, if only to what it is: code that a test allows is not allowed afterwards.

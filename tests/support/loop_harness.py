@@ -32,10 +32,11 @@ import pdeloop.domain
 import pdeloop.live
 from pde_sim_node import run_record
 from pdeloop import supervisor
-from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
+from pdeloop.domain import DOMAINS_FOLDER, own_domain
 from pdeloop.process.isolation import loopback_environment
 from pdeloop.process.start import BLAS_THREADS, die_with
 from tests.support import forked_nodes
+from tests.support.domains import share_domains
 
 ROOT = Path(__file__).resolve().parents[2]
 FORKING = multiprocessing.get_context("forkserver")
@@ -338,16 +339,11 @@ def processes(folder: Path) -> Iterator[Processes]:
 
 @contextlib.contextmanager
 def without_domain(loop: Processes) -> Iterator[None]:
-    """As a person uses it: no domain is given, commands take one, and find each other's loops.
+    """As a person uses it: no domain is given, commands take a free one, and find each other's loops.
 
-    They find those of this test only, and take one of two domains that this test holds: with a
-    temporary folder of their own they would not see which ones the tests beside them hold.
+    They find those of this test only, which are registered in a temporary folder of its own.
     """
-    own = loop.environment.pop("ROS_DOMAIN_ID")
-    folder = loop.folder / DOMAINS_FOLDER.name
-    folder.mkdir()
+    del loop.environment["ROS_DOMAIN_ID"]
+    share_domains(loop.folder)
     loop.environment["TMPDIR"] = str(loop.folder)
-    with own_domain() as another, contextlib.ExitStack() as held:
-        for domain in set(map(str, DOMAINS)) - {own, str(another)}:
-            fcntl.flock(held.enter_context((folder / domain).open("w")), fcntl.LOCK_EX)
-        yield
+    yield

@@ -172,3 +172,19 @@ def test_a_domain_in_which_somebody_is_left_is_not_given_out(monkeypatch, partic
         for _ in range(10):
             with own_domain() as chosen:
                 assert chosen == second
+
+
+TAKES_A_DOMAIN = """
+import sys
+from pdeloop import domain
+domain.DOMAINS = [int(sys.argv[1])]
+with domain.own_domain():
+    print("taken")
+"""
+
+
+def test_a_program_of_a_test_takes_no_domain_of_another_test() -> None:
+    with own_domain() as held:
+        command = [sys.executable, "-c", TAKES_A_DOMAIN, str(held)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 1 and "are in use" in done.stderr, done.stdout
