@@ -20,19 +20,18 @@ from pdeloop.messages.parameters import model_order
 from pdeloop.messages.signature import CONSTANTS
 from pdeloop.messages.spec import IDENTIFICATION_SETTINGS
 from pdeloop.method.design import lqg, lqt
-from pdeloop.method.design.dead_time import with_dead_time
 from pdeloop.method.design.field_law import FieldLaw, field_law
+from pdeloop.method.design.lqg import with_dead_time
 from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models import FieldModelSettings
-from pdeloop.method.reduce import dmdc, regression
+from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, Channels
 from pdeloop.method.reduce.identifiability import Identifiability, examine
 from pdeloop.method.reduce.input_delay import shifted, study_delays
 from pdeloop.method.reduce.order import study_orders
-from pdeloop.method.reduce.reduced_model import ReducedModel
-from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
+from pdeloop.method.reduce.reduced_model import DEFAULTS, IdentificationSettings, ReducedModel
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
@@ -167,7 +166,7 @@ def identify(
             trajectories, n_s=n_s, channels=channels, constant=constant
         )
     n_a = np.shape(trajectories[0][1])[-1]
-    return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s, channels=channels)
+    return regression.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s, channels=channels)
 
 
 def examined(
@@ -184,7 +183,9 @@ def examined(
     found = examine(trajectories, U, channels)
     if method != "dmdc":
         return found
-    more = dmdc.truncation_remarks(trajectories, p or U.shape[1] + np.shape(model.B)[1], channels)
+    more = regression.truncation_remarks(
+        trajectories, p or U.shape[1] + np.shape(model.B)[1], channels
+    )
     return replace(found, remarks=(*found.remarks, *more))
 
 
@@ -194,7 +195,9 @@ def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
     if not n_s or settings.identification == "subspace":
         return  # as the data suggest
     if settings.identification == "dmdc":
-        dmdc.check_sizes(settings.dmdc_rank or n_s + n_a, n_s, n_z=state_size, n_a=n_a, steps=steps)
+        regression.check_truncated_sizes(
+            settings.dmdc_rank or n_s + n_a, n_s, n_z=state_size, n_a=n_a, steps=steps
+        )
     else:
         regression.check_sizes(n_s, n_a, steps)
 

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from pdeloop.method.adapt.base import Rollout as Rollout
     from pdeloop.method.adapt.base import RolloutResult as RolloutResult
     from pdeloop.method.adapt.step_optimizer import StepOptimizer as StepOptimizer
+    from pdeloop.method.design.finite_horizon import track_horizon as track_horizon
     from pdeloop.method.design.lqt import track as track
-    from pdeloop.method.design.tracking import track_horizon as track_horizon
     from pdeloop.method.laws.base import Law as Law
     from pdeloop.method.reduce.identifiability import (
         IdentifiabilityWarning as IdentifiabilityWarning,
@@ -63,7 +63,7 @@ _NAMES = {
     "pdeloop.method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
     "pdeloop.method.adapt": ("Optimizer", "Rollout", "RolloutResult", "StepOptimizer"),
     "pdeloop.method.design.lqt": ("track",),
-    "pdeloop.method.design.tracking": ("track_horizon",),
+    "pdeloop.method.design.finite_horizon": ("track_horizon",),
     "pdeloop.method.laws.base": ("Law",),
     "pdeloop.method.reduce.order": ("study_orders",),
     "pdeloop.method.reduce.reduced_model": ("ReducedModel",),

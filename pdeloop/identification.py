@@ -26,7 +26,7 @@ from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import as_recorded, model_order, recorded_values, table
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED, CostColumn
-from pdeloop.method.reduce import dmdc, regression
+from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels
 from pdeloop.method.reduce.identifiability import Identifiability, NotIdentifiableError
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
@@ -475,7 +475,7 @@ def _truncated(p: int, data: Steps, U: Array) -> ReducedModel:
     n_s = U.shape[1]
     if 0 < p < n_s:
         raise ValueError("more modes than directions")
-    return dmdc.fit(data, U, p or n_s + data.inputs.shape[1])
+    return regression.truncated_fit(data, U, p or n_s + data.inputs.shape[1])
 
 
 def _refitted(

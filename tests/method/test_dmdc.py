@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.reduce.dmdc import truncated_dmdc
 from pdeloop.method.reduce.reduced_model import ReducedModel
+from pdeloop.method.reduce.regression import truncated_dmdc
 from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
 
 N_S, N_A, STEPS = 3, 2, 40

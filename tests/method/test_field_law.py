@@ -26,8 +26,7 @@ from pdeloop.method.models import affine_law
 from pdeloop.method.models.choice import Accuracy, FittedModel
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
 from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.reduce.reduced_model import ReducedModel
-from pdeloop.method.reduce.settings import IdentificationSettings
+from pdeloop.method.reduce.reduced_model import IdentificationSettings, ReducedModel
 from tests.support.small import FEW_FITS
 
 Array = np.ndarray

@@ -15,7 +15,7 @@ import pytest
 
 from controller_node.identification import DesignSettings, design_each, identify
 from pdeloop.messages.arrays import Array
-from pdeloop.method.reduce import dmdc
+from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import Channels
 from pdeloop.method.reduce.identifiability import CLOSE, NotIdentifiableError, examine
 from pdeloop.method.reduce.order import study_orders
@@ -110,7 +110,7 @@ def test_what_cannot_be_told_apart_is_refused_in_any_unit(
     data = [(z_unit * states, a_unit * actions)]
     for refuse in (
         lambda: exact_regression(data, n_s=N_Z),
-        lambda: dmdc.truncated_dmdc(data, p=2, n_s=2),
+        lambda: regression.truncated_dmdc(data, p=2, n_s=2),
         lambda: study_orders(data),
         lambda: identify(data, method="regression", n_s=0),
     ):

@@ -11,7 +11,7 @@ import pytest
 from scipy import linalg
 
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.dead_time import with_dead_time
+from pdeloop.method.design.lqg import with_dead_time
 from pdeloop.method.design.lqt import track
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.reduce.input_delay import shifted, study_delays

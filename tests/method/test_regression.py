@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pdeloop.method.reduce import dmdc
+from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.regression import exact_regression
 from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
 from tuner_node.exploration import least_variance
@@ -63,15 +63,15 @@ def test_truncated_dmdc_is_the_same_at_full_rank() -> None:
     rng = np.random.default_rng(5)
     states, actions = rng.standard_normal((STEPS + 1, 8)), rng.standard_normal((STEPS, N_A))
     model = exact_regression([(states, actions)], n_s=8)
-    truncated = dmdc.truncated_dmdc([(states, actions)], p=8 + N_A, n_s=8)
+    truncated = regression.truncated_dmdc([(states, actions)], p=8 + N_A, n_s=8)
     for name in ("A", "B", "U"):
         np.testing.assert_allclose(getattr(truncated, name), getattr(model, name), atol=1e-12)
     # With fewer directions than n_s + n_a it loses the inputs first when they are small.
     with pytest.raises(ValueError, match=r"p = 8 keeps 0\.\d+ %, 0\.\d+ % of a move of a1 and a2"):
-        dmdc.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
-    cut = dmdc.truncated_dmdc([(states, 0.05 * actions)], p=8, n_s=8)
+        regression.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
+    cut = regression.truncated_dmdc([(states, 0.05 * actions)], p=8, n_s=8)
     assert np.linalg.norm(0.05 * cut.B) < 0.05 * np.linalg.norm(model.B)
-    (remark,) = dmdc.truncation_remarks([(states, 0.05 * actions)], 8)
+    (remark,) = regression.truncation_remarks([(states, 0.05 * actions)], 8)
     assert "of a move of a1 and a2" in remark
 
 

@@ -15,8 +15,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
-from pdeloop.method.design.finite_horizon import finite_horizon_of
-from pdeloop.method.design.tracking import track_horizon
+from pdeloop.method.design.finite_horizon import finite_horizon_of, track_horizon
 from pdeloop.method.laws.calls import laws_of
 from pdeloop.method.laws.feedforward import FeedForward
 from tests.support.small import FEW_FITS

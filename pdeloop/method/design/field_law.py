@@ -39,6 +39,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.finite_horizon import finite_horizon, finite_horizon_of
+from pdeloop.method.design.lqt import target_gain
 from pdeloop.method.models import (
     FieldModel,
     FieldModelSettings,
@@ -66,6 +67,8 @@ from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
 from pdeloop.method.reduce.reduced_model import (
+    DEFAULTS,
+    IdentificationSettings,
     ReducedModel,
     Steps,
     Trajectory,
@@ -73,7 +76,6 @@ from pdeloop.method.reduce.reduced_model import (
     pieces,
 )
 from pdeloop.method.reduce.regression import fit
-from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
 from pdeloop.process.one_thread import one_thread
 
 _FIELD_LARGEST = 512
@@ -407,10 +409,8 @@ def field_law(
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
     U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, order or n_s)
     K_a, s_r = K @ U, U.T @ target
-    # Of the K_b with the wanted constant part the least; none where the target is outside of U.
-    size = float(s_r @ s_r)
-    constant = b - K @ point
-    K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    # There is no constant part where the target is outside of U.
+    K_b = target_gain(b - K @ point, s_r)
     d = U.T @ (point + drift - A @ point)
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 

@@ -12,12 +12,21 @@ A x_k + B a_k has the least covariance. With the tracking gains of `pdeloop.meth
 are designed as if the state were known, it is the optimal law: LQG, by the separation of estimation and
 control.
 
+Where inputs act late, with delays n_j, s_{k+1} = A s_k + sum_j B_j a_{j,k-n_j} + d is a model without
+delays of the state with all inputs that have not acted yet,
+
+    x_k = [s_k; a_{j,k-1} .. a_{j,k-n_j} of every j],        x_{k+1} = A_x x_k + B_x a_k + d_x,
+
+whose gains are optimal for the plant with its dead times. Of x the measurement determines s alone; the
+law `observer` remembers the rest, as it is what it answered.
+
 References
 ----------
 Anderson, Moore, "Optimal Filtering", 1979, sections 4.4 (steady state) and 8.2 (separation: "Optimal
 Control: Linear Quadratic Methods", 1990, chapter 8).
 Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic
 Control 15(2), 1970 (noise from the correlation of residuals).
+Åström, Wittenmark, "Computer-Controlled Systems", 3rd ed., section 2.3 (sampling systems with delays).
 """
 
 from __future__ import annotations
@@ -33,9 +42,15 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.lqt import DesignError, track_outputs
-from pdeloop.method.reduce.reduced_model import Steps, repeated, steps_of
-from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
+from pdeloop.method.design.lqt import DesignError, output_law, target_gain
+from pdeloop.method.reduce.input_delay import Delays
+from pdeloop.method.reduce.reduced_model import (
+    DEFAULTS,
+    IdentificationSettings,
+    Steps,
+    repeated,
+    steps_of,
+)
 from pdeloop.method.reduce.subspace import InnovationModel
 from pdeloop.process.one_thread import one_thread
 
@@ -260,25 +275,89 @@ def law_of_innovations(
         The actuators do not reach a mode that does not decay, or the measurements do not see one.
     """
     A, B, C = model.A, model.B, model.C
-    n_z, n_a = len(model.U), B.shape[1]
-    if cost is None or cost.plain:
-        cost = Cost(
-            n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
-        )
     with one_thread():
         require_detectable(A, C)
-        seen = model.U @ C
-        try:
-            gains = track_outputs(A, B, seen, cost, 0.0 if model.d is None else model.d)
-            K_a, b = gains.K_a, gains.K_b @ (seen.T @ cost.field_target)
-        except DesignError:
-            if not or_no_control:
-                raise
-            K_a, b = np.zeros_like(B.T), np.zeros(n_a)
+        K_a, b = output_law(
+            A,
+            B,
+            model.U @ C,
+            target,
+            state_weight=state_weight,
+            action_weight=action_weight,
+            cost=cost,
+            d=model.d,
+            or_no_control=or_no_control,
+        )
         back = linalg.pinv(C)
         M = linalg.lstsq(A, model.G)[0]
         U = model.U @ back.T
         s_r = U.T @ target
-        size = float(s_r @ s_r)
-        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    K_b = target_gain(b, s_r)
     return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d)
+
+
+def with_dead_time(
+    rows: ModelRows,
+    delays: Delays,
+    target: Array,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+    or_no_control: bool = False,
+) -> ModelRows:
+    """A model with the last inputs in its state, its law, and the filter that it had, or L = I.
+
+    Parameters
+    ----------
+    rows : ModelRows
+        The model without delays, z_{k+1} by a_{k-n}.
+    delays : tuple of int
+        n of each input; those below 0 count as 0.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        q and r.
+    cost : Cost, optional
+        In place of them.
+    or_no_control : bool
+        Gains of 0 where there are no stabilising ones.
+
+    Raises
+    ------
+    DesignError
+        There are no stabilising gains.
+    """
+    late = [max(n, 0) for n in delays]
+    n_s, n_a, memory = len(rows.A), len(late), sum(late)
+    newest = n_s + np.cumsum([0, *late[:-1]])
+    A, B = np.zeros((n_s + memory, n_s + memory)), np.zeros((n_s + memory, n_a))
+    A[:n_s, :n_s] = rows.A
+    for j, n in enumerate(late):
+        if not n:
+            B[:n_s, j] = rows.B[:, j]
+            continue
+        first = newest[j]
+        B[first, j] = 1.0
+        A[first + 1 : first + n, first : first + n - 1] = np.eye(n - 1)
+        A[:n_s, first + n - 1] = rows.B[:, j]
+    none = np.zeros(memory)
+    d = None if rows.d is None else np.concatenate([rows.d, none])
+    seen = np.hstack([rows.measurement, np.zeros((len(rows.U), memory))])
+    K_a, b = output_law(
+        A,
+        B,
+        seen,
+        target,
+        state_weight=state_weight,
+        action_weight=action_weight,
+        cost=cost,
+        d=d,
+        or_no_control=or_no_control,
+    )
+    s_r = np.concatenate([rows.s_r, none])
+    K_b = target_gain(b, s_r)
+    with one_thread():
+        L = linalg.block_diag(np.eye(n_s) if rows.L is None else rows.L, np.zeros((memory, memory)))
+    U = np.hstack([rows.U, np.zeros((len(rows.U), memory))])
+    return replace(rows, A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=L, d=d)

@@ -155,7 +155,7 @@ def track(
 
 
 def track_outputs(A: Array, B: Array, U: Array, cost: Cost, d: ArrayLike = 0.0) -> Gains:
-    """The gains of any quadratic cost; see `pdeloop.method.design.tracking` for its terms.
+    """The gains of any quadratic cost; see `pdeloop.method.design.finite_horizon` for its terms.
 
     U is what the state looks like, z = U s, and its columns need not be orthonormal.
     """
@@ -169,9 +169,41 @@ def track_outputs(A: Array, B: Array, U: Array, cost: Cost, d: ArrayLike = 0.0) 
         p = _steady_state_map(closed_loop) @ (E.T @ w - closed_loop.T @ pushed)
         b = cost.action_target + linalg.solve(S, B.T @ (p - pushed), assume_a="pos")
         s_r = U.T @ cost.field_target
-        size = float(s_r @ s_r)
-        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
-    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if size > 0.0 else b)
+        K_b = target_gain(b, s_r)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if s_r.any() else b)
+
+
+def target_gain(b: Array, s_r: Array) -> Array:
+    """The least K_b with K_b s_r = b; 0 where s_r is."""
+    size = float(s_r @ s_r)
+    return np.outer(b, s_r) / size if size > 0.0 else np.zeros((len(b), len(s_r)))
+
+
+def output_law(
+    A: Array,
+    B: Array,
+    U: Array,
+    target: Array,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+    d: Array | None = None,
+    or_no_control: bool = False,
+) -> tuple[Array, Array]:
+    """K_a and b of a = K_a s + b for the cost of z = U s; or_no_control: 0 where none stabilises."""
+    if cost is None or cost.plain:
+        n_z, n_a = len(U), B.shape[1]
+        cost = Cost(
+            n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
+        )
+    try:
+        gains = track_outputs(A, B, U, cost, 0.0 if d is None else d)
+    except DesignError:
+        if not or_no_control:
+            raise
+        return np.zeros_like(B.T), np.zeros(B.shape[1])
+    return gains.K_a, gains.b + gains.K_b @ (U.T @ cost.field_target)
 
 
 def _feedback(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.design.tracking import track_horizon
+from pdeloop.method.design.finite_horizon import track_horizon
 from pdeloop.method.laws.base import Law, Parts
 
 

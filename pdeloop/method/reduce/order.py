@@ -17,7 +17,7 @@ References
 Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-validation).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
@@ -29,6 +29,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels, scaled
 from pdeloop.method.reduce.identifiability import examine_steps
 from pdeloop.method.reduce.reduced_model import (
+    DEFAULTS,
+    IdentificationSettings,
     ReducedModel,
     Steps,
     Trajectory,
@@ -37,9 +39,9 @@ from pdeloop.method.reduce.reduced_model import (
     pieces,
     repeated,
     steps_of,
+    turns,
 )
 from pdeloop.method.reduce.regression import fit, needs_constant
-from pdeloop.method.reduce.settings import DEFAULTS, IdentificationSettings
 from pdeloop.process.one_thread import one_thread
 
 _ORDER_PIECES = 8
@@ -180,7 +182,7 @@ def study_orders(
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
         constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
         by = fitted_by or (lambda data, U: fit(data, U, constant))
-        for fitted, held in _folds(known, settings):
+        for fitted, held in turns(pieces(known, _ORDER_PIECES), settings.order_folds):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
             most = min(numerical_rank(values, *data.after.shape), _determined(data, modes))
@@ -222,18 +224,6 @@ def _determined(data: Steps, modes: Array) -> int:
     lost = np.flatnonzero(heights <= steps * np.finfo(np.float64).eps)
     most: int = (lost[0] if lost.size else heights.size) - n_a
     return most
-
-
-def _folds(
-    trajectories: Sequence[Trajectory], settings: IdentificationSettings
-) -> Iterator[tuple[list[Trajectory], list[Trajectory]]]:
-    """Pieces to fit to and pieces that are held out."""
-    cut, folds = pieces(trajectories, _ORDER_PIECES), settings.order_folds
-    for fold in range(folds):
-        held = cut[fold::folds]
-        fitted = [piece for i, piece in enumerate(cut) if i % folds != fold]
-        if held and fitted:
-            yield fitted, held
 
 
 def _errors(model: ReducedModel, states: Array, actions: Array) -> Array:

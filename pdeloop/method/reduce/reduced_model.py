@@ -9,13 +9,13 @@ Y = [a_0 .. a_{N-1}]; U holds the leading left singular vectors of Z'.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,9 @@ from pdeloop.messages.array_files import read_arrays
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.files import write_atomically
 from pdeloop.method.reduce.channels import NUMBERED, Channels, scaled, state_faults
+from pdeloop.method.settings import Settings, setting
 
+T = TypeVar("T")
 Trajectory = tuple[Array, Array]
 """States (N + 1, n_z) and actions (N, n_a)."""
 ORTHONORMAL = 1e-9
@@ -34,6 +36,38 @@ INDEPENDENT = 1e-10
 """Least singular value of independent columns of norm 1."""
 SAME_TIME = 1e-6
 """Relative tolerance between two sampling times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentificationSettings(Settings):
+    """Constants of the reduced model and of the first law.
+
+    All are dimensionless: errors are relative to the data.
+    """
+
+    order_folds: int = setting(
+        4, "number of groups of pieces of an exploratory episode, each held out once", 2, 1000
+    )
+    order_share: float = setting(
+        0.8,
+        "share of the best order's reduction of the one-step error, on a logarithmic scale, that "
+        "the suggested order reaches",
+        0.0,
+        1.0,
+    )
+    field_error: float = setting(
+        0.05, "largest error of a model that a first law is designed from", 0.0, 1.0
+    )
+    noise_evidence: float = setting(
+        2.0,
+        "standard errors by which the residuals must show measurement noise before a filter is "
+        "designed for it",
+        0.0,
+        100.0,
+    )
+
+
+DEFAULTS = IdentificationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,6 +422,14 @@ def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:
         edges = np.unique(np.linspace(0, len(actions), count + 1).astype(int))
         cut += [(states[a : b + 1], actions[a:b]) for a, b in pairwise(edges)]
     return cut
+
+
+def turns(parts: Sequence[T], folds: int) -> Iterator[tuple[list[T], list[T]]]:
+    """Parts to fit to and others that are held out, so that each is held out once; neither is empty."""
+    for fold in range(folds):
+        others = [part for i, part in enumerate(parts) if i % folds != fold]
+        if others and len(parts) > fold:
+            yield others, list(parts[fold::folds])
 
 
 def leading_modes(after: Array, n_s: int, channels: Channels = NUMBERED) -> tuple[Array, Array]:

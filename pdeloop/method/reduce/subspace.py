@@ -41,7 +41,14 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels
 from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
-from pdeloop.method.reduce.reduced_model import Steps, Trajectory, leading_modes, repeated, steps_of
+from pdeloop.method.reduce.reduced_model import (
+    Steps,
+    Trajectory,
+    leading_modes,
+    repeated,
+    steps_of,
+    turns,
+)
 from pdeloop.process.one_thread import one_thread
 
 _SUBSPACE_TOLERANCE = 1.02
@@ -187,9 +194,7 @@ def _choose(
     """p and n with the least error on parts that were held out, and the errors of all."""
     parts = _parts(known)
     totals, changes = np.zeros(len(tried)), np.zeros(len(tried))
-    for fold in range(FOLDS):
-        others = [part for j, part in enumerate(parts) if j % FOLDS != fold]
-        own = [part for j, part in enumerate(parts) if j % FOLDS == fold]
+    for others, own in turns(parts, FOLDS):
         made, predictor = (0, 0), None
         for i, (p, n) in enumerate(tried):
             if not np.isfinite(totals[i]):
