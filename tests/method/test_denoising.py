@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models.denoising import denoised
+from pdeloop.method.models.noise_level import denoised
 
 SIGMA = 0.1
 

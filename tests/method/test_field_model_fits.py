@@ -16,7 +16,7 @@ from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, Ko
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
 from pdeloop.method.models.base import Samples
-from pdeloop.method.models.kinds import NEAR_RIDGES, kinds_of
+from pdeloop.method.models.choice import NEAR_RIDGES, kinds_of
 from pdeloop.method.models.linear import fit_linear
 from pdeloop.method.models.prediction import errors
 from tests.support.plants import plant_of

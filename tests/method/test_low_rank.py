@@ -8,7 +8,7 @@ import pytest
 
 from pdeloop.method.models import Measured, fit_field_model
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.linear import LowRankModel
 
 N_Z, R, N_A = 3000, 5, 2
 RNG = np.random.default_rng(0)

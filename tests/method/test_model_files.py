@@ -8,19 +8,26 @@ import pytest
 
 from pdeloop.method.models import FieldModel
 from pdeloop.method.models.base import MAX_SUBSTEPS
-from pdeloop.method.models.coarse import CoarseModel
 from pdeloop.method.models.files import FORMS, model_of
 from pdeloop.method.models.finite_difference import (
+    CoarseModel,
     FiniteDifferenceModel,
     features_of,
     neighbour_features,
 )
-from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.linear import LinearModel, LowRankModel
 from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.readings import ReadingsModel
-from pdeloop.method.models.sensed import Actuators, SensedModel, grid_points
-from pdeloop.method.models.sensed_unknowns import EQUATION, FIRST, SHARED, TERMS, unknowns
+from pdeloop.method.models.sensed import (
+    EQUATION,
+    FIRST,
+    SHARED,
+    TERMS,
+    Actuators,
+    SensedModel,
+    grid_points,
+    unknowns,
+)
 from pdeloop.method.models.spectral import SpectralModel
 
 N_Z, N_A = 8, 2

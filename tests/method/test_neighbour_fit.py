@@ -8,8 +8,8 @@ import pytest
 
 from pdeloop.method.models import FieldModelSettings, fit_field_model
 from pdeloop.method.models.base import Samples
-from pdeloop.method.models.kinds import NEAR_NEEDED, NEAR_RIDGES, kinds_of
-from pdeloop.method.models.neighbour_fit import fit_neighbours
+from pdeloop.method.models.choice import NEAR_NEEDED, NEAR_RIDGES, kinds_of
+from pdeloop.method.models.finite_difference_fit import fit_neighbours
 from pdeloop.method.models.prediction import errors
 from tests.support.ordinary import rolled_out
 

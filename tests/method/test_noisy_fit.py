@@ -12,11 +12,9 @@ import pytest
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Measured, Samples
-from pdeloop.method.models.choice import fit_field_model, with_clean
-from pdeloop.method.models.denoising import smoothed
-from pdeloop.method.models.filtering import filtered
-from pdeloop.method.models.kinds import FORMS
-from pdeloop.method.models.noisy_fit import fit_noisy, significant
+from pdeloop.method.models.choice import FORMS, fit_field_model, with_clean
+from pdeloop.method.models.noise_level import smoothed
+from pdeloop.method.models.noisy_fit import filtered, fit_noisy, significant
 from pdeloop.method.models.prediction import errors
 from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel

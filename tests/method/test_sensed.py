@@ -13,14 +13,17 @@ from threadpoolctl import threadpool_limits
 import pdeloop
 from pdeloop.episode import rollout
 from pdeloop.method.models.sensed import (
+    COEFFICIENTS,
+    SHARED,
+    TERMS,
     Actuators,
     SensedEquation,
     grid_points,
     interpolated,
     sensed_model,
+    unknowns,
 )
 from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
-from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, SHARED, TERMS, unknowns
 from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED
 from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of

@@ -12,16 +12,17 @@ from threadpoolctl import threadpool_limits
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.sensed import SensedModel, sensed_model
-from pdeloop.method.models.sensed_fit import Fitted, fit_sensed
-from pdeloop.method.models.sensed_unknowns import (
+from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
     TERMS,
     VARIATIONS,
+    SensedModel,
+    sensed_model,
     unknowns,
     well_posed,
 )
+from pdeloop.method.models.sensed_fit import Fitted, fit_sensed
 from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 from tests.support.small import same_bits

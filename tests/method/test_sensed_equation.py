@@ -6,18 +6,20 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pdeloop.method.models.sensed import SensedEquation, grid_points, interpolated, sensed_model
-from pdeloop.method.models.sensed_fit import fit_sensed
-from pdeloop.method.models.sensed_flow import SensedFlow
-from pdeloop.method.models.sensed_unknowns import (
+from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
     FIRST,
     SHARED,
     TERMS,
+    SensedEquation,
+    grid_points,
+    interpolated,
+    sensed_model,
     unknowns,
     well_posed,
 )
+from pdeloop.method.models.sensed_fit import SensedFlow, fit_sensed
 from pdeloop.method.models.settings import DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of

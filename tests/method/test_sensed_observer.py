@@ -15,8 +15,15 @@ from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.whole_field_law import WholeFieldLaw, whole_field_law
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.sensed import Actuators, SensedModel, interpolated, sensed_model
-from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
+from pdeloop.method.models.sensed import (
+    COEFFICIENTS,
+    TERMS,
+    Actuators,
+    SensedModel,
+    interpolated,
+    sensed_model,
+    unknowns,
+)
 from tests.support.sensed import SENSORS
 from tests.support.sensed_optimiser import N_A, rows_of
 from tests.support.small import same_bits

@@ -8,9 +8,14 @@ import pytest
 
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
-from pdeloop.method.models.coarse import CoarseModel, coarse_points
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, features_of
+from pdeloop.method.models.finite_difference import (
+    CoarseModel,
+    Feature,
+    FiniteDifferenceModel,
+    coarse_points,
+    features_of,
+)
 
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX

@@ -8,11 +8,11 @@ import pytest
 
 from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
 from pdeloop.method.models.base import Samples
+from pdeloop.method.models.choice import SPARSE, kinds_of
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
-from pdeloop.method.models.kinds import SPARSE, kinds_of
+from pdeloop.method.models.finite_difference_fit import chosen, fit_sparse, products
 from pdeloop.method.models.prediction import errors
-from pdeloop.method.models.sparse_fit import chosen, fit_sparse, products
 from tests.support.ordinary import rolled_out
 
 SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)

@@ -20,10 +20,9 @@ from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.models import Measured
 from pdeloop.method.models import undeclared_noise as of_models
 from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.noise_level import noise_level, short_waves
+from pdeloop.method.models.noise_level import correlations, is_white, noise_level, short_waves
 from pdeloop.method.models.settings import DEFAULTS
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
-from pdeloop.method.models.whiteness import correlations, is_white
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import misjudged_noise, warnings

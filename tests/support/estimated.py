@@ -11,9 +11,17 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Context, Trajectory
 from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_loop
 from pdeloop.method.laws import ExtendedKalman, Law
-from pdeloop.method.models.sensed import WAVES, Actuators, SensedModel, field_of, sensed_model
+from pdeloop.method.models.sensed import (
+    COEFFICIENTS,
+    TERMS,
+    WAVES,
+    Actuators,
+    SensedModel,
+    field_of,
+    sensed_model,
+    unknowns,
+)
 from pdeloop.method.models.sensed_filter import SensedFilter
-from pdeloop.method.models.sensed_unknowns import COEFFICIENTS, TERMS, unknowns
 
 Array = np.ndarray
 SENSORS, N_A, T, N_S = 8, 3, 24, 6

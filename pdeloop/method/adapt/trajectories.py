@@ -9,7 +9,7 @@ import numpy as np
 from pdeloop.messages.array_files import Arrays, checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory
-from pdeloop.method.models.denoising import cleaned_states
+from pdeloop.method.models.noise_level import cleaned_states
 from pdeloop.method.reduce.snapshots import LARGE, factored
 from pdeloop.process.one_thread import one_thread
 

@@ -58,9 +58,8 @@ from pdeloop.method.models.choice import (
     scale_of,
     turns,
 )
-from pdeloop.method.models.denoising import smoothed
-from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.linear import LinearModel, LowRankModel
+from pdeloop.method.models.noise_level import smoothed
 from pdeloop.method.models.prediction import NEAR, beginnings, predicted, usable
 from pdeloop.method.models.prediction import pieces as cut
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +162,62 @@ class Samples:
         return weights
 
 
+class StoredModel:
+    """What models made of arrays have in common.
+
+    Attributes
+    ----------
+    FORM : str
+        What its arrays are known by.
+    SHAPES : mapping of str to str
+        Axes of each array, a letter each, of which the same are equally long; before a colon the kind
+        of its numbers: c complex, i whole, inf real or infinite.
+    """
+
+    FORM: ClassVar[str]
+    SHAPES: ClassVar[Mapping[str, str]]
+    kind: str
+    constant: Array
+    B: Array
+
+    @property
+    def n_z(self) -> int:
+        return len(self.constant)
+
+    @property
+    def n_a(self) -> int:
+        return int(self.B.shape[1])
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        model: Any = self
+        return linearised(model, state, action)
+
+    def arrays(self) -> Arrays:
+        texts = {"form": np.array(self.FORM), "kind": np.array(self.kind)}
+        return texts | {name: np.asarray(getattr(self, name)) for name in self.SHAPES}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> Self:
+        """The model of `arrays`; ValueError where they do not fit together."""
+        make: Any = cls
+        model: Self = make(kind=text_of(arrays, "kind"), **shaped(arrays, cls.SHAPES))
+        return model
+
+
+def shaped(arrays: Arrays, shapes: Mapping[str, str]) -> dict[str, Any]:
+    """The arrays of these names, and numbers of those without axes; shapes: as for `StoredModel`."""
+    lengths: dict[str, int] = {}
+    found: dict[str, Any] = {}
+    for name, spec in shapes.items():
+        kind, _, axes = spec.rpartition(":")
+        shape = tuple(int(n) if n.isdigit() else lengths.get(n) for n in axes.split())
+        stored = kind if kind in ("c", "i") else "f"
+        array = checked_array(arrays, name, stored, shape, finite=kind != "inf")
+        lengths |= dict(zip(axes.split(), array.shape, strict=True))
+        found[name] = array if axes else array.item()
+    return found
+
+
 def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, Array]:
     """A and B of a model at a point, whose rows are pulled back unit vectors."""
     eye = np.eye(model.n_z)
@@ -178,9 +234,8 @@ def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str, *shape: int
     return checked_array(arrays, name, "f", shape)
 
 
-def steps_of(arrays: Mapping[str, NDArray[np.generic]], least: int = 1) -> int:
-    """The internal steps of a sampling time among arrays; ValueError for none or too many."""
-    steps = int(checked_array(arrays, "substeps", "i", ()))
+def checked_substeps(steps: int, least: int = 1) -> int:
+    """The internal steps of a sampling time; ValueError for none or too many."""
     if not least <= steps <= MAX_SUBSTEPS:
         raise ValueError(f"a model has {steps} internal steps; expected {least} to {MAX_SUBSTEPS}")
     return steps
@@ -189,3 +244,24 @@ def steps_of(arrays: Mapping[str, NDArray[np.generic]], least: int = 1) -> int:
 def text_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> str:
     """A text among arrays."""
     return str(arrays[name].item())
+
+
+Values = NDArray[Any]
+"""Real or complex."""
+
+
+def orthonormal(columns: Array) -> Array:
+    """An orthonormal basis of the space of columns, some of which may be zero or the same."""
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(scale > 0.0, scale, 1.0)
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    kept: Array = basis[:, sizes > 1e-10 * sizes[0]]
+    return kept
+
+
+def least_squares(columns: Array, values: Values) -> Values:
+    """The least coefficients of columns, each in its own unit, that explain values best."""
+    scale = np.linalg.norm(columns, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    found: Values = np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale[:, None]
+    return found

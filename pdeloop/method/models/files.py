@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.method.models.base import Arrays, FieldModel, text_of
-from pdeloop.method.models.coarse import CoarseModel
-from pdeloop.method.models.finite_difference import FiniteDifferenceModel
-from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.low_rank import LowRankModel
+from pdeloop.method.models.finite_difference import CoarseModel, FiniteDifferenceModel
+from pdeloop.method.models.linear import LinearModel, LowRankModel
 from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import SensedModel

@@ -3,16 +3,23 @@
 
     dz_c/dt (x) = sum_f C_fc(x) D^{j_f} M_f(z)(x) + (B a + c)(x),
 
-for every component c of the field; M_f is a monomial of the components, and D^j a central difference on
-a ring of grid points of distance 1: none for j = 0, the first and second one along the last axis for
-j = 1, 2, along the axis before for j = 3, 4, and so on. Anything else (walls) has coefficients of its
-own where that shows. Time is in sampling times, each of equal Runge-Kutta steps of order 4.
+for every component c of the field; M_f is a monomial of the components, and D^j a central
+difference on a ring of grid points of distance 1: none for j = 0, the first and second one along
+the last axis for j = 1, 2, along the axis before for j = 3, 4, and so on. Anything else (walls) has
+coefficients of its own where that shows. Time is in sampling times, each of equal Runge-Kutta steps
+of order 4.
 
-On one axis the factors of M_f may be of neighbours, each at a distance of its own from x: products that
-are no difference of any monomial, such as those of chains and rings of oscillators or species.
+On one axis the factors of M_f may be of neighbours, each at a distance of its own from x: products
+that are no difference of any monomial, such as those of chains and rings of oscillators or species.
 
 Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
 its numbers, has products of any of them.
+
+Fields on several axes may be modelled on a coarser grid: z_{k+1} = P f(S z_k, a_k), where S takes
+the values at some of the grid points, f is the model of them, and P, the least-squares
+interpolation of measured states, gives the whole field. Fields that a law can influence are smooth,
+whereas the work of a step of f grows with the number of points, times that of the internal steps,
+which on half the spacing is four times as large.
 """
 
 from __future__ import annotations
@@ -30,13 +37,21 @@ from numpy.typing import NDArray
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.messages.text import shown
-from pdeloop.method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
+from pdeloop.method.models.base import (
+    Arrays,
+    StoredModel,
+    checked_substeps,
+    linearised,
+    numbers_of,
+    text_of,
+)
 from pdeloop.method.models.finite_difference_kernels import (
     MOST_FACTORS,
     advance,
     mean_features,
     pull_back,
 )
+from pdeloop.method.models.linear import add_products
 
 
 class Feature(NamedTuple):
@@ -85,7 +100,7 @@ Table = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class FiniteDifferenceModel:
+class FiniteDifferenceModel(StoredModel):
     """The equation above.
 
     Attributes
@@ -105,6 +120,7 @@ class FiniteDifferenceModel:
         there is one axis.
     """
 
+    FORM = "finite-difference"
     kind: str
     features: tuple[Feature, ...]
     coefficients: Array
@@ -112,14 +128,6 @@ class FiniteDifferenceModel:
     constant: Array
     substeps: int
     shape: tuple[int, ...] = ()
-
-    @property
-    def n_z(self) -> int:
-        return len(self.constant)
-
-    @property
-    def n_a(self) -> int:
-        return int(self.B.shape[1])
 
     @cached_property
     def table(self) -> Table:
@@ -159,15 +167,12 @@ class FiniteDifferenceModel:
         mean_features(z, a, end, *known, found, miss)
         return found, miss
 
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return linearised(self, state, action)
-
     def arrays(self) -> Arrays:
         own: Arrays = {"shape": self._axes} if self.shape else {}
         if any(any(feature.shifts) for feature in self.features):
             own["shifts"] = np.array([_filled(feature.shifts, 0) for feature in self.features])
         return own | {
-            "form": np.array("finite-difference"),
+            "form": np.array(self.FORM),
             "kind": np.array(self.kind),
             "table": np.delete(self.table, np.s_[1 + MOST_FACTORS : -1], axis=1),
             "coefficients": self.coefficients,
@@ -176,9 +181,8 @@ class FiniteDifferenceModel:
             "substeps": np.array(self.substeps),
         }
 
-    @staticmethod
-    def from_arrays(arrays: Arrays) -> FiniteDifferenceModel:
-        """The model of `arrays`."""
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> FiniteDifferenceModel:
         table = checked_array(arrays, "table", "i", (None, MOST_FACTORS + 2))
         coefficients = numbers_of(arrays, "coefficients", len(table), None, None)
         _, components, n_x = coefficients.shape
@@ -206,7 +210,7 @@ class FiniteDifferenceModel:
             coefficients,
             numbers_of(arrays, "B", components * n_x, None),
             numbers_of(arrays, "constant", components * n_x),
-            steps_of(arrays, least=0),
+            checked_substeps(int(checked_array(arrays, "substeps", "i", ())), least=0),
             shape,
         )
 
@@ -221,3 +225,93 @@ class FiniteDifferenceModel:
 
 def _filled(numbers: Sequence[int], value: int) -> list[int]:
     return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
+
+
+Points = NDArray[np.int64]
+_INNER = "inner."
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseModel:
+    """An equation on a coarser grid.
+
+    Attributes
+    ----------
+    inner : FiniteDifferenceModel
+        f.
+    points : (m,) array of int
+        Numbers of a state that S takes.
+    interpolation : (n_z, m) array
+        P.
+    """
+
+    FORM = "coarse"
+    inner: FiniteDifferenceModel
+    points: Points
+    interpolation: Array
+
+    @property
+    def kind(self) -> str:
+        return self.inner.kind
+
+    @property
+    def n_z(self) -> int:
+        return len(self.interpolation)
+
+    @property
+    def n_a(self) -> int:
+        return self.inner.n_a
+
+    def step(self, states: Array, actions: Array) -> Array:
+        coarse = self.inner.step(states[:, self.points], actions)
+        after = np.zeros(states.shape)
+        add_products(read_only(coarse), read_only(self.interpolation.T), after)
+        return after
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        coarse = np.zeros((len(covectors), len(self.points)))
+        add_products(read_only(covectors), read_only(self.interpolation), coarse)
+        on_points, on_actions = self.inner.pull_back(states[:, self.points], actions, coarse)
+        on_states = np.zeros(states.shape)
+        on_states[:, self.points] = on_points
+        return on_states, on_actions
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        return linearised(self, state, action)
+
+    def arrays(self) -> Arrays:
+        inner = {_INNER + n: array for n, array in self.inner.arrays().items() if n != "form"}
+        own = {"points": self.points, "interpolation": self.interpolation}
+        return inner | own | {"form": np.array(self.FORM), "kind": np.array(self.kind)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> CoarseModel:
+        inner = FiniteDifferenceModel.from_arrays(
+            {name.removeprefix(_INNER): a for name, a in arrays.items() if name.startswith(_INNER)}
+        )
+        if text_of(arrays, "kind") != inner.kind:
+            raise ValueError(f"a model '{text_of(arrays, 'kind')}' is made of one '{inner.kind}'")
+        points = checked_array(arrays, "points", "i", (inner.n_z,))
+        interpolation = numbers_of(arrays, "interpolation", None, inner.n_z)
+        if points.min(initial=0) < 0 or points.max(initial=0) >= len(interpolation):
+            raise ValueError(f"a model '{inner.kind}' has points outside of its state")
+        return CoarseModel(inner, points.copy(), interpolation)
+
+
+def coarse_points(shape: tuple[int, ...], most: int) -> tuple[Points, tuple[int, ...]]:
+    """At most this many points of a grid, equally spaced along each axis, and how many along each.
+
+    >>> coarse_points((4, 6), 6)
+    (array([ 7,  9, 11, 19, 21, 23]), (2, 3))
+    """
+    spacing = [1] * len(shape)
+
+    def sizes() -> list[int]:
+        return [n // own for n, own in zip(shape, spacing, strict=True)]
+
+    while math.prod(sizes()) > most:
+        spacing[int(np.argmax(sizes()))] += 1
+    numbers = np.arange(math.prod(shape)).reshape(shape)
+    for axis, (size, own) in enumerate(zip(sizes(), spacing, strict=True)):
+        numbers = np.take(numbers, own // 2 + own * np.arange(size), axis=axis)
+    return numbers.ravel(), tuple(sizes())

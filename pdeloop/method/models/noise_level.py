@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The level that measurement noise would have, from differences of states in time.
+"""Measurement noise of states: its level, from differences in time, and states without it.
 
 Of the coefficients X_k of any orthonormal wave at step k,
 
@@ -10,22 +10,42 @@ the least P_d over bands of short waves and orders is the largest sigma^2 that t
 sigma^2 itself where a band has no waves of the field.
 
 That alone is no evidence of noise: the short waves of a front that moves over several points between
-two states are white in time as well. But they are not white in space, as they gather around the front
-(`whiteness`). Whether there is noise is then decided by a model (`undeclared_noise`).
+two states are white in time as well. But they are not white in space, as they gather around the front.
+Whether there is noise is then decided by a model (`undeclared_noise`).
+
+Whether residuals are white in time and space, as noise is, is a portmanteau test (`is_white`). The
+residuals of a wrong model are smooth, or gather where the field is steep, so that they or their
+squares are correlated with their neighbours, whereas of independent noise each of m sample
+correlations rho of N numbers is N(0, 1/N), and Q = N sum rho^2 chi-square with m degrees of freedom
+(Box and Pierce; McLeod and Li for the squares). As even the best model errs by a small part of the
+noise, correlations with a root sum of squares of up to a tolerance tau are accepted, too:
+
+    sqrt(Q) <= tau sqrt(N) + sqrt(chi-square quantile of m at 1 - level).
+
+With tau = 0 independent noise is rejected at the rate `level`, and with tau > 0 at most at that
+rate by the triangle inequality.
+
+References
+----------
+Box, Pierce, "Distribution of residual autocorrelations", J. Am. Stat. Assoc. 65, 1970. McLeod, Li,
+"Diagnostic checking ARMA time series models using squared-residual autocorrelations", J. Time Series
+Analysis 4, 1983.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import comb
+from typing import Any
 
 import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
+import scipy.linalg
+from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.prediction import weighing
 from pdeloop.method.models.settings import NOISE_MISJUDGED
-from pdeloop.method.models.whiteness import correlations
 
 ORDERS = (1, 2, 3, 4)
 BANDS = 4
@@ -129,3 +149,122 @@ def short_waves(states: Array) -> Array:
     spectra[:, 0] = np.sqrt(2.0) * spectra[:, 0].real  # the mean of the series, which is real
     found: Array = scipy.fft.irfft(spectra, 2 * (spectra.shape[1] - 1))
     return found
+
+
+LAGS = 4
+"""Neighbours in time, and in space, with which residuals are correlated."""
+
+
+def correlations(residuals: Sequence[Array]) -> tuple[Array, int]:
+    """Sample correlations of residuals (L, n) with their neighbours, and N, the count of numbers.
+
+    4 LAGS of them: of the residuals in time and in space, and of their squares in time and in space.
+    """
+    count = sum(own.size for own in residuals)
+    found = []
+    for parts in (residuals, [own**2 for own in residuals]):
+        mean = sum(float(own.sum()) for own in parts) / count
+        centred = [own - mean for own in parts]
+        total = max(sum(float(np.sum(own**2)) for own in centred), 1e-300)
+        for lag in range(1, LAGS + 1):
+            found.append(sum(float(np.sum(own[lag:] * own[:-lag])) for own in centred) / total)
+        for lag in range(1, LAGS + 1):
+            found.append(sum(float(np.sum(own * np.roll(own, lag, 1))) for own in centred) / total)
+    return np.array(found), count
+
+
+def is_white(residuals: Sequence[Array], level: float, tolerance: float = 0.0) -> bool:
+    """True unless residuals (L, n) are correlated beyond the tolerance; False without any.
+
+    level: rate at which independent ones with finite fourth moments are rejected.
+    """
+    residuals = [own for own in residuals if len(own) > LAGS]
+    if not residuals or not all(np.isfinite(own).all() for own in residuals):
+        return False
+    rho, count = correlations(residuals)
+    limit = np.sqrt(scipy.special.chdtri(len(rho), level))
+    return bool(np.sqrt(count * np.sum(rho**2)) <= tolerance * np.sqrt(count) + limit)
+
+
+def denoised(states: Array, noise: float) -> Array:
+    """A trajectory with the singular values that it would have without noise, nearest in the mean.
+
+    Measurement noise is white in space and time, while the fields of a trajectory have much in common:
+    few singular values are above 1 + sqrt(beta), in units of noise sqrt(n), which are those of the
+    noise alone; those that are shrink to sqrt((y^2 - beta - 1)^2 - 4 beta) / y.
+
+    Parameters
+    ----------
+    states : (T, n_z) array
+        n is the larger of T and n_z, beta the smaller over it.
+    noise : float
+        Standard deviation of the noise on every number.
+
+    References
+    ----------
+    Gavish, Donoho, "Optimal shrinkage of singular values", IEEE Trans. Inf. Theory 63, 2017.
+    """
+    if not states.size:
+        return states
+    left, values, right = scipy.linalg.svd(states, full_matrices=False)
+    beta, unit = min(states.shape) / max(states.shape), noise * np.sqrt(max(states.shape))
+    y = np.maximum(values / unit, 1.0 + np.sqrt(beta))
+    shrunk = unit * np.sqrt(np.maximum((y**2 - beta - 1.0) ** 2 - 4.0 * beta, 0.0)) / y
+    clean: Array = (left * shrunk) @ right
+    return clean
+
+
+def smoothed(fields: Array, noise: float, components: int = 1) -> Array:
+    """Fields with the amplitude at each wavenumber that is nearest to that without noise in the mean.
+
+    The Wiener filter (S - R)/S, with S the mean power of the fields at a wavenumber and R that of the
+    noise. A single state among many of its trajectory, such as an initial field, says more by its
+    spectrum than by singular values.
+
+    Parameters
+    ----------
+    fields : (n, n_z) array
+        Of one distribution.
+    noise : float
+        Standard deviation of the noise on every number.
+    components : int
+        Number of fields in a state, stored one after the other.
+    """
+    parts = fields.reshape(len(fields), components, -1)
+    spectra = np.fft.rfft(parts)
+    signal, noise_power = signal_power(spectra, noise, parts.shape[2])
+    kept = signal / (signal + noise_power)
+    clean: Array = np.fft.irfft(kept * spectra, parts.shape[2]).reshape(fields.shape)
+    return clean
+
+
+def cleaned_states(
+    trajectories: Sequence[Array], noise: float, components: int = 1, *, line: bool = True
+) -> list[Array]:
+    """States of trajectories `denoised`, the initial ones `smoothed` together where they are on a line.
+
+    Parameters
+    ----------
+    trajectories : sequence of (T, n_z) arrays
+        None of them empty.
+    noise, components
+        As for `smoothed`.
+    line : bool
+        Whether the states are fields on one axis.
+    """
+    clean = [denoised(states, noise) for states in trajectories]
+    if line and clean:
+        first = smoothed(np.stack([states[0] for states in trajectories]), noise, components)
+        for own, state in zip(clean, first, strict=True):
+            own[0] = state
+    return clean
+
+
+def signal_power(spectra: NDArray[Any], noise: float, points: int) -> tuple[Array, float]:
+    """Mean power of fields without noise at each wavenumber, and that of the noise.
+
+    spectra (n, ..): Fourier transforms of fields of so many points.
+    """
+    noise_power = noise**2 * points
+    power = np.mean(np.abs(spectra) ** 2, axis=0)
+    return np.maximum(power - noise_power, 0.0), noise_power

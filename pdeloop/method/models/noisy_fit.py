@@ -5,9 +5,15 @@ The regression of `spectral_fit` fails with noise for two reasons: within one sa
 changes the field hardly more than the noise does, and at wavenumbers without signal the noise of a
 state, which is absent from the next one, looks like fast decay. Therefore
 
-1. the terms of the equation are integrated along filtered states, estimated from the current equation
-   and the measurements (`filtering`); once the equation is nearly right their error is a small part of
-   the noise, and hardly biases the coefficients;
+1. the terms of the equation are integrated along filtered states: at every wavenumber k a share g of
+   the innovation, measured minus predicted, corrects the prediction,
+
+       F[zhat_{k+1}] = F[f(zhat_k, a_k)] + g F[z_{k+1} - f(zhat_k, a_k)].
+
+   With white noise of the power R the innovations have the power P + R, P being that of the error of
+   the prediction, and g = P/(P + R) minimises the error (the steady-state Kalman filter of independent
+   wavenumbers). So g is 1 while the model is poor and falls as it improves. Once the equation is nearly
+   right the error of the states is a small part of the noise, and hardly biases the coefficients;
 2. the equation is compared with the measured states over windows of m sampling times with unknown
    initial state x,
 
@@ -26,7 +32,7 @@ References
 ----------
 Messenger, Bortz, "Weak SINDy for partial differential equations", J. Comput. Phys. 443, 2021. Ljung,
 "System Identification", 2nd ed., chapters 7 and 16. James, Stein, "Estimation with quadratic loss",
-1961 (the entries of B).
+1961 (the entries of B). Anderson, Moore, "Optimal Filtering", chapters 4 and 9 (the filter).
 """
 
 from __future__ import annotations
@@ -39,21 +45,76 @@ import scipy  # whose transforms, a tenth of a start, load when they are used
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Measured
-from pdeloop.method.models.columns import least_squares
-from pdeloop.method.models.denoising import signal_power
-from pdeloop.method.models.filtering import Filtered, filtered
+from pdeloop.method.models.base import FieldModel, Measured, least_squares
+from pdeloop.method.models.noise_level import signal_power
 from pdeloop.method.models.prediction import finite
 from pdeloop.method.models.settings import (
     COEFFICIENT_RIDGE,
+    FAR,
     FIRST_SUBSTEPS,
     LEAST_CORRECTION,
     FieldModelSettings,
 )
 from pdeloop.method.models.spectral import SpectralModel, Spectrum
-from pdeloop.method.models.spectral_fit import POWERS, fewer_of, substeps_of
-from pdeloop.method.models.symbols import Form, Regression, polynomial
+from pdeloop.method.models.spectral_fit import (
+    POWERS,
+    Form,
+    Regression,
+    fewer_of,
+    polynomial,
+    substeps_of,
+)
 from pdeloop.solver.polynomial_step import phi_functions
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """States of rollouts, (L + 1, n_z) each, and the model's predictions of them.
+
+    power: mean power of the innovations at each wavenumber, of Fourier transforms over the number of
+    points; lost: predictions that were not finite, in whose place the last state stood.
+    """
+
+    states: list[Array]
+    power: Array
+    lost: int
+
+
+def filtered(
+    model: FieldModel,
+    rollouts: Sequence[Measured],
+    first: Sequence[Array],
+    shares: Array,
+) -> Filtered:
+    """The states of rollouts, each with one state more than actions.
+
+    first: their initial states; shares: g, of each wavenumber. A prediction far beyond the measured
+    states is rejected.
+    """
+    n_z, z = model.n_z, np.array(first)
+    found = [np.empty(rollout.states.shape) for rollout in rollouts]
+    for own, state in zip(found, z, strict=True):
+        own[0] = state
+    lengths = np.array([len(rollout.actions) for rollout in rollouts])
+    total, count, lost = np.zeros(len(shares)), 0, 0
+    most = FAR * max(float(np.abs(rollout.states).max()) for rollout in rollouts)
+    for k in range(int(lengths.max())):
+        rows = np.flatnonzero(lengths > k).tolist()
+        actions = np.stack([rollouts[i].actions[k] for i in rows])
+        with np.errstate(all="ignore"):
+            predicted = model.step(z[rows], actions)
+            wrong = ~(np.abs(predicted).max(axis=1) <= most)
+        predicted[wrong] = z[rows][wrong]
+        innovation = (
+            scipy.fft.rfft(np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted) / n_z
+        )
+        z[rows] = predicted + n_z * scipy.fft.irfft(shares * innovation, n_z)
+        for i in rows:
+            found[i][k + 1] = z[i]
+        total += np.sum(np.abs(innovation) ** 2, axis=0)
+        count, lost = count + len(rows), lost + int(wrong.sum())
+    return Filtered(found, total / count, lost)
+
 
 _NOISY_STEPS = 2000
 """Maximum number of data steps in a fit with measurement noise."""

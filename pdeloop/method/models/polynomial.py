@@ -19,17 +19,17 @@ reduction", CMAME 306, 2016.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 from pdeloop.jit.cache import cached_njit
-from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
-from pdeloop.method.models.base import Arrays, Samples, linearised, numbers_of, text_of
+from pdeloop.method.models.base import Arrays, Samples, StoredModel
 from pdeloop.method.models.linear import add_products
 
 LARGEST_STATE = 256
@@ -49,7 +49,7 @@ _FAR = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialModel:
+class PolynomialModel(StoredModel):
     """The model above.
 
     Attributes
@@ -67,6 +67,15 @@ class PolynomialModel:
         Of [1; x; (a - m_a) / s_a; products], s included.
     """
 
+    FORM = "polynomial"
+    SHAPES: ClassVar = {
+        "centre": "n",
+        "action_scale": "a",
+        "V": "n r",
+        "action_centre": "a",
+        "products": "i:p 2",
+        "coefficients": "f n",
+    }
     kind: str
     V: Array
     centre: Array
@@ -113,35 +122,17 @@ class PolynomialModel:
         add_products(read_only(on_w[:, :r]), read_only(self.V.T), on_states)
         return on_states, on_w[:, r:] / self.action_scale
 
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return linearised(self, state, action)
-
-    def arrays(self) -> Arrays:
-        names = ("V", "centre", "action_centre", "action_scale", "products", "coefficients")
-        texts = {"form": np.array("polynomial"), "kind": np.array(self.kind)}
-        return texts | {name: getattr(self, name) for name in names}
-
-    @staticmethod
-    def from_arrays(arrays: Arrays) -> PolynomialModel:
-        """The model of `arrays`."""
-        centre, scale = numbers_of(arrays, "centre", None), numbers_of(arrays, "action_scale", None)
-        V = numbers_of(arrays, "V", len(centre), None)
-        count = V.shape[1] + len(scale)
-        products = checked_array(arrays, "products", "i", (None, 2))
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> Self:
+        model = super().from_arrays(arrays)
+        count, products = model.V.shape[1] + model.n_a, model.products
         if products.size and not (products.min() >= 0 and products.max() < count):
             raise ValueError(f"a model has products of numbers beyond its {count}")
-        if not (scale > 0.0).all():
+        if len(model.coefficients) != 1 + count + len(products):
+            raise ValueError(f"a model has {len(model.coefficients)} rows of coefficients")
+        if not (model.action_scale > 0.0).all():
             raise ValueError("a model has a scale of actions that is not positive")
-        rows = 1 + count + len(products)
-        return PolynomialModel(
-            text_of(arrays, "kind"),
-            V,
-            centre,
-            numbers_of(arrays, "action_centre", len(scale)),
-            scale,
-            products,
-            numbers_of(arrays, "coefficients", rows, len(centre)),
-        )
+        return model
 
 
 @cached_njit()
@@ -217,17 +208,7 @@ class _Scaled:
             matrix[np.diag_indices(len(size))] += penalty + 1e-13
             solved = linalg.solve(matrix, moment, assume_a="pos") / size[:, None]
             solved *= np.where(np.isfinite(self.scale), self.scale, 0.0)
-            found.append(
-                PolynomialModel(
-                    model.kind,
-                    model.V,
-                    model.centre,
-                    model.action_centre,
-                    model.action_scale,
-                    model.products,
-                    np.ascontiguousarray(solved),
-                )
-            )
+            found.append(replace(model, coefficients=np.ascontiguousarray(solved)))
         return found
 
 

@@ -17,12 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Arrays, numbers_of, text_of
+from pdeloop.method.models.base import StoredModel
 from pdeloop.method.reduce.reduced_model import Trajectory
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
@@ -32,7 +33,7 @@ FOREMOST = 60
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingsModel:
+class ReadingsModel(StoredModel):
     """A model in innovation form, as a model of its state (`pdeloop.method.models.FieldModel`).
 
     Attributes
@@ -43,6 +44,15 @@ class ReadingsModel:
         Covariance of e.
     """
 
+    FORM = "readings"
+    SHAPES: ClassVar = {
+        "G": "n r",
+        "A": "n n",
+        "B": "n a",
+        "C": "r n",
+        "U": "y r",
+        "innovations": "r r",
+    }
     A: Array
     B: Array
     C: Array
@@ -55,10 +65,6 @@ class ReadingsModel:
     def n_z(self) -> int:
         return len(self.A)
 
-    @property
-    def n_a(self) -> int:
-        return int(self.B.shape[1])
-
     def step(self, states: Array, actions: Array) -> Array:
         after: Array = states @ self.A.T + actions @ self.B.T
         return after
@@ -68,25 +74,6 @@ class ReadingsModel:
 
     def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
         return self.A.copy(), self.B.copy()
-
-    def arrays(self) -> Arrays:
-        numbers = {name: getattr(self, name) for name in ("A", "B", "C", "G", "U", "innovations")}
-        return {"form": np.array("readings"), "kind": np.array(self.kind), **numbers}
-
-    @staticmethod
-    def from_arrays(arrays: Arrays) -> ReadingsModel:
-        """The model of `arrays`."""
-        G = numbers_of(arrays, "G", None, None)
-        n, r = G.shape
-        return ReadingsModel(
-            numbers_of(arrays, "A", n, n),
-            numbers_of(arrays, "B", n, None),
-            numbers_of(arrays, "C", r, n),
-            G,
-            numbers_of(arrays, "U", None, r),
-            numbers_of(arrays, "innovations", r, r),
-            text_of(arrays, "kind"),
-        )
 
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""

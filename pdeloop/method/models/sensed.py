@@ -17,8 +17,10 @@ points in it. Below the grid the second derivative does what a finer one would: 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 import scipy  # whose transforms, a tenth of a start, load when they are used
@@ -26,20 +28,84 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Arrays, numbers_of
-from pdeloop.method.models.sensed_unknowns import (
-    COEFFICIENTS,
-    EQUATION,
-    SHARED,
-    TERMS,
-    VARIATIONS,
-    unknowns_of,
-)
+from pdeloop.method.models.base import Arrays, numbers_of, shaped
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.models.spectral_fit import fewer_of, substeps_of
-from pdeloop.method.models.symbols import ORDERS
+from pdeloop.method.models.spectral_fit import ORDERS, fewer_of, substeps_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
+
+FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
+"""p and j of the terms that every fit begins with."""
+TERMS = FIRST + tuple(
+    (p, j)
+    for p, highest in enumerate(ORDERS, start=1)
+    for j in range(highest + 1)
+    if (p, j) not in FIRST
+)
+"""Those of every equation that a model of the whole field may have."""
+VARIATIONS = tuple(
+    (p, j, m, sine)
+    for p, j in ((1, 0), (1, 1), (1, 2), (2, 0), (3, 0))
+    for m in (1, 2)
+    for sine in (False, True)
+)
+"""p and j of a term whose coefficient depends on x; m and whether it is a sine: the unknown's wave."""
+EQUATION = len(TERMS) + len(VARIATIONS)
+"""Number of the coefficients of both."""
+COEFFICIENTS = EQUATION + 1
+"""The same, and 1 for the constant."""
+# b, x_0, s and w.
+_ACTUATORS = 4
+SHARED = COEFFICIENTS + _ACTUATORS
+"""Unknowns that all rollouts share, besides one for each actuator."""
+# The least share of a coefficient of x that a bound leaves, so that it stays an unknown.
+_KEPT = 1e-6
+
+
+def unknowns(n_a: int) -> int:
+    """Number of unknowns that all rollouts share."""
+    return SHARED + n_a
+
+
+def well_posed(shared: Array) -> Array:
+    """The nearest unknowns whose short waves do not grow and whose large fields are not driven on."""
+    found = shared.copy()
+
+    def bound(term: tuple[int, int], sign: float) -> float:
+        i = TERMS.index(term)
+        found[i] = sign * max(sign * shared[i], 0.0)
+        return float(found[i])
+
+    # The highest even derivative damps, the diffusion of large fields as well.
+    if not bound((1, 4), -1.0):
+        bound((1, 2), 1.0)
+    bound((3, 2), 1.0)
+    for p in range(len(ORDERS), 2, -2):
+        if bound((p, 0), -1.0):
+            break
+    # At every x as well, where coefficients depend on it: no sum of waves exceeds their amplitudes.
+    for term, sign, others in (((3, 0), -1.0, ((5, 0), (7, 0))), ((1, 2), 1.0, ((1, 4),))):
+        waves = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == term]
+        cosines, sines = found[waves].reshape(-1, 2).T
+        reached, most = float(np.hypot(cosines, sines).sum()), sign * found[TERMS.index(term)]
+        if reached > most and not any(found[TERMS.index(other)] for other in others):
+            found[waves] *= max(most / reached, _KEPT)
+    return found
+
+
+def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
+    """The unknowns of `arrays`; older ones have no coefficients of x, or the first terms alone."""
+    known, others = arrays.get(name), SHARED - EQUATION
+    pairs = (len(FIRST), 0), (len(FIRST), n_a), (len(TERMS), n_a)
+    older = {(terms + others + strengths,): terms for terms, strengths in pairs}
+    if known is None or known.shape not in older:
+        return numbers_of(arrays, name, unknowns(n_a))
+    terms, found = older[known.shape], np.zeros(unknowns(n_a))
+    own = numbers_of(arrays, name, len(known))
+    found[:terms] = own[:terms]
+    found[EQUATION : EQUATION + len(own) - terms] = own[terms:]
+    return found
+
 
 Spectrum = NDArray[np.complex128]
 
@@ -98,6 +164,9 @@ class Actuators:
         return np.where(self.widths > 0.0, self.widths, 0.5 / len(self.centres))
 
 
+_FIELDS = [own.name for own in fields(SpectralModel)]
+
+
 @dataclass(frozen=True, eq=False)
 class SensedModel(SpectralModel):
     """The equation on a grid of which every so many points are sensors.
@@ -118,6 +187,8 @@ class SensedModel(SpectralModel):
         Largest |z| that is simulated.
     """
 
+    FORM = "sensed"
+    OWN: ClassVar = {"shared": "u", "sensors": "i:", "noise": "", "spread": "33", "largest": ""}
     shared: Array = field(kw_only=True)
     actuators: Actuators = field(kw_only=True)
     sensors: int = field(kw_only=True)
@@ -138,38 +209,21 @@ class SensedModel(SpectralModel):
         return found
 
     def arrays(self) -> Arrays:
-        own = {
-            "form": np.array("sensed"),
-            "shared": self.shared,
-            "centres": self.actuators.centres,
-            "widths": self.actuators.widths,
-            "sensors": np.array(self.sensors),
-            "noise": np.array(self.noise),
-            "spread": self.spread,
-            "largest": np.array(self.largest),
-        }
-        return super().arrays() | own
+        own = {name: np.asarray(getattr(self, name)) for name in self.OWN}
+        return super().arrays() | own | vars(self.actuators)
 
-    @staticmethod
-    def from_arrays(arrays: Arrays) -> SensedModel:
-        """The model of `arrays`."""
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> SensedModel:
         whole = SpectralModel.from_arrays(arrays)
         sensors = int(checked_array(arrays, "sensors", "i", ()))
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
-        return SensedModel(
-            **{name: getattr(whole, name) for name in SpectralModel.__dataclass_fields__},
-            shared=unknowns_of(arrays, "shared", whole.n_a),
-            actuators=Actuators(
-                numbers_of(arrays, "centres", whole.n_a), _widths_of(arrays, whole.n_a)
-            ),
-            sensors=sensors,
-            noise=float(checked_array(arrays, "noise", "f", ())),
-            spread=numbers_of(arrays, "spread", 1 + 2 * WAVES),
-            largest=float(checked_array(arrays, "largest", "f", ()))
-            if "largest" in arrays
-            else 0.0,
-        )
+        own = shaped({"largest": np.array(0.0)} | arrays, cls.OWN)
+        centres = numbers_of(arrays, "centres", whole.n_a)
+        own["shared"] = unknowns_of(arrays, "shared", whole.n_a)
+        known = {name: getattr(whole, name) for name in _FIELDS}
+        actuators = Actuators(centres, _widths_of(arrays, whole.n_a))
+        return SensedModel(**known, **own, actuators=actuators)
 
 
 def _widths_of(arrays: Arrays, n_a: int) -> Array:

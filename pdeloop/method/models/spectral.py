@@ -15,20 +15,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Arrays, linearised, numbers_of, steps_of, text_of
+from pdeloop.method.models.base import Arrays, StoredModel, checked_substeps, shaped, text_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class SpectralModel:
+class SpectralModel(StoredModel):
     """The equation above.
 
     Attributes
@@ -53,6 +53,19 @@ class SpectralModel:
         n_l and c_lp; None: there are none.
     """
 
+    FORM = "spectral"
+    SHAPES: ClassVar = {
+        "constant": "n",
+        "linear": "c:m",
+        "multipliers": "c:q m",
+        "polynomials": "q p",
+        "B": "n a",
+        "substeps": "i:",
+        "clip": "inf:",
+        "fewer": "s 2",
+    }
+    OF_X: ClassVar = {"factors": "c:l m", "coefficients": "l d n"}
+    """Of terms whose coefficients depend on x, where there are any."""
     kind: str
     linear: Spectrum
     multipliers: Spectrum
@@ -64,14 +77,6 @@ class SpectralModel:
     fewer: Array = field(default_factory=lambda: np.empty((0, 2)))
     factors: Spectrum | None = None
     coefficients: Array | None = None
-
-    @property
-    def n_z(self) -> int:
-        return len(self.constant)
-
-    @property
-    def n_a(self) -> int:
-        return int(self.B.shape[1])
 
     @property
     def degree(self) -> int:
@@ -129,56 +134,24 @@ class SpectralModel:
             )
         return on_states, on_actions
 
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return linearised(self, state, action)
-
     def arrays(self) -> Arrays:
-        of_x = {"factors": self.factors, "coefficients": self.coefficients}
-        known = {name: value for name, value in of_x.items() if value is not None}
-        return known | {
-            "form": np.array("spectral"),
-            "kind": np.array(self.kind),
-            "linear": self.linear,
-            "multipliers": self.multipliers,
-            "polynomials": self.polynomials,
-            "B": self.B,
-            "constant": self.constant,
-            "substeps": np.array(self.substeps),
-            "clip": np.array(self.clip),
-            "fewer": self.fewer,
-        }
+        of_x = {name: getattr(self, name) for name in self.OF_X}
+        return super().arrays() | {name: own for name, own in of_x.items() if own is not None}
 
-    @staticmethod
-    def from_arrays(arrays: Arrays) -> SpectralModel:
-        """The model of `arrays`."""
-        constant = numbers_of(arrays, "constant", None)
-        n_z, modes = len(constant), len(constant) // 2 + 1
-        multipliers = _spectrum_of(arrays, "multipliers", None, modes)
-        polynomials = numbers_of(arrays, "polynomials", len(multipliers), None)
-        factors = coefficients = None
-        if "factors" in arrays or "coefficients" in arrays:
-            factors = _spectrum_of(arrays, "factors", None, modes)
-            shape = len(factors), polynomials.shape[1] + 1, n_z
-            coefficients = numbers_of(arrays, "coefficients", *shape)
-        substeps, fewer = steps_of(arrays), numbers_of(arrays, "fewer", None, 2)
-        if ((fewer[:, 1] < 1) | (fewer[:, 1] > substeps)).any():
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> Self:
+        shapes = SpectralModel.SHAPES
+        if any(name in arrays for name in cls.OF_X):
+            shapes = shapes | cls.OF_X
+        make: Any = cls
+        model: Self = make(kind=text_of(arrays, "kind"), **shaped(arrays, shapes))
+        checked_substeps(model.substeps)
+        if len(model.linear) != model.n_z // 2 + 1:
+            raise ValueError(f"a model of {model.n_z} points has {len(model.linear)} wavenumbers")
+        if model.coefficients is not None and model.coefficients.shape[1] != model.degree:
+            raise ValueError(f"a model of degree {model.degree} has other coefficients of x")
+        if ((model.fewer[:, 1] < 1) | (model.fewer[:, 1] > model.substeps)).any():
             raise ValueError(
-                f"a model has other than 1 to {substeps} internal steps for some fields"
+                f"a model has other than 1 to {model.substeps} internal steps for some fields"
             )
-        return SpectralModel(
-            text_of(arrays, "kind"),
-            _spectrum_of(arrays, "linear", modes),
-            multipliers,
-            polynomials,
-            numbers_of(arrays, "B", n_z, None),
-            constant,
-            substeps=substeps,
-            clip=float(checked_array(arrays, "clip", "f", (), finite=False)),
-            fewer=fewer,
-            factors=factors,
-            coefficients=coefficients,
-        )
-
-
-def _spectrum_of(arrays: Arrays, name: str, *shape: int | None) -> Spectrum:
-    return checked_array(arrays, name, "c", shape)
+        return model

@@ -5,7 +5,7 @@ Noise cannot be predicted. So unless a model without noise predicts the rollouts
 the level that their differences allow (`noise_level`) would let it, an equation is fitted for that
 noise. The noise is there if this equation predicts rollouts that it was not fitted to better than any
 model without noise, and if what it does not predict of the short waves is measurement noise: its
-innovations there, along filtered states, have that level and are white in time and space (`whiteness`).
+innovations there, along filtered states, have that level and are white in time and space (`is_white`).
 Those of a front that is narrower than the grid are not: they gather around it. Long waves are judged by
 the prediction, as their innovations hold the equation's own errors.
 """
@@ -21,14 +21,13 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Measured
 from pdeloop.method.models.choice import FittedModel, fit_field_model, limited, with_clean
-from pdeloop.method.models.noise_level import noise_level, share_of_noise, short_waves
+from pdeloop.method.models.noise_level import is_white, noise_level, share_of_noise, short_waves
 from pdeloop.method.models.settings import (
     FAR,
     LEAST_CORRECTION,
     NOISE_MISJUDGED,
     FieldModelSettings,
 )
-from pdeloop.method.models.whiteness import is_white
 from pdeloop.process.one_thread import one_thread
 
 _NOISE_EXCESS = 1.3
