@@ -48,7 +48,7 @@ from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.study import Study, StudyError
 from pdeloop.study.results import Ended, read_study, reading, writing
 from pdeloop.study.training import train_one
-from tests.support.small import SMALL, parameters
+from tests.support.small import FEW_FITS, SMALL, parameters
 
 CONSTANTS: dict[str, dict[str, Any]] = {
     "cma-es": {"sigma": 0.01, "population": 4},
@@ -63,7 +63,7 @@ AGENTS = ("ppo", "sac")
 
 def values_of(method: str) -> dict[str, Any]:
     sensors = {"sensors": 8} if method in ("lqg", "true-model") else {}
-    return {**parameters(rollouts=ROLLOUTS, optimizer="model_based"), **sensors}
+    return {**parameters(rollouts=ROLLOUTS, optimizer="model_based", **FEW_FITS), **sensors}
 
 
 def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:

@@ -62,7 +62,7 @@ def optimum(ambient: float) -> Callable[[int, np.ndarray], np.ndarray]:
     return law
 
 
-@pytest.mark.parametrize(("seed", "ambient"), [(0, 0.0), (1, 0.0), (0, 20.0)])
+@pytest.mark.parametrize(("seed", "ambient"), [(1, 0.0), (0, 20.0)])
 def test_the_observer_knows_of_the_dead_time(seed: int, ambient: float, tmp_path: Path) -> None:
     with pytest.warns(pdeloop.TrainingWarning, match="no other law is better"):
         run = pdeloop.train(
