@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt import (
-    Context,
     ModelBased,
     Record,
     Rollout,

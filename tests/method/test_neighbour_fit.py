@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models import FieldModelSettings, fit_field_model
+from pdeloop.method.models import FieldModelSettings, finite_difference_fit, fit_field_model
 from pdeloop.method.models.base import Samples
 from pdeloop.method.models.choice import NEAR_NEEDED, NEAR_RIDGES, kinds_of
 from pdeloop.method.models.finite_difference_fit import fit_neighbours
@@ -14,7 +14,14 @@ from pdeloop.method.models.prediction import errors
 from tests.support.ordinary import rolled_out
 
 N_X, DT = 12, 0.1
-SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)
+SETTINGS = FieldModelSettings(folds=2)
+
+
+@pytest.fixture(autouse=True)
+def shorter_steps(monkeypatch):
+    monkeypatch.setattr(finite_difference_fit, "_NEAR_REACH", 0.2)
+
+
 B = np.repeat(np.eye(3), 4, axis=0)
 
 
@@ -49,7 +56,7 @@ CHAIN = {
 
 def test_a_plant_of_products_of_neighbours_is_recovered_to_1e_6_without_other_terms():
     rollouts = explored(chain, 2, N_X)
-    model = fit_neighbours(Samples.of(rollouts), kind="near-shared", settings=SETTINGS)
+    model = fit_neighbours(Samples.of(rollouts), kind="near-shared")
     found = {
         (f.factors, f.shifts): C for f, C in zip(model.features, model.coefficients, strict=True)
     }
@@ -104,18 +111,18 @@ def layers(z):
     [(species, 1, 1e-9, 0.05, 4), (oscillators, 2, None, 0.3, 11), (layers, 2, None, 1.0, 6)],
 )
 def test_cells_of_their_own_and_pairs_of_components_are_described(
-    rate, components, ridge, variance, terms
+    rate, components, ridge, variance, terms, monkeypatch
 ):
     """The oscillators': the speed, three displacements, and the seven cubes of (q_i, q_{i+1}).
 
     The layers': both values, and two products in each.
     """
+    monkeypatch.setattr(finite_difference_fit, "_NEAR_SAMPLES", 50)
     n_z, start = components * N_X, 1.0 if rate is species else 0.0
     rollouts = explored(rate, 4, n_z, variance=variance, start=start)
     model = fit_neighbours(
         Samples.of(rollouts[:3]),
         kind="k",
-        settings=FieldModelSettings(near_samples=50),
         components=components,
         ridge=ridge,
     )
@@ -131,7 +138,7 @@ def test_pairs_of_components_need_not_be_declared(components, prefix):
 
 def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():
     rollouts = explored(lambda z: 0.2 * (neighbour(z, 1) - 2 * z + neighbour(z, -1)) - z, 3, N_X)
-    settings = FieldModelSettings(reproduced=0.0, largest_degree=2, passes=2, folds=2)
+    settings = FieldModelSettings(reproduced=0.0, largest_degree=2, folds=2)
     fitted = fit_field_model(rollouts, np.zeros(N_X), settings=settings)
     assert fitted is not None and fitted.error < NEAR_NEEDED
     assert not any(kind.startswith(("near", "two-near")) for kind, _ in fitted.candidates)

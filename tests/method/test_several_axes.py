@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models import Measured, finite_difference_fit, fit_field_model
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
     CoarseModel,
@@ -110,14 +110,14 @@ def plate(ny: int, nx: int, count: int) -> list[Measured]:
 
 
 @pytest.mark.parametrize("points", [256, 64], ids=["all points", "coarse"])
-def test_a_reacting_plate_between_walls_is_predicted(points: int) -> None:
+def test_a_reacting_plate_between_walls_is_predicted(
+    points: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Well enough to be believed, as no linear model is; every second point suffices for that."""
     believed = ModelBasedSettings().believed
     ny, nx = 12, 16
-    settings = FieldModelSettings(coarse_points=points)
-    found = fit_field_model(
-        plate(ny, nx, 6), np.zeros(ny * nx), line=False, shape=(ny, nx), settings=settings
-    )
+    monkeypatch.setattr(finite_difference_fit, "_COARSE_POINTS", points)
+    found = fit_field_model(plate(ny, nx, 6), np.zeros(ny * nx), line=False, shape=(ny, nx))
     assert found is not None and found.error <= believed
     assert found.model.kind.startswith("x") and found.model.n_z == ny * nx
     assert isinstance(found.model, CoarseModel) == (points < ny * nx)

@@ -6,7 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models import (
+    FieldModelSettings,
+    Measured,
+    finite_difference_fit,
+    fit_field_model,
+)
 from pdeloop.method.models.base import Samples
 from pdeloop.method.models.choice import SPARSE, kinds_of
 from pdeloop.method.models.files import model_of
@@ -15,7 +20,14 @@ from pdeloop.method.models.finite_difference_fit import chosen, fit_sparse, prod
 from pdeloop.method.models.prediction import errors
 from tests.support.ordinary import rolled_out
 
-SETTINGS = FieldModelSettings(near_reach=0.2, folds=2)
+SETTINGS = FieldModelSettings(folds=2)
+
+
+@pytest.fixture(autouse=True)
+def shorter_steps(monkeypatch):
+    monkeypatch.setattr(finite_difference_fit, "_NEAR_REACH", 0.2)
+
+
 N_Z, DT, LATE = 9, 0.1, 3
 PRODUCTS = {(0, 7): -0.5, (2, 5): 0.6, (4, 4): -0.3, (1, 3, 8): 0.4, (6, 6, 6): -0.5}
 """Of the equation of each number in turn."""
@@ -59,7 +71,7 @@ def test_the_products_of_a_network_are_found_and_its_equation_recovered():
     rollouts = network()
     samples = Samples.of(rollouts[:2])
     assert set(PRODUCTS) <= set(chosen(samples))
-    model = fit_sparse(samples, kind="sparse", settings=SETTINGS, is_map=False)
+    model = fit_sparse(samples, kind="sparse", is_map=False)
     assert model is not None and model.substeps > 0
     found = {f.factors: model.coefficients[n, :, 0] for n, f in enumerate(model.features)}
     for i, (own, c) in enumerate(PRODUCTS.items()):
@@ -73,7 +85,7 @@ def test_inputs_that_act_late_are_a_map_and_no_equation():
     tried = dict(fitted.candidates)
     assert fitted.model.kind == "sparse-map" and fitted.error < 1e-10
     assert tried["linear"] > 0.05
-    flow = fit_sparse(Samples.of(rollouts), kind="sparse", settings=SETTINGS, is_map=False)
+    flow = fit_sparse(Samples.of(rollouts), kind="sparse", is_map=False)
     assert flow is None or errors(flow, rollouts, np.zeros(2 + LATE), 2.0).min() > 1e-3
 
 
@@ -101,8 +113,7 @@ def test_what_no_product_explains_has_no_such_model():
     z = rng.normal(size=(200, 6))
     samples = Samples(z, rng.normal(size=(200, 1)), z + np.sign(np.roll(z, 1, axis=1)))
     assert all(
-        fit_sparse(samples, kind="sparse", settings=SETTINGS, is_map=is_map) is None
-        for is_map in SPARSE.values()
+        fit_sparse(samples, kind="sparse", is_map=is_map) is None for is_map in SPARSE.values()
     )
 
 

@@ -28,7 +28,6 @@ PARAMETERS = {
 }
 SETTINGS = {
     "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1},
-    "field_model_settings": {"sensed_newest": 2},
 }
 
 

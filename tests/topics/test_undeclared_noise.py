@@ -29,7 +29,7 @@ QUICK: dict[str, Any] = {
     "evaluation_fields": 1,
     "exploration_variance": 1.0,
     "identification": "field",
-    "field_model_settings": {"folds": 2, "passes": 2, "largest_degree": 3},
+    "field_model_settings": {"folds": 2, "largest_degree": 3},
     "optimizer_settings": {"iterations": 1},
 }
 SIGMA = 0.05

@@ -25,6 +25,7 @@ from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
 from pdeloop.method.models.settings import (
     DEFAULTS,
     SENSED_MOST,
+    SENSED_NEWEST,
     SENSED_REPRODUCED,
     FieldModelSettings,
 )
@@ -132,9 +133,8 @@ def to_be_fitted(
     problem = ClosedLoopProblem(
         context.U, context.target, context.state_weight, context.action_weight, context.horizon
     )
-    settings = context.field_models
     largest_cost = _LARGEST_COST * problem.cost_of(records[0])
-    return problem, whole_rollouts(problem, records, largest_cost, settings.sensed_newest)
+    return problem, whole_rollouts(problem, records, largest_cost, SENSED_NEWEST)
 
 
 def sensed_from(

@@ -62,6 +62,7 @@ from pdeloop.method.models.linear import LinearModel, LowRankModel
 from pdeloop.method.models.noise_level import smoothed
 from pdeloop.method.models.prediction import NEAR, beginnings, predicted, usable
 from pdeloop.method.models.prediction import pieces as cut
+from pdeloop.method.models.settings import BETTER
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
@@ -366,7 +367,7 @@ def field_law(
             limits, n_s, scale, models, noise, constant=other.d is not None
         )
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    accepted = _accepted(known, most, models.better)
+    accepted = _accepted(known, most, BETTER)
     model = fitted.model
     if not accepted and _is_better(fitted.own, regression):
         accepted = [model]

@@ -5,8 +5,8 @@ Each kind is fitted to some of the rollouts and judged by the error E of its pre
 from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
 share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
 ten times its share of the states up to REPRODUCED_NOISY, is selected; if there is none, the one with
-the fewest unknowns that is not `better` times worse than the best. Squares alone are selected at a
-hundredth of that E, or if cubes as well are not `better`. It is then fitted to all rollouts. `kinds_of`
+the fewest unknowns that is not BETTER times worse than the best. Squares alone are selected at a
+hundredth of that E, or if cubes as well are not. It is then fitted to all rollouts. `kinds_of`
 lists the kinds in the order in which they are tried, with the number of their unknowns.
 """
 
@@ -36,6 +36,7 @@ from pdeloop.method.models.noisy_fit import fit_noisy
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
 from pdeloop.method.models.prediction import errors, one_step, pieces, predicted, usable
 from pdeloop.method.models.settings import (
+    BETTER,
     DEFAULTS,
     DENSE,
     REPRODUCED_NOISY,
@@ -130,22 +131,22 @@ def kinds_of(
         ]
     if shape:
         several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
-        return kinds + _linear(n_z, settings) + several
+        return kinds + _linear(n_z) + several
     if not line:
-        return kinds + _linear(n_z, settings) + _sparse(n_z, settings) + _polynomial(n_z)
+        return kinds + _linear(n_z) + _sparse(n_z) + _polynomial(n_z)
     if components == 1 and n_z >= _FEWEST_POINTS:
         kinds += [
             _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
         ]
     kinds += _several_fields(n_z, components, settings)
-    near = _neighbours(n_z, components, settings)
+    near = _neighbours(n_z, components)
     if components == 1:  # two fields that were not declared
         two = _several_fields(n_z, 2, settings, "two-")
         # Linear ones are tried early, as that is quick.
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
-        near += _neighbours(n_z, 2, settings, "two-")
-    kinds += _linear(n_z, settings) + near + _sparse(n_z, settings)
+        near += _neighbours(n_z, 2, "two-")
+    kinds += _linear(n_z) + near + _sparse(n_z)
     return kinds + _polynomial(n_z)
 
 
@@ -161,7 +162,7 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
     return Kind(form.name, fit, form.unknowns, noisy, enough=enough)
 
 
-def _linear(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+def _linear(n_z: int) -> list[Kind]:
     if n_z > DENSE:
         return []
     return [
@@ -186,9 +187,7 @@ def _several_fields(
     return kinds + _finite_difference(components, settings, prefix)
 
 
-def _neighbours(
-    n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
-) -> list[Kind]:
+def _neighbours(n_z: int, components: int, prefix: str = "") -> list[Kind]:
     """Products of neighbours, for states that are no fields; arguments: as for `_several_fields`."""
     count = components * len(neighbour_features(components))
     if n_z % components or n_z // components < 5 or n_z > DENSE:
@@ -199,7 +198,6 @@ def _neighbours(
             fit_neighbours,
             components=components,
             kind=prefix + name,
-            settings=settings,
             ridge=ridge,
         )
         own = 0.0 if ridge is None else count
@@ -207,14 +205,14 @@ def _neighbours(
     return kinds
 
 
-def _sparse(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+def _sparse(n_z: int) -> list[Kind]:
     """Few products of any numbers of a small state."""
     if n_z > _SPARSE_NUMBERS:
         return []
     return [
         Kind(
             name,
-            partial(fit_sparse, kind=name, settings=settings, is_map=is_map),
+            partial(fit_sparse, kind=name, is_map=is_map),
             (n_z + SPARSE_TERMS, 0),
             needed=NEAR_NEEDED,
         )
@@ -242,7 +240,6 @@ def _finite_difference(
         for name, ridge in ridges.items():
             known: dict[str, Any] = {
                 "kind": prefix + name,
-                "settings": settings,
                 "ridge": ridge,
                 "degree": degree,
             }
@@ -405,7 +402,7 @@ def fit_field_model(
         if not judged:
             return None
         least = min(judged.values())
-        near = min(settings.better * least, max(least, most))
+        near = min(BETTER * least, max(least, most))
         good = [
             kind
             for kind, error in judged.items()

@@ -6,7 +6,7 @@ measured state; the change z_{k+1} - z_k is then linear in the coefficients, eac
 feature on the way. Coefficients are the sum of one that all points share and a part of each point's
 own, which a ridge holds at zero where the data say nothing of it.
 
-Fields on several axes are fitted on as fine a grid as the settings allow (`fit_coarse`).
+Fields on several axes are fitted on as fine a grid as is affordable (`fit_coarse`).
 
 Of states that are values of cells, not fields, the features are all monomials of a few neighbours
 to begin with (`fit_neighbours`). Of states that are neither, as of networks whose parts act on each
@@ -56,11 +56,14 @@ from pdeloop.method.models.settings import (
     COEFFICIENT_RIDGE,
     POINT_SAMPLES,
     SPARSE_TERMS,
-    FieldModelSettings,
 )
 
 _POINT_PASSES = 4
 """How often an equation of finite differences is refitted along the paths of the last fit."""
+_POINT_SUBSTEPS = 32
+"""Maximum number of internal steps per sampling time."""
+_COARSE_POINTS = 256
+"""Maximum number of grid points of a model on several axes; on finer grids every n-th point is used."""
 _POINT_REACH = 2.5
 """Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
@@ -74,7 +77,6 @@ def fit_finite_difference(
     samples: Samples,
     *,
     kind: str,
-    settings: FieldModelSettings,
     components: int = 1,
     ridge: float | None = None,
     degree: int = 3,
@@ -96,7 +98,7 @@ def fit_finite_difference(
         found = data.solved(coefficients(data.columns(), ridge), model)
         if found is None:
             break
-        substeps = substeps_of(found, size, _POINT_REACH, settings)
+        substeps = substeps_of(found, size, _POINT_REACH)
         model = fitted = replace(found, substeps=substeps)
     return fitted
 
@@ -119,9 +121,7 @@ def largest_of(samples: Samples) -> float:
     return float(np.quantile(np.abs(samples.before).max(axis=1), 0.9))
 
 
-def substeps_of(
-    model: FiniteDifferenceModel, size: float, reach: float, settings: FieldModelSettings
-) -> int:
+def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
     """Enough internal steps for a field of that size, of `reach` over its fastest rate each.
 
     None for a map.
@@ -132,7 +132,7 @@ def substeps_of(
         [len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j, _ in model.features]
     )
     rate = float((np.abs(model.coefficients) * growth[:, None, None]).sum(axis=0).max())
-    return int(np.clip(np.ceil(rate / reach), 2, settings.point_substeps))
+    return int(np.clip(np.ceil(rate / reach), 2, _POINT_SUBSTEPS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +251,10 @@ def coefficients(columns: Columns, ridge: float | None) -> Array:
     return every
 
 
+_NEAR_SAMPLES = 400
+"""Maximum number of data steps in a fit of products."""
+_NEAR_REACH = 0.5
+"""Fastest rate of such a model times its internal step."""
 _NEAR_SCREENED = 0.1
 """Share of the change that may be unexplained along straight paths between samples."""
 _NEAR_HOPELESS = 0.05
@@ -271,7 +275,6 @@ def fit_neighbours(
     samples: Samples,
     *,
     kind: str,
-    settings: FieldModelSettings,
     components: int = 1,
     ridge: float | None = None,
 ) -> FiniteDifferenceModel | None:
@@ -282,11 +285,11 @@ def fit_neighbours(
 
     ridge: of the points' own parts in normalised columns; None: all points share their coefficients.
     """
-    samples = samples.thinned(settings.near_samples)
+    samples = samples.thinned(_NEAR_SAMPLES)
     for reach in (1, 2) if components > 1 else (2,):
         features = neighbour_features(components, reach)
         empty = replace(nothing(kind, features, samples, components), substeps=1)
-        found = fitted(empty, samples, ridge, settings)
+        found = fitted(empty, samples, ridge)
         if found is not None:
             return found
     return None
@@ -296,7 +299,6 @@ def fitted(
     model: FiniteDifferenceModel,
     samples: Samples,
     ridge: float | None,
-    settings: FieldModelSettings,
 ) -> FiniteDifferenceModel | None:
     """The equation of the terms of an empty one, which has substeps of its own then, or None."""
     size = largest_of(samples)
@@ -310,9 +312,9 @@ def fitted(
         if found is None or not columns.unexplained(C) <= most**2:
             return None  # the plant is of another kind
         # Means that are roughly right are enough for what follows.
-        substeps = substeps_of(found, size, settings.near_reach, settings)
+        substeps = substeps_of(found, size, _NEAR_REACH)
         model = replace(found, substeps=min(substeps, _NEAR_SUBSTEPS))
-    every = _passes(model, samples, ridge, settings)
+    every = _passes(model, samples, ridge)
     if every is None:
         return None
     missed = Regression.along(every, samples, missed=True)
@@ -324,14 +326,13 @@ def fitted(
         features=tuple(every.features[f] for f in kept),
         coefficients=np.ascontiguousarray(every.coefficients[kept]),
     )
-    return _passes(fewer, samples, ridge, settings) or every
+    return _passes(fewer, samples, ridge) or every
 
 
 def _passes(
     model: FiniteDifferenceModel,
     samples: Samples,
     ridge: float | None,
-    settings: FieldModelSettings,
 ) -> FiniteDifferenceModel | None:
     """The best equation of passes that regress what steps miss."""
     size = largest_of(samples)
@@ -347,7 +348,7 @@ def _passes(
         found = data.solved(coefficients(data.columns(), ridge), model)
         if found is None:
             break
-        substeps = substeps_of(found, size, settings.near_reach, settings)
+        substeps = substeps_of(found, size, _NEAR_REACH)
         model = replace(found, substeps=substeps)
     return best
 
@@ -390,18 +391,16 @@ _ROUNDING = 1e-7
 """Size of what a linear model leaves over of a product that is one itself, relative to the product."""
 
 
-def fit_sparse(
-    samples: Samples, *, kind: str, settings: FieldModelSettings, is_map: bool
-) -> FiniteDifferenceModel | None:
+def fit_sparse(samples: Samples, *, kind: str, is_map: bool) -> FiniteDifferenceModel | None:
     """The equation or the map, or None where no product is found, or the plant is of another kind."""
-    samples = samples.thinned(settings.near_samples)
+    samples = samples.thinned(_NEAR_SAMPLES)
     found = chosen(samples)
     if not found:
         return None
     n_z = samples.before.shape[1]
     features = tuple(Feature(factors) for factors in [*((i,) for i in range(n_z)), *found])
     empty = nothing(kind, features, samples, n_z)
-    return fitted(replace(empty, substeps=0 if is_map else 1), samples, None, settings)
+    return fitted(replace(empty, substeps=0 if is_map else 1), samples, None)
 
 
 def products(n_z: int, most: int) -> list[Product]:
@@ -451,12 +450,11 @@ def fit_coarse(
     samples: Samples,
     *,
     kind: str,
-    settings: FieldModelSettings,
     shape: tuple[int, ...],
     ridge: float | None,
     degree: int,
 ) -> CoarseModel | FiniteDifferenceModel | None:
-    """The equation on as fine a grid as the settings allow, or None where there is none.
+    """The equation on as fine a grid as is affordable, or None where there is none.
 
     shape: points of each axis; kind, ridge, degree: as for `fit_finite_difference`.
     """
@@ -465,12 +463,11 @@ def fit_coarse(
     fit = partial(
         fit_finite_difference,
         kind=kind,
-        settings=settings,
         components=components,
         ridge=ridge,
         degree=degree,
     )
-    points, few = coarse_points(shape, settings.coarse_points)
+    points, few = coarse_points(shape, _COARSE_POINTS)
     if few == shape:
         return fit(samples, shape=shape)
     every = (np.arange(components)[:, None] * math.prod(shape) + points).ravel()

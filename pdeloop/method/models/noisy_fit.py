@@ -49,6 +49,7 @@ from pdeloop.method.models.base import FieldModel, Measured, least_squares
 from pdeloop.method.models.noise_level import signal_power
 from pdeloop.method.models.prediction import finite
 from pdeloop.method.models.settings import (
+    CLIP,
     COEFFICIENT_RIDGE,
     FAR,
     FIRST_SUBSTEPS,
@@ -157,9 +158,7 @@ class WindowRegression(Regression):
         projected: Spectrum = (columns - q @ (np.conj(q.transpose(0, 2, 1)) @ columns))[..., 0].T
         return projected
 
-    def coefficients(
-        self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
-    ) -> Array:
+    def coefficients(self, columns: Spectrum, values: Spectrum) -> Array:
         count = len(self.y) - self.lost - self.common.shape[2]  # complex numbers a wavenumber
         return significant(columns, values, max(count / len(self.y), 0.1), self.strictness)
 
@@ -237,7 +236,7 @@ def fit_noisy(
         np.zeros((n_z, n_a)),
         np.zeros(n_z),
         FIRST_SUBSTEPS,
-        settings.clip * largest if form.degree > POWERS else np.inf,
+        CLIP * largest if form.degree > POWERS else np.inf,
     )
     best, least = None, np.inf
     known = filtered(model, rollouts, first, shares)
@@ -252,7 +251,7 @@ def fit_noisy(
         compared = replace(form, shares=(max(share, form.shares[-1]),))
         for strictness in STRICTNESS:
             strict = replace(data, strictness=strictness)
-            found = _pass(strict, model, compared, settings)
+            found = _pass(strict, model, compared)
             if found is None:
                 continue
             found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
@@ -377,11 +376,9 @@ def _orthonormal(columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
     return left * (values > 1e-10 * values[:, :1])[:, None]
 
 
-def _pass(
-    data: WindowRegression, model: SpectralModel, form: Form, settings: FieldModelSettings
-) -> SpectralModel | None:
+def _pass(data: WindowRegression, model: SpectralModel, form: Form) -> SpectralModel | None:
     """The equation of a regression; None where it is not finite."""
-    linear, multipliers, polynomials = polynomial(data, form, 0, settings)
+    linear, multipliers, polynomials = polynomial(data, form, 0)
     if form.degree <= POWERS:
         multipliers, polynomials = polynomials.T @ multipliers, np.eye(form.degree - 1)
     cut, modes = data.y.shape[1], len(linear)

@@ -22,6 +22,12 @@ FAR = 1e3
 NOISE_MISJUDGED = 2.0
 """Ratio of the noise in the data to the declared noise, or its inverse, from which they count as
 different."""
+BETTER = 3.0
+"""How many times smaller the E of a kind with more unknowns must be for it to be selected."""
+CLIP = 1.2
+"""Bound on z in powers above the third, relative to the largest measured value."""
+SENSED_NEWEST = 8
+"""Maximum number of rollouts in a fit, the newest ones."""
 SENSED_REPRODUCED = 0.05
 """Maximum error of an equation that is used."""
 REPRODUCED_NOISY = 0.05
@@ -42,49 +48,19 @@ class FieldModelSettings(Settings):
 
     # The choice of a kind.
     reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
-    better: float = setting(
-        3.0,
-        "how many times smaller the E of a kind with more unknowns must be for it to be selected",
-        1,
-        100,
-    )
     folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
     worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
     largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
     # Spectral models.
-    passes: int = setting(
-        12,
-        "number of times that an equation is refitted along the paths of the previous fit",
-        1,
-        20,
-    )
-    samples: int = setting(500, "maximum number of data steps in a fit", 50, 1_000_000)
     substeps: int = setting(64, "maximum number of internal steps per sampling time", 1, 1000)
     reach: float = setting(
         1.5, "fastest nonlinear rate times the internal step; ETDRK4 is stable up to 2.8", 0.1, 2.8
-    )
-    clip: float = setting(
-        1.2, "bound on z in powers above the third, relative to the largest measured value", 1, 10
-    )
-    # Finite-difference, convolution and low-rank models.
-    point_substeps: int = setting(32, "as `substeps`, for finite-difference models", 2, 1000)
-    near_samples: int = setting(400, "as `samples`, for models of neighbours", 50, 1_000_000)
-    near_reach: float = setting(
-        0.5, "as `reach`, for models of neighbours, whose rule is of order 4", 0.1, 2.8
-    )
-    coarse_points: int = setting(
-        256,
-        "maximum number of grid points of finite-difference models on several axes; every n-th "
-        "point is used on finer grids",
-        16,
-        65536,
     )
     # The field between few sensors. "Error" is the squared error of simulated readings over their sum
     # of squares, without the share of the noise.
     sensed_unresolved: float = setting(
         0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
     )
-    sensed_newest: int = setting(8, "maximum number of rollouts in a fit, the newest ones", 1, 1000)
     sensed_growth: float = setting(
         0.5, "maximum growth of a wave per sampling time, as an exponent of e", 0, 10
     )

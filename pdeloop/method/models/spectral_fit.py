@@ -34,7 +34,12 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Samples, Values, least_squares, orthonormal
-from pdeloop.method.models.settings import COEFFICIENT_RIDGE, FIRST_SUBSTEPS, FieldModelSettings
+from pdeloop.method.models.settings import (
+    CLIP,
+    COEFFICIENT_RIDGE,
+    FIRST_SUBSTEPS,
+    FieldModelSettings,
+)
 from pdeloop.method.models.spectral import SpectralModel, Spectrum
 from pdeloop.solver.polynomial_step import phi_functions
 
@@ -115,9 +120,7 @@ class Regression:
         projected: Spectrum = values - q @ (q.T @ values)
         return projected
 
-    def coefficients(
-        self, columns: Spectrum, values: Spectrum, settings: FieldModelSettings
-    ) -> Array:
+    def coefficients(self, columns: Spectrum, values: Spectrum) -> Array:
         """Real coefficients of complex columns (N, terms) that explain values (N,) best."""
         return _real_least_squares(columns, values)
 
@@ -129,7 +132,7 @@ class Regression:
         return wavenumbers
 
 
-def polynomial(data: Regression, form: Form, turn: int, settings: FieldModelSettings) -> Symbols:
+def polynomial(data: Regression, form: Form, turn: int) -> Symbols:
     """Polynomials of ik."""
     k = data.k
     compared = min(form.compared(len(k), turn), data.y.shape[1])
@@ -142,7 +145,7 @@ def polynomial(data: Regression, form: Form, turn: int, settings: FieldModelSett
     powers = _power_terms(form)
     terms += [(p, k**j) for p, j in powers]
     columns = np.stack([(rests[p] * term[low]).ravel() for p, term in terms], axis=1)
-    found = data.coefficients(columns, data.rest(data.y[:, low]).ravel(), settings)
+    found = data.coefficients(columns, data.rest(data.y[:, low]).ravel())
     linear = data.symbols[0] + sum(
         coefficient * term for coefficient, (_, term) in zip(found[:count], terms, strict=False)
     )
@@ -239,6 +242,10 @@ def _real_least_squares(A: Spectrum, y: Spectrum) -> Array:
 _SETTLED = 1e-3
 """Relative change of the one-step error at which the passes end."""
 
+_PASSES = 12
+"""Number of times that an equation is refitted along the paths of the previous fit."""
+_SAMPLES = 500
+"""Maximum number of data steps in a fit."""
 POWERS = 3
 """Above this degree the multipliers are powers of ik, each with a polynomial; else they are symbols."""
 SIZES = 48
@@ -249,7 +256,7 @@ def fit_spectral(
     samples: Samples, form: Form, settings: FieldModelSettings
 ) -> SpectralModel | None:
     """The equation of that form, or None where half of the samples overflow the first ones."""
-    samples = samples.thinned(settings.samples)
+    samples = samples.thinned(_SAMPLES)
     start = None
     if form.free == "linear":  # whose passes need one
         start = fit_spectral(samples, replace(form, free="none"), settings)
@@ -263,21 +270,21 @@ def fit_spectral(
         np.zeros((n_z, n_a)),
         np.zeros(n_z),
         FIRST_SUBSTEPS,
-        settings.clip * largest if form.degree > POWERS else np.inf,
+        CLIP * largest if form.degree > POWERS else np.inf,
     )
     # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
     best, least, tried = None, np.inf, model
-    for turn in range(settings.passes + 1):
+    for turn in range(_PASSES + 1):
         data = _regression(tried, samples, form)
         if data is None and best is None:
             break
         settled = data is not None and abs(data.miss - least) <= _SETTLED * least
         if data is not None and data.miss < least and turn:
             best, least = tried, data.miss
-        if turn == settings.passes or (settled and turn > len(form.shares)):
+        if turn == _PASSES or (settled and turn > len(form.shares)):
             break
         if data is not None and (tried is best or turn <= len(form.shares)):
-            model, found = tried, _pass(data, tried, form, turn, settings)
+            model, found = tried, _pass(data, tried, form, turn)
         else:
             found = _between(best or model, tried)  # half of the way
         if found is None:
@@ -297,16 +304,14 @@ def _between(first: SpectralModel, second: SpectralModel) -> SpectralModel:
     return replace(second, **middle)
 
 
-def _pass(
-    data: Regression, model: SpectralModel, form: Form, turn: int, settings: FieldModelSettings
-) -> SpectralModel | None:
+def _pass(data: Regression, model: SpectralModel, form: Form, turn: int) -> SpectralModel | None:
     """The equation of a regression; None where it is not finite."""
     if form.free == "all":
         linear, multipliers, polynomials = all_free(data)
     elif form.free == "linear":
         linear, multipliers, polynomials = free_linear(data, form)
     else:
-        linear, multipliers, polynomials = polynomial(data, form, turn, settings)
+        linear, multipliers, polynomials = polynomial(data, form, turn)
     if form.degree <= POWERS:
         multipliers, polynomials = polynomials.T @ multipliers, np.eye(form.degree - 1)
     symbols = polynomials.T @ multipliers
