@@ -36,7 +36,7 @@ from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
 
-SMALL = 12
+SMALL = 40
 """Size of a state up to which a law knows all of it unless another order is asked for: POD modes are
 those of large numbers, whatever their units."""
 

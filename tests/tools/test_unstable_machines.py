@@ -43,7 +43,7 @@ class Levitation(pdeloop.Dynamics):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_law_keeps_it_at_its_target(seed: int) -> None:
-    """Explorations and first laws tell most of the stops, and of the target in their first steps alone."""
+    """Explorations and first laws tell of the target in their first steps alone."""
     run = pdeloop.train(plant=Levitation(), seed=seed)
     none, adapted = (run.costs[name].mean() for name in ("none", "adapted"))
     assert none > 50.0

@@ -211,18 +211,18 @@ def also_in_parts(
 
     Else `whole` itself. Explorations of an unstable plant, and a wrong first law, lead to where no
     model follows, and no good law leads: their beginnings near to the target are predicted. Those of a
-    chaotic plant are predicted in pieces. Where the plant leaves the target at once, a linear model of
-    short pieces near to it is the beginning of a law that keeps it there, of which more is measured.
+    chaotic plant are predicted in pieces; the better of both is taken. Where the plant leaves the
+    target at once, a linear model of short pieces near to it is the beginning of a law that keeps it
+    there, of which more is measured.
     """
     believed = whole and is_believed(context, whole, settings)
     if _reads(context) or (whole and believed and whole.once <= MOST_ONCE):
         return whole
-    return (
-        _near(context, records, settings, linear=False)
-        or (whole and not believed and _in_pieces(context, records, whole, settings))
-        or _near(context, records, settings, linear=True)
-        or whole
-    )
+    found = [_near(context, records, settings, linear=False)]
+    if whole and not believed:
+        found.append(_in_pieces(context, records, whole, settings))
+    best = min((own for own in found if own), key=lambda own: own.error, default=None)
+    return best or _near(context, records, settings, linear=True) or whole
 
 
 def _in_pieces(

@@ -264,9 +264,10 @@ def best_model(
     found = fitted(parts) if error > settings.field_error else None
     if found is not None and found.error < error:
         data, best, error = parts, found, found.error
-    exact = best is not None and (noise or best.own.one_step <= NOISY)
+    # Any model predicts what rests, as at a stop, and costs much.
+    rests = whole is not None and best is whole and not noise and whole.own.one_step > NOISY
     for linear in (False, True):
-        if exact and error <= most:
+        if error <= most and not rests:
             break
         near = [beginnings(rollouts, target, limit, weights, short=linear) for limit in NEAR]
         known = [(own, parts) for parts in near if (own := fitted(parts, linear=linear))]
