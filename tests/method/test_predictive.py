@@ -268,7 +268,7 @@ def optimizer(rollouts: int = 10, kind: type[Predictive] = Predictive) -> ModelB
         horizon=T,
         exploration=explored[0],
         further=explored[1:],
-        field_models=FieldModelSettings(folds=2, largest_degree=2, near_samples=50),
+        field_models=FieldModelSettings(folds=2, largest_degree=2),
         law=type("Short", (kind,), {"settings": SHORT})(ROWS, T),
     )
     own = ModelBased.for_context(context)

@@ -174,7 +174,7 @@ def test_noise_that_is_found_is_told_and_makes_no_first_law() -> None:
 QUICK = {
     **{"n_z": 96, "n_a": 6, "horizon": 20, "reduced_order": 8},
     **{"rollouts": 6, "evaluation_fields": 1},
-    **{"field_model_settings.folds": 2, "field_model_settings.passes": 2},
+    **{"field_model_settings.folds": 2},
     **{"exploration_variance": 1.0, "identification": "regression"},
     **{"field_model_settings.largest_degree": 3},
 }

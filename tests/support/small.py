@@ -26,7 +26,6 @@ RECORDED = {"iterations": "6", "seeds": "2"}
 FEW_FITS = {
     "field_model_settings.folds": 2,
     "field_model_settings.largest_degree": 2,
-    "field_model_settings.near_samples": 50,
 }
 """For trainings whose model does not matter: fits of all kinds would be most of their time."""
 FEW_STEPS = {"optimizer_settings.iterations": 3, "optimizer_settings.mixtures": 2, **FEW_FITS}

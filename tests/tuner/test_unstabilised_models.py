@@ -70,7 +70,7 @@ def test_a_model_of_few_readings_keeps_its_filter(monkeypatch: pytest.MonkeyPatc
     def track_outputs(*given: Any) -> lqt.Gains:
         raise lqt.DesignError("not stabilisable")
 
-    monkeypatch.setattr(lqg, "track_outputs", track_outputs)
+    monkeypatch.setattr(lqt, "track_outputs", track_outputs)
     rows = trained(identification_attempts=1, sensors=8, law="observer", identification="subspace")
     *_, last = (row for row in rows if row["event"] == "evaluated")
     assert last["lqt"] == last["none"]
