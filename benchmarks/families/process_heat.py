@@ -102,6 +102,10 @@ class DeadZone(Process):
         moved = np.sign(a) * np.maximum(np.abs(a) - 0.1, 0.0)
         return joined(0.4 * second(z) - 0.05 * z + self._B @ moved)
 
+    def operating_point(self) -> tuple[Array, Array]:
+        """Outside of the dead zone, where the valves act."""
+        return np.full(self.n_z, self.target), np.full(self.n_a, 0.2)
+
 
 class Building(Process):
     """Eight rooms and their walls in a winter; radiator valves act on what the pipes carry."""
@@ -124,6 +128,11 @@ class Building(Process):
         return joined(
             rooms, 0.1 * (room - wall) - 0.05 * wall, 0.3 * (1.8 - pipe) - 0.05 * heat.sum()
         )
+
+    def operating_point(self) -> tuple[Array, Array]:
+        """The settled state: the targets of walls and pipes have no weight, and are none."""
+        a = np.full(self.n_a, self.action_target)
+        return self.settled(joined(np.full(16, 0.5), 1.5), a), a
 
 
 class CurrentProfile(Process):

@@ -11,6 +11,8 @@ from benchmarks import general
 from benchmarks.families.cases import CASES, PROCESS_CASES
 from benchmarks.families.process import PLANTS, Process
 from benchmarks.families.references import clipped_law, linearisation, predictive_law
+from pdeloop import problem
+from pdeloop.episode import rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 
@@ -64,6 +66,20 @@ def test_the_references_of_a_linear_plant() -> None:
     affine, planned = clipped_law(model, cost, free), predictive_law(model, cost, free)
     np.testing.assert_allclose(planned(0, states), affine(0, states), rtol=1e-3, atol=1e-4)
     assert predictive_law(model, cost, bound)(0, states)[3, 0] == pytest.approx(-0.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["DeadZone", "Building"])
+def test_a_plant_is_linearised_where_its_actions_act(name: str) -> None:
+    """Else the clipped law costs as much as no control, and says nothing of a training."""
+    plant = PLANTS[name]()
+    built = problem(plant=plant).plant()
+    law = clipped_law(linearisation(plant), built.cost, built.action_set)
+    none = np.zeros((2, plant.n_a))
+    costs = [
+        rollout(built, each, [1, 2], keep=False).costs.mean.mean()
+        for each in (law, lambda k, z: none)
+    ]
+    assert costs[0] < 0.2 * costs[1]
 
 
 def test_the_family_has_columns_of_its_own() -> None:
