@@ -109,3 +109,12 @@ def test_rows_do_not_depend_on_each_other_and_a_file_gives_the_same_bits() -> No
 def test_arrays_of_something_else_are_refused(name: str, value: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r".+"):
         model_of(fitted().arrays() | {name: value})
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_state_that_rests_is_predicted_to_rest() -> None:
+    """At a stop nothing moves: there are no modes to take the mean of."""
+    rest, actions = np.full((80, 3), 2.0), np.random.default_rng(0).standard_normal((80, 1))
+    model = fit_polynomial(Samples(rest, actions, rest), kind="polynomial")
+    assert model is not None
+    np.testing.assert_array_equal(model.step(rest, actions), rest)

@@ -190,7 +190,8 @@ class _Scaled:
         r, n_a = model.V.shape[1], model.n_a
         features = model.features(self.samples.before, self.samples.actions)
         size = np.sqrt(np.mean(features**2, axis=0))
-        size[1 : 1 + r] = np.sqrt(np.mean(features[:, 1 : 1 + r] ** 2))  # small modes are held back
+        if r:  # small modes are held back
+            size[1 : 1 + r] = np.sqrt(np.mean(features[:, 1 : 1 + r] ** 2))
         size[size == 0.0] = 1.0
         features /= size
         gram = features.T @ features / len(features)
