@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,8 @@ from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
 
 SMALL = 40
-"""Size of a state up to which a law knows all of it unless another order is asked for: POD modes are
-those of large numbers, whatever their units."""
+"""Size of a state up to which a training's law knows all of it unless another order is asked for: POD
+modes are those of large numbers, whatever their units."""
 
 
 @dataclass(frozen=True)
@@ -291,24 +292,14 @@ def designed(
     free = settings.action_set.free(n_a)
     if settings.action_set.zero_mean:  # only their differences show an effect
         known = [(states, actions @ free) for states, actions in trajectories]
-    asked = min(model_order(asdict(settings)), target.size)
-
-    def identified(n_s: int) -> ReducedModel:
-        return identify(
-            known,
-            method="dmdc" if truncated else "regression",
-            n_s=n_s,
-            p=settings.dmdc_rank if truncated else 0,
-            channels=channels,
-            settings=settings.method,
-        )
-
-    try:
-        model = identified(asked or target.size * (target.size <= SMALL))
-    except ValueError:  # the data do not determine all of a small state
-        if asked or target.size > SMALL:
-            raise
-        model = identified(0)
+    model = identify(
+        known,
+        method="dmdc" if truncated else "regression",
+        n_s=min(model_order(asdict(settings)), target.size),
+        p=settings.dmdc_rank if truncated else 0,
+        channels=channels,
+        settings=settings.method,
+    )
     if settings.action_set.zero_mean:
         model = replace(model, B=model.B @ free.T)
     unsolved: DesignError | None = None
@@ -369,7 +360,7 @@ def design_each(
     Environments of one model have one design in common. A model without stabilising gains has gains of
     0: a training can explore again, or begin from no control. Where the actions act late
     (`study_delays`), a law with a filter has the last ones in its state; the identification "subspace"
-    knows them anyway.
+    knows them anyway. A small state is not reduced unless an order is asked for.
 
     states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
     to.
@@ -381,11 +372,17 @@ def design_each(
         every = [(states[:, m], actions[:, m]) for m in range(states.shape[1])]
         late = tuple(max(n, 0) for n in study_delays(every).best)
         settings = replace(settings, input_delay=late if any(late) else ())
-    found: dict[int, NDArray[np.float64]] = {}
+    whole, found = settings, dict[int, NDArray[np.float64]]()
+    if target.size <= SMALL and not model_order(asdict(settings)):
+        whole = replace(settings, reduced_order=target.size)
     for number in numbers:
         if number not in found:
             own = [m for m, other in enumerate(numbers) if other == number]
             first, *further = [(states[:, m], actions[:, m]) for m in own]
-            rows = designed([first], target, settings, further=further, or_no_control=True).rows
+            design = partial(designed, [first], target, further=further, or_no_control=True)
+            try:
+                rows = design(whole).rows
+            except ValueError:  # the data do not determine all of a small state
+                rows = design(settings).rows
             found[number] = pack(rows)
     return np.stack([found[number] for number in numbers])

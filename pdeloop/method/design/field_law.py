@@ -87,6 +87,8 @@ _FIELD_THINNING = 5
 _FIELD_ROOM = 2.0
 """Modes per actuator from which on the basis includes the rows of the full-state feedback."""
 
+EQUAL = 1e-4
+"""Relative difference up to which costs are the same: the law of the regression is used then."""
 EXACT = 1e-6
 """E of a model that counts as exact."""
 NOISY = 0.3
@@ -133,8 +135,8 @@ class FieldLaw:
 
     @property
     def better(self) -> bool:
-        """True if its law is cheaper on the model than the other one."""
-        return self.rows is not None and self.cost < self.other_cost
+        """True if its law is cheaper on the model than the other one, by more than nothing."""
+        return self.rows is not None and self.cost < (1.0 - EQUAL) * self.other_cost
 
     def summary(self) -> dict[str, Any]:
         """The report as data."""

@@ -278,7 +278,7 @@ def scale_of(states: Sequence[Array]) -> Scale:
     """The mean state, and the standard deviation of every number of the state."""
     every = np.concatenate(states)
     spread = every.std(axis=0)
-    units = np.maximum(spread, max(LEAST_UNIT * float(spread.max()), 1e-300))
+    units = np.maximum(spread, max(LEAST_UNIT * float(spread.max()), 1e-150))
     return Scale(every.mean(axis=0), units)
 
 
