@@ -35,7 +35,7 @@ def test_numbers_that_cost_nothing_have_no_say_in_the_choice_of_a_model(level: f
     context = Context(
         np.eye(N_Z)[:, :1], np.zeros(N_Z), 1.0, 1.0, STEPS, known[0], further=known[1:], cost=cost
     )
-    belief = believe(context, records)
+    belief = believe(context, records, 0.05)
     assert belief is not None
     assert belief.error < 1e-3
     before, after = (np.concatenate([own.states[i:][:STEPS] for own in records]) for i in (0, 1))

@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdeloop.method.adapt import Context, Trajectory, belief, model_based, renewal
+from pdeloop.method.adapt import Context, Trajectory, model_based, renewal
 from pdeloop.method.adapt.base import Record
-from pdeloop.method.adapt.belief import Belief, also_in_parts
+from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.renewal import Renewal, renew_from_states
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.models import FieldModel
+from pdeloop.method.models import FieldModel, FittedModel, Measured
+from pdeloop.method.models.choice import Accuracy
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
 from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.selection import Selection
 from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
 from tests.support.small import same_bits
 
@@ -62,27 +65,18 @@ def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_the
     trajectory = Trajectory(records[0].states, records[0].actions)
     context = Context(np.eye(12)[:, :1], np.zeros(12), 1.0, 1.0, 80, trajectory)
 
-    def judged(
-        known: Context,
-        own: Any,
-        first: str = "",
-        parts: int = 1,
-        most: float = np.inf,
-        near: float = np.inf,
-        linear: bool = False,
-    ) -> Belief | None:
-        if near < np.inf:
+    def judged(self: Selection, rollouts: list[Measured], *_: Any, **__: Any) -> FittedModel | None:
+        if not rollouts or len(rollouts[0].actions) not in (
+            80,
+            10,
+        ):  # beginnings near to the target
             return None
-        rollouts = [belief._measured(known, record) for record in own]
-        if parts > 1:
-            rollouts = [part for rollout in rollouts for part in belief.pieces(rollout, parts)]
-        return Belief(model, belief.errors(model, rollouts, known.target, 2.0).mean(), 1)
+        error = float(errors(model, rollouts, self.target, 2.0).mean())
+        return FittedModel(model, error, [], Accuracy(error, error))
 
-    monkeypatch.setattr(belief, "believe", judged)
-    first = judged(context, records)
-    assert first is not None and first.error > SETTINGS.believed
-    found = also_in_parts(context, records, first, SETTINGS)
-    assert found is not None and found.whole == whole
+    monkeypatch.setattr(Selection, "fit", judged)
+    found = believe(context, records, SETTINGS.believed)
+    assert found is not None and (found.whole, found.accepted) == (whole, not whole)
     assert (found.error <= SETTINGS.believed) == (not whole)
     again = Belief.of(found.state())
     assert again is not None and (again.whole, again.error) == (found.whole, found.error)

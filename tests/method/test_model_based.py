@@ -20,11 +20,13 @@ from pdeloop.method.adapt import (
     Trajectory,
     model_based,
 )
-from pdeloop.method.adapt.belief import also_in_parts, believe
+from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
 from pdeloop.method.design.lqt import track
+from pdeloop.method.models import Measured, fit_field_model
 from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits
@@ -271,10 +273,11 @@ def test_a_model_of_what_stays_near_predicts_laws_that_it_was_not_fitted_to() ->
     settings = ModelBasedSettings()
     first, others = rolled(0.8, range(10, 14)), rolled(1.1, range(14, 18)) + rolled(0.9, range(4))
     every = [*explored, *first, *others]
-    whole = believe(context, every)
+    known = [Measured(own.states, own.actions) for own in every]
+    whole = fit_field_model(known, context.target)
     assert whole is None or whole.error > settings.believed
-    found = also_in_parts(context, every, whole, settings)
-    assert found is not None and found.error < 1e-6
+    found = believe(context, every, settings.believed)
+    assert found is not None and found.accepted and found.error < 1e-6
     loop = found.loop(context)
     for record in rolled(0.6, range(30, 34)):
         predicted = loop.costs(loop.theta(record.policy), record.states[:1])[0]
@@ -298,10 +301,25 @@ def test_a_first_law_is_left_only_where_no_control_diverges_from_fewer_fields_or
     )
     monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
     monkeypatch.setattr(model_based, "any_state_serves", lambda *_: False)
-    belief = believe(optimizer._context, optimizer._before)
+    belief = believe(optimizer._context, optimizer._before, 0.05)
     assert belief is not None
     optimizer._improve(belief, {}, True)
     assert optimizer._progress.safe is safe
+
+
+def test_no_control_that_was_not_measured_is_not_returned_where_rollouts_alone_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The model knows nothing of the final law, and says that no control is better than the first."""
+    plant = Plant()
+    optimizer = make(plant, share=0.1)
+    while optimizer._progress.stage != JUDGING:
+        optimizer.tell(measured(plant, optimizer))
+    optimizer._progress.safe, best = False, optimizer.policy
+    monkeypatch.setattr(ClosedLoop, "costs", lambda _, theta, fields: np.full(len(fields), np.inf))
+    row = optimizer.tell(measured(plant, optimizer))
+    assert row["chosen"] == "adapted" and same_bits(optimizer.policy, best)
+    assert "less than the first law" in str(row["reason"])
 
 
 def test_a_large_budget_ends_once_the_fields_are_known() -> None:

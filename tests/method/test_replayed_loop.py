@@ -15,7 +15,7 @@ from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
 from pdeloop.method.adapt.replay import best_measured, step
 from pdeloop.method.adapt.replayed_loop import ReplayedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of, evidence_of_rollouts
 from pdeloop.method.design.lqg import law_of_innovations
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of
@@ -77,7 +77,7 @@ def loop_and_rollout() -> tuple[ReplayedLoop, Record, np.ndarray]:
     theta = law.theta_start
     theta = theta + 0.05 * np.random.default_rng(3).standard_normal(theta.size)
     record = rolled(5, law, theta)
-    belief = believe(context(), [*explored(), record])
+    belief = believe(context(), [*explored(), record], 0.05)
     assert belief is not None
     loop = belief.loop(context())
     assert isinstance(loop, ReplayedLoop)
@@ -138,7 +138,8 @@ def test_of_replays_measured_costs_alone_decide() -> None:
     records = [rolled(20 + i, first_law(), law) for i in range(3) for law in (first, theta)]
     fields = loop.beginnings(records)
     laws, on_model = {FIRST: first, ADAPTED: theta}, Estimate(-1e3)
-    found = evidence_of(loop, laws, FIRST, records, fields, on_model)
+    assert evidence_of(loop, laws, FIRST, records, fields, on_model) is None
+    found = evidence_of_rollouts(laws, FIRST, records)
     own, before = (np.array([r.cost for r in records[i::2]]) for i in (1, 0))
     assert found[ADAPTED].change == mean_of(own) - mean_of(before)
     assert found[FIRST].change == ZERO

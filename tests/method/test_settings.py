@@ -166,7 +166,7 @@ def test_an_optimiser_fits_its_models_with_the_constants_of_its_context() -> Non
         context = Context(
             np.eye(16)[:, :1], np.zeros(16), 1.0, 1.0, 40, first, field_models=settings
         )
-        belief = believe(context, records, "linear")
+        belief = believe(context, records, 0.05, "linear")
         assert belief is not None
         tried[reproduced] = belief.model.kind
     assert tried[1.0] == "linear" != tried[0.0]

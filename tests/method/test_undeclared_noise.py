@@ -14,12 +14,8 @@ from controller_node.identification import Designed, DesignSettings, designed
 from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.model_rows import pack
-from pdeloop.method.adapt import Context, Record, Trajectory, undeclared_noise
-from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.models import Measured
 from pdeloop.method.models import undeclared_noise as of_models
-from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.noise_level import correlations, is_white, noise_level, short_waves
 from pdeloop.method.models.settings import DEFAULTS
 from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
@@ -128,14 +124,12 @@ def test_a_model_that_predicts_what_noise_would_not_allow_ends_the_search(
 ) -> None:
     """Whatever the data look like: with noise that was not declared, nothing is even fitted."""
     white = np.random.default_rng(7).standard_normal((L, N))
-    record = Record(np.zeros((1, 2)), np.inf, white, np.zeros((L - 1, 1)))
-    context = Context(np.eye(N)[:, :1], np.zeros(N), 1.0, 1.0, L - 1, Trajectory(white, white))
-    model = LinearModel("linear", np.eye(N), np.zeros((N, 1)), np.zeros(N))
-    settings, fits = ModelBasedSettings(), []
+    rollout, fits = Measured(white, np.zeros((L - 1, 1))), []
     monkeypatch.setattr(of_models, "fit_field_model", lambda *_, **on: fits.append(on))
     # All of these states is noise, of which a share of 1 cannot be predicted.
     for error, tried in ((0.45, 0), (0.55, 1)):
-        undeclared_noise.believe_in_noise(context, [record], Belief(model, error, 1), settings)
+        given = {"settings": DEFAULTS, "most": 0.3, "better_than": error}
+        fit_undeclared_noise([rollout], np.zeros(N), **given)
         assert len(fits) == tried
     assert fits[0]["noise"] == pytest.approx(1.0, rel=0.05)
 

@@ -127,6 +127,7 @@ def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, exc
         for i in range(4)
     ]
     known = evidence_of(loop, laws, base, seen, fields, Estimate(held_out, 0.1, 20.0))
+    assert known is not None
     favoured = held_out < 0.0 and held_out + excess < 0.0
     assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
 

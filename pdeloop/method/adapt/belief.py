@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,24 +17,14 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
 from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.adapt.replayed_loop import ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
-from pdeloop.method.adapt.settings import BELIEVED_NOISY, ImprovementSettings
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.models import FieldModel, Measured, affine_law, fit_field_model
-from pdeloop.method.models.choice import scale_of
+from pdeloop.method.models import FieldModel, Measured, affine_law
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.prediction import NEAR, beginnings, errors, pieces
 from pdeloop.method.models.readings import ReadingsModel, fit_readings
+from pdeloop.method.models.selection import Selection
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import FAR
-
-_PIECES = 8
-"""Pieces of a rollout that a model of a chaotic plant must predict."""
-_CHAOTIC_GROWTH = 20.0
-"""Minimum ratio of the errors on whole rollouts and on pieces."""
-
-MOST_ONCE = 0.3
-"""Largest error of single steps of a model: what rests is predicted by any model, and costs much."""
 
 _MODEL = "model."
 
@@ -55,9 +45,10 @@ class Belief:
     near : float
         A linear model up to so many times the distance of initial states from the target; infinite: of
         all that was measured, or of beginnings that it predicts as well.
-    once : float
-        Error of single steps relative to the change in them, on rollouts that it was not fitted to; 0
-        where noise hides it, or it is not known.
+    noise : float
+        Measurement noise that it was fitted for in place of the declared one; 0: there is none.
+    accepted : bool
+        True if laws are improved on it.
     """
 
     model: FieldModel
@@ -65,7 +56,8 @@ class Belief:
     components: int
     whole: bool = True
     near: float = np.inf
-    once: float = 0.0
+    noise: float = 0.0
+    accepted: bool = True
 
     def state(self) -> State:
         """The model, its error and its components, as the arrays of a checkpoint."""
@@ -132,15 +124,9 @@ class Belief:
 
 
 def believe(
-    context: Context,
-    records: Sequence[Record],
-    first: str = "",
-    parts: int = 1,
-    most: float = np.inf,
-    near: float = np.inf,
-    linear: bool = False,
+    context: Context, records: Sequence[Record], accepted: float, first: str = ""
 ) -> Belief | None:
-    """The model that predicts the rollouts best, or None where none can be fitted.
+    """The model that predicts the rollouts, as `Selection` says; None where none can be fitted.
 
     Parameters
     ----------
@@ -148,121 +134,37 @@ def believe(
         The law's basis and target.
     records : sequence of Record
         Explorations, whose policy is zero and whose cost is infinite, and rollouts of laws.
+    accepted : float
+        Largest E of a model that is accepted without noise.
     first : str
         The kind that is tried first, the one selected before; empty: none.
-    parts : int
-        Pieces of equal length that are predicted in place of a rollout.
-    most : float
-        Largest E with which a model is used.
-    near : float
-        Rollouts end where they are so many times as far from the target as any at its first state.
-    linear : bool
-        Only linear models, of short pieces.
     """
     if _reads(context):
         return _of_readings(context, records)
-    rollouts = [_measured(context, record) for record in records if len(record.actions)]
-    if parts > 1:
-        rollouts = [part for rollout in rollouts for part in pieces(rollout, parts)]
-    if near < np.inf:
-        rollouts = beginnings(rollouts, context.target, near, context.weights, short=linear)
-    found = fit_field_model(
-        rollouts,
-        context.target,
+    selection = Selection(
+        target=context.target,
+        accepted=accepted,
         settings=context.field_models,
         noise=context.noise,
         action_set=context.action_set,
-        first=first,
         line=context.line,
         shape=context.shape,
         weights=context.weights,
-        most=most,
-        linear=linear,
-        scale=None if context.noise or not rollouts else scale_of([own.states for own in rollouts]),
+        undeclared=not context.sensors,
     )
+    found = selection.select([_measured(context, own) for own in records], first)
     if found is None:
         return None
     components = 2 if found.model.kind.startswith("two-") else 1
-    once = 0.0 if context.noise else found.own.one_step
-    near, error = (near, once) if linear else (np.inf, found.error)
-    return Belief(found.model, error, components, near=near, once=once)
-
-
-def is_believed(context: Context, belief: Belief | None, settings: ImprovementSettings) -> bool:
-    """True if laws are improved on a model."""
-    return belief is not None and belief.error <= largest_error(context, settings, belief.near)
-
-
-def largest_error(context: Context, settings: ImprovementSettings, near: float = np.inf) -> float:
-    """The largest E of a model that laws are improved on; near: as for `believe`.
-
-    What leaves the target at once says little of the plant, which a law that keeps it there does.
-    """
-    return BELIEVED_NOISY if context.noise or near < np.inf else settings.believed
-
-
-def also_in_parts(
-    context: Context,
-    records: Sequence[Record],
-    whole: Belief | None,
-    settings: ImprovementSettings,
-) -> Belief | None:
-    """A model of parts of rollouts where the best one of whole rollouts, `whole`, predicts too little.
-
-    Else `whole` itself. Explorations of an unstable plant, and a wrong first law, lead to where no
-    model follows, and no good law leads: their beginnings near to the target are predicted. Those of a
-    chaotic plant are predicted in pieces; the better of both is taken. Where the plant leaves the
-    target at once, a linear model of short pieces near to it is the beginning of a law that keeps it
-    there, of which more is measured.
-    """
-    believed = whole and is_believed(context, whole, settings)
-    if _reads(context) or (whole and believed and whole.once <= MOST_ONCE):
-        return whole
-    found = [_near(context, records, settings, linear=False)]
-    if whole and not believed:
-        found.append(_in_pieces(context, records, whole, settings))
-    best = min((own for own in found if own), key=lambda own: own.error, default=None)
-    return best or _near(context, records, settings, linear=True) or whole
-
-
-def _in_pieces(
-    context: Context, records: Sequence[Record], whole: Belief, settings: ImprovementSettings
-) -> Belief | None:
-    """A model that predicts pieces of rollouts of a chaotic plant, where small errors grow.
-
-    They are far smaller than those of whole rollouts; those of a plant that is described badly add up.
-    """
-    most = min(largest_error(context, settings), whole.error / _CHAOTIC_GROWTH)
-    rollouts = [_measured(context, record) for record in records if len(record.actions)]
-    parts = [part for rollout in rollouts for part in pieces(rollout, _PIECES)]
-    # What it was fitted to is predicted better than what it was not, and takes no other fit.
-    known = _errors(context, whole.model, parts)
-    if not (len(known) and known.mean() <= most):
-        return None
-    found = believe(context, records, whole.model.kind, _PIECES, most)
-    return replace(found, whole=False) if found and found.error <= most else None
-
-
-def _near(
-    context: Context, records: Sequence[Record], settings: ImprovementSettings, *, linear: bool
-) -> Belief | None:
-    """The best model of beginnings near to the target, of regions of several sizes."""
-    most = BELIEVED_NOISY if linear else largest_error(context, settings)
-    rollouts = [_measured(context, own) for own in records if len(own.actions)]
-    sizes: dict[int, float] = {}
-    for near in (np.inf, *NEAR):  # of several in which the same is measured the largest
-        parts = beginnings(rollouts, context.target, near, context.weights)
-        sizes.setdefault(sum(len(own.actions) for own in parts), near)
-    regions = [near for near in sizes.values() if near < np.inf]
-    found = [believe(context, records, near=near, linear=linear) for near in regions]
-    good = [own for own in found if own and own.error <= most and own.once <= MOST_ONCE]
-    return min(good, key=lambda own: own.error, default=None)
-
-
-def _errors(context: Context, model: FieldModel, rollouts: Sequence[Measured]) -> Array:
-    """E of each rollout."""
-    worst = context.field_models.worst
-    return errors(model, rollouts, context.target, worst, context.noise, context.weights)
+    return Belief(
+        found.model,
+        found.error,
+        components,
+        found.whole,
+        found.near,
+        found.noise,
+        accepted=found.predicts,
+    )
 
 
 def _reads(context: Context) -> bool:

@@ -34,13 +34,7 @@ from pdeloop.method.adapt.base import (
     require_positive,
     require_results,
 )
-from pdeloop.method.adapt.belief import (
-    Belief,
-    also_in_parts,
-    believe,
-    is_believed,
-    largest_error,
-)
+from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.initial_fields import (
     any_state_serves,
@@ -63,7 +57,6 @@ from pdeloop.method.adapt.schedule import Schedule
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records, cleaned
-from pdeloop.method.adapt.undeclared_noise import believe_in_noise
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -372,18 +365,14 @@ class ModelBased(Optimizer):
         """Improve the law on the model that predicts the rollouts, or go on without one."""
         final = self._records.count >= self._schedule.last or self._rests
         belief = self._believe()
-        known = self._measurements()
-        other = believe_in_noise(self._context, known, belief, self._settings)
-        if other is not None:
-            belief, row["noise"] = other
-            self._take_noise(other[1])
-        else:
-            belief = also_in_parts(self._context, known, belief, self._settings)
         if belief is not None:
             row["model"] = belief.model.kind
             if np.isfinite(belief.error):
                 row["mismatch"] = belief.error
-        if belief is not None and self._is_believed(belief):
+            if belief.noise:
+                row["noise"] = belief.noise
+                self._take_noise(belief.noise)
+        if belief is not None and belief.accepted:
             self._progress.belief, self._progress.replayed = belief, False
             self._improve(belief, row, final)
         else:
@@ -395,8 +384,7 @@ class ModelBased(Optimizer):
         """The model that predicts the rollouts; the kind selected before is tried first."""
         before = self._progress.belief
         kind = "" if before is None else before.model.kind
-        most = largest_error(self._context, self._settings)
-        return believe(self._context, self._measurements(), kind, 1, most)
+        return believe(self._context, self._measurements(), self._settings.believed, kind)
 
     def _take_noise(self, noise: float) -> None:
         """Go on as if this measurement noise had been declared; 0: it was as declared."""
@@ -404,10 +392,6 @@ class ModelBased(Optimizer):
         self._context = replace(self._context, noise=noise or self._declared)
 
     _unpredicted = "no model of the whole field predicts the rollouts"
-
-    def _is_believed(self, belief: Belief) -> bool:
-        """True if the law is improved on this model."""
-        return is_believed(self._context, belief, self._settings)
 
     def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
         """A step along measured rollouts from the law that is best on fields of the first one."""
@@ -489,11 +473,14 @@ class ModelBased(Optimizer):
         """Choose between the first law, the final one and no control; the name of that to stay with."""
         progress, known = self._progress, self._rollouts()
         base = FIRST if progress.safe or progress.replayed else NONE
-        if progress.replayed or progress.belief is None:
-            evidence = evidence_of_rollouts(laws, base, known)
-        else:
+        evidence = None
+        if progress.belief is not None and not progress.replayed:
             loop, fields = progress.belief.loop(self._context), self._fields()
             evidence = evidence_of(loop, laws, base, known, fields, progress.change)
+        if evidence is None:
+            measured = any(np.array_equal(own.policy, laws[base]) for own in known)
+            base = base if measured else FIRST  # to which there is nothing to compare
+            evidence = evidence_of_rollouts(laws, base, known)
         verdict = choose(evidence, base, self._settings.confidence)
         progress.policy = laws[verdict.chosen].copy()
         row["chosen"], row["reason"] = verdict.chosen, verdict.reason

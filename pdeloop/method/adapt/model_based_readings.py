@@ -46,10 +46,6 @@ class ModelBasedReadings(ModelBased):
             return super()._fields()
         return self._progress.belief.loop(self._context).beginnings(self._data())
 
-    def _is_believed(self, belief: Belief) -> bool:
-        """Always: the cost of a law is measured after every step."""
-        return True
-
     def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
         """More rollouts may determine a model."""
         row["reason"] = f"{self._unpredicted}; the law is kept"

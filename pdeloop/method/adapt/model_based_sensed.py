@@ -111,7 +111,7 @@ class ModelBasedSensed(ModelBasedReadings):
             found = sensed_from(self._context, measured, model)
             if found is not None:
                 return Belief(*found, 1)
-        return believe(self._context, measured)
+        return believe(self._context, measured, self._settings.believed)
 
     def _fields(self) -> Array:
         """Initial fields of the rollouts whose readings the equation reproduces; of all if of none."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from pdeloop.method.settings import Settings, setting
 
-BELIEVED_NOISY = 0.3
-"""Largest error E at which a model is used with measurement noise."""
 CONFIRMED = 0.5
 """Share of the gain on its own fields that a law must reach on those left out; otherwise it is made
 again on more drawn fields."""

@@ -162,21 +162,23 @@ def evidence_of(
     records: Sequence[Record],
     fields: Array,
     held_out: Estimate,
-) -> dict[str, Evidence]:
+) -> dict[str, Evidence] | None:
     """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
+
+    None where rollouts alone count: the model replays them, or knows nothing of one of the laws.
 
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
     held_out: change of the adapted law on fields that did not make it.
     """
-    if loop.replays:  # a rollout replayed is itself
-        return evidence_of_rollouts(laws, base, records)
+    if loop.replays:
+        return None
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}
     for name, law in laws.items():
         own = [r for r in records if np.array_equal(r.policy, law)]
         excess = _excess(loop, law, own)
         if any(record.usable for record in own) and not np.isfinite(excess).any():
-            return evidence_of_rollouts(laws, base, records)  # the model knows nothing of this law
+            return None
         same = name != base and np.array_equal(law, laws[base])
         if same or not (len(excess) or name == base):
             continue
@@ -259,7 +261,7 @@ def cheaper_law(
         if loop is not None:
             pair = {"law": law, FIRST: chosen}
             evidence = evidence_of(loop, pair, FIRST, records, fields, ZERO)
-            estimates.append(_change(evidence, "law", FIRST))
+            estimates.append(_change(evidence or {}, "law", FIRST))
         usable = [own for own in estimates if own is not None and np.isfinite(own.value)]
         if usable:
             change = min(usable, key=lambda own: own.error)

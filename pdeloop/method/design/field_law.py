@@ -46,7 +46,6 @@ from pdeloop.method.models import (
     FittedModel,
     Measured,
     affine_law,
-    fit_field_model,
 )
 from pdeloop.method.models.base import Law, Samples, saturated
 from pdeloop.method.models.choice import (
@@ -60,12 +59,12 @@ from pdeloop.method.models.choice import (
 )
 from pdeloop.method.models.linear import LinearModel, LowRankModel
 from pdeloop.method.models.noise_level import smoothed
-from pdeloop.method.models.prediction import NEAR, beginnings, predicted, usable
 from pdeloop.method.models.prediction import pieces as cut
+from pdeloop.method.models.prediction import predicted, usable
+from pdeloop.method.models.selection import Selected, Selection
 from pdeloop.method.models.settings import BETTER
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
 from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
     IdentificationSettings,
@@ -73,15 +72,12 @@ from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
     leading_modes,
-    pieces,
 )
 from pdeloop.method.reduce.regression import fit
 from pdeloop.process.one_thread import one_thread
 
 _FIELD_LARGEST = 512
 """Largest state for which a model of the whole field is fitted for the first law."""
-_FIELD_PIECES = 8
-"""Pieces of an episode that the model may predict instead of the whole."""
 _FIELD_THINNING = 5
 """Interval between the simulated states that the basis is computed from."""
 _FIELD_ROOM = 2.0
@@ -91,8 +87,6 @@ EQUAL = 1e-4
 """Relative difference up to which costs are the same: the law of the regression is used then."""
 EXACT = 1e-6
 """E of a model that counts as exact."""
-NOISY = 0.3
-"""Largest error of an accepted model with measurement noise, which leaves initial states uncertain."""
 FAR = 3.0
 """Distance of the target from the mean state, relative to that of the farthest measured state, above
 which it is outside of the data."""
@@ -209,79 +203,35 @@ def best_model(
     models: FieldModelSettings = MODEL_DEFAULTS,
     axes: tuple[int, ...] = (),
     weights: Array | None = None,
-) -> tuple[FittedModel | None, float, list[Measured], float]:
-    """The model of the whole field that predicts trajectories best, or pieces of them, and noise.
+) -> Selected | None:
+    """The model of the whole field that predicts trajectories best; None where there is none.
 
-    The noise is what the model was fitted for where another, or none, was declared; 0: as declared.
-    Pieces, because the state of a chaotic plant soon becomes independent of its initial field. They are
-    predicted even by models that take noise for the field, so noise that was not declared is
-    looked for before. A target far outside of the data makes every error small, so a model that does
-    not reproduce what the data do is chosen again by that. The work grows with the third power of the
-    size of the state, so there is a largest one. Last, what the model was chosen by. axes: as for
-    `field_law`; noise that was not declared is looked for on one axis alone. weights: as for
-    `fit_field_model`.
+    A target far outside of the data makes every error small, so a model that does not reproduce what
+    the data do is chosen again by that. The work grows with the third power of the size of the state,
+    so there is a largest one. axes: as for `field_law`; weights: as for `fit_field_model`.
     """
-    rollouts = [Measured(z, a) for z, a in trajectories if len(a)]
     if len(target) > _FIELD_LARGEST:
-        return None, 0.0, rollouts, 0.0
-    scale, line = scale_of([states for states, _ in trajectories]), len(axes) < 2
-    most = max(settings.field_error, NOISY) if noise else settings.field_error
-    shape = () if line or len(target) % math.prod(axes) else axes
-
-    def fitted(
-        data: Sequence[Measured], by_scale: bool = False, linear: bool = False
-    ) -> FittedModel | None:
-        return fit_field_model(
-            data,
-            target,
-            action_set=action_set,
-            noise=noise,
-            settings=models,
-            line=line,
-            shape=shape,
-            scale=scale,
-            by_scale=by_scale,
-            weights=weights,
-            most=most,
-            linear=linear,
-        )
-
-    whole = fitted(rollouts)
-    error = np.inf if whole is None else whole.error
-    if line:
-        misjudged = fit_undeclared_noise(
-            rollouts,
-            target,
-            settings=models,
-            most=settings.field_error,
-            better_than=np.inf if noise else error,
-            declared=noise,
-            action_set=action_set,
-            weights=weights,
-        )
-        if misjudged is not None:
-            return *misjudged, rollouts, most
-    data, best = rollouts, whole
-    parts = [Measured(z, a) for z, a in pieces(trajectories, _FIELD_PIECES) if len(a)]
-    found = fitted(parts) if error > settings.field_error else None
-    if found is not None and found.error < error:
-        data, best, error = parts, found, found.error
-    # Any model predicts what rests, as at a stop, and costs much.
-    rests = whole is not None and best is whole and not noise and whole.own.one_step > NOISY
-    for linear in (False, True):
-        if error <= most and not rests:
-            break
-        near = [beginnings(rollouts, target, limit, weights, short=linear) for limit in NEAR]
-        known = [(own, parts) for parts in near if (own := fitted(parts, linear=linear))]
-        known = [pair for pair in known if linear or pair[0].error <= most]
-        own, parts = min(known, key=lambda pair: pair[0].own.one_step, default=(None, parts))
-        if own is not None and own.own.one_step <= NOISY:
-            return own, 0.0, parts, NOISY
-    if best is not None and error <= settings.field_error < best.own.simulated:
-        again = fitted(data, by_scale=True)
-        if again is not None and again.own.simulated < best.own.simulated:
-            best = again
-    return best, 0.0, data, most
+        return None
+    line = len(axes) < 2
+    selection = Selection(
+        target=target,
+        accepted=settings.field_error,
+        settings=models,
+        noise=noise,
+        action_set=action_set,
+        line=line,
+        shape=() if line or len(target) % math.prod(axes) else axes,
+        weights=weights,
+    )
+    found = selection.select([Measured(z, a) for z, a in trajectories])
+    if found is None or found.noise or found.near < np.inf:
+        return found
+    if found.error <= settings.field_error < found.fitted.own.simulated:
+        scale = scale_of([states for states, _ in trajectories])
+        again = selection.fit(found.rollouts, scale, by_scale=True)
+        if again is not None and again.own.simulated < found.fitted.own.simulated:
+            return replace(found, fitted=again)
+    return found
 
 
 def regression_accuracy(
@@ -358,11 +308,12 @@ def field_law(
         Modes of the law; 0: as many as `other` has.
     """
     weights = None if cost is None else cost.state_weights
-    fitted, found, rollouts, most = best_model(
-        trajectories, target, action_set, settings, noise, models, axes, weights
-    )
-    if fitted is None or found:
-        return FieldLaw(fitted, noise=found)
+    selected = best_model(trajectories, target, action_set, settings, noise, models, axes, weights)
+    if selected is None:
+        return FieldLaw(None)
+    if selected.noise:
+        return FieldLaw(selected.fitted, noise=selected.noise)
+    fitted, rollouts, most = selected.fitted, selected.rollouts, selected.most
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
     limits = [limited(rollout, action_set) for rollout in rollouts]
     with one_thread():

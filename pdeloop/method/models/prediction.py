@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Law, Measured, Samples
 
-NEAR = (10.0, 3.0, 1.0)
-"""Distances from the target, relative to the largest of initial states, up to which a model is sought
-where none predicts whole rollouts."""
 _SHORT = 8
-"""Steps of a piece of them, at most."""
+"""Steps of a short piece of a beginning, at most."""
 
 
 def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:

@@ -1,0 +1,222 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The selection of a model by rollouts: whole ones, pieces of them, or what stays near the target.
+
+The model is that which predicts whole rollouts (`choice`), where one is accepted, or else
+
+- one that is fitted for measurement noise that nobody declared (`undeclared_noise`), which is looked
+  for first, as any model that takes noise for the state seems to predict pieces;
+- of a chaotic plant, one that predicts pieces of rollouts, where small errors have not grown yet. They
+  are then far smaller than those of whole rollouts; those of a plant that is described badly add up;
+- of an unstable plant, one that predicts the beginnings of rollouts, near to the target. Explorations,
+  and a wrong law, lead to where no model follows, and no good law leads;
+- where the plant leaves the target at once, a linear model of short pieces near to it: the beginning
+  of a law that keeps it there, of which more is measured.
+
+Any model predicts what rests, as at a stop, and it costs much: a model that does not predict the change
+within single steps is not accepted either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.arrays import Array
+from pdeloop.method.models.base import FieldModel, Measured
+from pdeloop.method.models.choice import FittedModel, Scale, fit_field_model, scale_of
+from pdeloop.method.models.prediction import beginnings, errors, pieces
+from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
+
+ACCEPTED_NOISY = 0.3
+"""Largest error of a model that is accepted with measurement noise, or is linear and of beginnings:
+initial states are uncertain then, and what leaves the target at once says little."""
+ONE_STEP = 0.3
+"""Largest error of single steps, relative to the change in them."""
+PIECES = 8
+"""Pieces of a rollout that a model of a chaotic plant predicts."""
+CHAOTIC_GROWTH = 20.0
+"""Least ratio of the errors on whole rollouts and on pieces of a chaotic plant."""
+NEAR = (10.0, 3.0, 1.0)
+"""Distances from the target, relative to the largest of initial states, of beginnings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """A model, and what it was selected by.
+
+    Attributes
+    ----------
+    fitted : FittedModel
+    rollouts : list of Measured
+        Whole ones, pieces or beginnings.
+    most : float
+        Largest error at which a model of these is accepted.
+    whole : bool
+        False: it predicts pieces of rollouts, of a chaotic plant.
+    near : float
+        Linear, of short pieces up to so many times the distance of initial states from the target;
+        infinite: it is not.
+    noise : float
+        Measurement noise that it was fitted for in place of the declared one; 0: there is none.
+    one_step : float
+        Error of single steps relative to the change in them; 0 where noise hides it.
+    """
+
+    fitted: FittedModel
+    rollouts: list[Measured]
+    most: float
+    whole: bool = True
+    near: float = np.inf
+    noise: float = 0.0
+    one_step: float = 0.0
+
+    @property
+    def model(self) -> FieldModel:
+        """The model."""
+        return self.fitted.model
+
+    @property
+    def error(self) -> float:
+        """E, or of short pieces that of single steps."""
+        return self.one_step if self.near < np.inf else self.fitted.error
+
+    @property
+    def predicts(self) -> bool:
+        """True if its error is small enough."""
+        return self.error <= self.most
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Selection:
+    """How a model is selected; the arguments of `fit_field_model` are as there.
+
+    Attributes
+    ----------
+    accepted : float
+        Largest E of a model that is accepted without noise.
+    undeclared : bool
+        Whether noise that was not declared is looked for.
+    """
+
+    target: Array
+    accepted: float
+    settings: FieldModelSettings = DEFAULTS
+    noise: float = 0.0
+    action_set: ActionSet = ANY_ACTION
+    line: bool = True
+    shape: tuple[int, ...] = ()
+    weights: Array | None = None
+    undeclared: bool = True
+
+    @cached_property
+    def most(self) -> float:
+        """Largest E of a model that is accepted."""
+        return max(self.accepted, ACCEPTED_NOISY) if self.noise else self.accepted
+
+    def fit(
+        self,
+        rollouts: Sequence[Measured],
+        scale: Scale,
+        first: str = "",
+        *,
+        linear: bool = False,
+        by_scale: bool = False,
+    ) -> FittedModel | None:
+        """`fit_field_model` of these rollouts."""
+        return fit_field_model(
+            rollouts,
+            self.target,
+            settings=self.settings,
+            noise=self.noise,
+            action_set=self.action_set,
+            first=first,
+            line=self.line,
+            shape=self.shape,
+            scale=scale,
+            by_scale=by_scale,
+            weights=self.weights,
+            most=self.most,
+            linear=linear,
+        )
+
+    def select(self, rollouts: Sequence[Measured], first: str = "") -> Selected | None:
+        """The model, which need not be accepted; None where none can be fitted.
+
+        rollouts: measured ones; first: kind that is tried first, that of the last selection.
+        """
+        rollouts = [own for own in rollouts if len(own.actions)]
+        if not rollouts:
+            return None
+        scale = scale_of([own.states for own in rollouts])
+        whole = self._selected(self.fit(rollouts, scale, first), rollouts)
+        if (noisy := self._of_noise(rollouts, whole)) is not None:
+            return noisy
+        if whole is not None and whole.predicts and whole.one_step <= ONE_STEP:
+            return whole
+        found = [self._near(rollouts, scale, linear=False)]
+        if whole is not None and not whole.predicts:
+            found.append(self._of_pieces(rollouts, scale, whole))
+        best = min((own for own in found if own), key=lambda own: own.error, default=None)
+        return best or self._near(rollouts, scale, linear=True) or whole
+
+    def _selected(
+        self, fitted: FittedModel | None, rollouts: list[Measured], near: float = np.inf
+    ) -> Selected | None:
+        if fitted is None:
+            return None
+        most = ACCEPTED_NOISY if near < np.inf else self.most
+        one_step = 0.0 if self.noise else fitted.own.one_step
+        return Selected(fitted, rollouts, most, near=near, one_step=one_step)
+
+    def _of_noise(self, rollouts: list[Measured], whole: Selected | None) -> Selected | None:
+        """An equation for noise that was not declared, of fields on one axis."""
+        if not (self.undeclared and self.line) or self.shape:
+            return None
+        found = fit_undeclared_noise(
+            [replace(own, law=None) for own in rollouts],
+            self.target,
+            settings=self.settings,
+            most=ACCEPTED_NOISY,
+            # E without another noise is no measure for E with it.
+            better_than=np.inf if self.noise or whole is None else whole.error,
+            declared=self.noise,
+            action_set=self.action_set,
+            weights=self.weights,
+        )
+        if found is None:
+            return None
+        return Selected(found[0], rollouts, ACCEPTED_NOISY, noise=found[1])
+
+    def _of_pieces(
+        self, rollouts: list[Measured], scale: Scale, whole: Selected
+    ) -> Selected | None:
+        """A model that predicts pieces of rollouts of a chaotic plant."""
+        most = min(self.most, whole.error / CHAOTIC_GROWTH)
+        parts = [part for rollout in rollouts for part in pieces(rollout, PIECES)]
+        # What it was fitted to is predicted better than what it was not, and takes no other fit.
+        worst = self.settings.worst
+        known = errors(whole.model, parts, self.target, worst, self.noise, self.weights)
+        if not (len(known) and known.mean() <= most):
+            return None
+        found = self._selected(self.fit(parts, scale, whole.model.kind), parts)
+        return replace(found, whole=False) if found and found.error <= most else None
+
+    def _near(self, rollouts: list[Measured], scale: Scale, *, linear: bool) -> Selected | None:
+        """The best model of beginnings near to the target, of regions of several sizes."""
+        regions: dict[int, float] = {}
+        for near in (np.inf, *NEAR):  # of several in which the same is measured the largest
+            parts = beginnings(rollouts, self.target, near, self.weights)
+            regions.setdefault(sum(len(own.actions) for own in parts), near)
+        found = []
+        for near in regions.values():
+            if near < np.inf:
+                parts = beginnings(rollouts, self.target, near, self.weights, short=linear)
+                fitted = self.fit(parts, scale, linear=linear)
+                found.append(self._selected(fitted, parts, near if linear else np.inf))
+        good = [own for own in found if own and own.predicts and own.one_step <= ONE_STEP]
+        return min(good, key=lambda own: own.error, default=None)
