@@ -36,33 +36,41 @@ def forcing(action: Array, B: Array, constant: Array, force: Array) -> None:
 
 
 @jit
-def multiply(z: Array, row: Array, without: int, value: Array) -> None:
+def multiply(z: Array, table: Table, f: int, without: int, value: Array) -> None:
     """Multiply by all factors of a monomial but one."""
     n_x = z.shape[1]
-    for factor in range(row[0]):
-        if factor != without:
-            c, ahead = row[1 + factor], row[1 + MOST_FACTORS + factor]
-            # Slices: a computed index might be negative, and such loops are not vectorised.
-            front, back, end = z[c, ahead:], z[c, :ahead], value[n_x - ahead :]
-            for i in range(front.size):
-                value[i] *= front[i]
-            for i in range(back.size):
-                end[i] *= back[i]
+    for factor in range(table[f, 0]):
+        if factor == without:
+            continue
+        c, ahead = table[f, 1 + factor], table[f, 1 + MOST_FACTORS + factor]
+        if ahead == 0:
+            for i in range(n_x):
+                value[i] *= z[c, i]
+            continue
+        # Slices: a computed index might be negative, and such loops are not vectorised.
+        front, back, end = z[c, ahead:], z[c, :ahead], value[n_x - ahead :]
+        for i in range(front.size):
+            value[i] *= front[i]
+        for i in range(back.size):
+            end[i] *= back[i]
 
 
 @jit
-def monomial(z: Array, row: Array, ring: Array) -> None:
-    """A monomial at the points 1 .. n_x of a ring, whose ends are repeated."""
+def monomial(z: Array, table: Table, f: int, value: Array) -> None:
+    """A monomial at all points."""
     n_x = z.shape[1]
-    c, ahead = row[1], row[1 + MOST_FACTORS]
-    copy(z[c, ahead:], ring[1 : 1 + n_x - ahead])
-    copy(z[c, :ahead], ring[1 + n_x - ahead : 1 + n_x])
-    multiply(z, row, 0, ring[1 : 1 + n_x])
-    ring[0], ring[n_x + 1] = ring[n_x], ring[1]
+    c, ahead = table[f, 1], table[f, 1 + MOST_FACTORS]
+    if ahead == 0:
+        for i in range(n_x):
+            value[i] = z[c, i]
+    else:
+        copy(z[c, ahead:], value[: n_x - ahead])
+        copy(z[c, :ahead], value[n_x - ahead :])
+    multiply(z, table, f, 0, value)
 
 
 @jit
-def difference_along(ring: Array, order: int, shape: Table, out: Array) -> None:
+def difference_along(values: Array, order: int, shape: Table, out: Array) -> None:
     """`difference` on several axes, each of them a ring."""
     axis = len(shape) - 1 - (order - 1) // 2
     stride = 1
@@ -76,33 +84,36 @@ def difference_along(ring: Array, order: int, shape: Table, out: Array) -> None:
             after = here + stride if place < length - 1 else begin
             if order % 2 == 1:
                 for i in range(stride):
-                    out[here + i] = 0.5 * (ring[1 + after + i] - ring[1 + before + i])
+                    out[here + i] = 0.5 * (values[after + i] - values[before + i])
             else:
                 for i in range(stride):
-                    centre = 2.0 * ring[1 + here + i]
-                    out[here + i] = ring[1 + after + i] - centre + ring[1 + before + i]
+                    centre = 2.0 * values[here + i]
+                    out[here + i] = values[after + i] - centre + values[before + i]
 
 
 @jit
-def difference(ring: Array, order: int, shape: Table, out: Array) -> None:
-    """D^order at all points."""
+def difference(values: Array, order: int, shape: Table, out: Array) -> None:
+    """D^order at all points, order > 0."""
     n_x = out.size
-    if order == 0:
-        for i in range(n_x):
-            out[i] = ring[1 + i]
-    elif len(shape) > 1:
-        difference_along(ring, order, shape, out)
-    elif order == 1:
-        for i in range(n_x):
-            out[i] = 0.5 * (ring[2 + i] - ring[i])
+    if len(shape) > 1:
+        difference_along(values, order, shape, out)
+        return
+    first, second, last, before = values[0], values[1 % n_x], values[n_x - 1], values[n_x - 2]
+    if order == 1:
+        out[0] = 0.5 * (second - last)
+        for i in range(1, n_x - 1):
+            out[i] = 0.5 * (values[i + 1] - values[i - 1])
+        out[n_x - 1] = 0.5 * (first - before)
     else:
-        for i in range(n_x):
-            out[i] = ring[2 + i] - 2.0 * ring[1 + i] + ring[i]
+        out[0] = second - 2.0 * first + last
+        for i in range(1, n_x - 1):
+            out[i] = values[i + 1] - 2.0 * values[i] + values[i - 1]
+        out[n_x - 1] = first - 2.0 * last + before
 
 
 @jit
 def rate(
-    z: Array, table: Table, shape: Table, C: Array, force: Array, ring: Array, value: Array,
+    z: Array, table: Table, shape: Table, C: Array, force: Array, value: Array, moved: Array,
     out: Array,
 ) -> None:  # fmt: skip
     """dz/dt, components by points."""
@@ -112,16 +123,20 @@ def rate(
             out[c, i] = force[c, i]
     for f in range(len(table)):
         if table[f, -1] == 0:  # the first of its monomial
-            monomial(z, table[f], ring)
-        difference(ring, table[f, -1], shape, value)
+            monomial(z, table, f, value)
+            for c in range(components):
+                for i in range(n_x):
+                    out[c, i] += C[f, c, i] * value[i]
+            continue
+        difference(value, table[f, -1], shape, moved)
         for c in range(components):
             for i in range(n_x):
-                out[c, i] += C[f, c, i] * value[i]
+                out[c, i] += C[f, c, i] * moved[i]
 
 
 @jit
 def transposed_rate(
-    z: Array, y: Array, table: Table, shape: Table, C: Array, ring: Array, value: Array,
+    z: Array, y: Array, table: Table, shape: Table, C: Array, value: Array, moved: Array,
     on_m: Array, out: Array,
 ) -> None:  # fmt: skip
     """(d rate/dz)^T y."""
@@ -130,23 +145,34 @@ def transposed_rate(
     on_m[:] = 0.0
     for f in range(len(table)):
         for i in range(n_x):
-            total = 0.0
-            for c in range(components):
-                total += C[f, c, i] * y[c, i]
-            ring[1 + i] = total
-        ring[0], ring[n_x + 1] = ring[n_x], ring[1]
+            value[i] = 0.0
+        for c in range(components):
+            for i in range(n_x):
+                value[i] += C[f, c, i] * y[c, i]
         order = table[f, -1]
-        difference(ring, order, shape, value)
-        sign = -1.0 if order % 2 == 1 else 1.0  # the transpose of a central difference
-        for i in range(n_x):
-            on_m[i] += sign * value[i]
+        if order == 0:
+            for i in range(n_x):
+                on_m[i] += value[i]
+        else:
+            difference(value, order, shape, moved)
+            sign = -1.0 if order % 2 == 1 else 1.0  # the transpose of a central difference
+            for i in range(n_x):
+                on_m[i] += sign * moved[i]
         if f + 1 < len(table) and table[f + 1, -1] != 0:
             continue
         for own in range(table[f, 0]):
+            c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
+            if table[f, 0] == 1 and ahead == 0:
+                for i in range(n_x):
+                    out[c, i] += on_m[i]
+                continue
             for i in range(n_x):
                 value[i] = on_m[i]
-            multiply(z, table[f], own, value)
-            c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
+            multiply(z, table, f, own, value)
+            if ahead == 0:
+                for i in range(n_x):
+                    out[c, i] += value[i]
+                continue
             front, back, end = out[c, ahead:], out[c, :ahead], value[n_x - ahead :]
             for i in range(front.size):
                 front[i] += value[i]
@@ -158,7 +184,7 @@ def transposed_rate(
 @jit
 def runge_kutta(
     z: Array, table: Table, shape: Table, C: Array, force: Array, h: float, stages: Array, k: Array,
-    ring: Array, value: Array,
+    value: Array, moved: Array,
 ) -> None:  # fmt: skip
     """An internal step in place; stages (4, ..): where the rates k (4, ..) were taken."""
     components, n_x = z.shape
@@ -168,7 +194,7 @@ def runge_kutta(
         for c in range(components):
             for i in range(n_x):
                 stages[stage, c, i] = z[c, i] + reach * before[c, i] if stage else z[c, i]
-        rate(stages[stage], table, shape, C, force, ring, value, k[stage])
+        rate(stages[stage], table, shape, C, force, value, moved, k[stage])
     for c in range(components):
         for i in range(n_x):
             z[c, i] += h / 6.0 * (k[0, c, i] + 2.0 * k[1, c, i] + 2.0 * k[2, c, i] + k[3, c, i])
@@ -176,12 +202,12 @@ def runge_kutta(
 
 @jit
 def mapped(
-    z: Array, table: Table, shape: Table, C: Array, force: Array, ring: Array, value: Array,
+    z: Array, table: Table, shape: Table, C: Array, force: Array, value: Array, moved: Array,
     change: Array,
 ) -> None:  # fmt: skip
     """The step of a map in place."""
     components, n_x = z.shape
-    rate(z, table, shape, C, force, ring, value, change)
+    rate(z, table, shape, C, force, value, moved, change)
     for c in range(components):
         for i in range(n_x):
             z[c, i] += change[c, i]
@@ -195,16 +221,16 @@ def advance(
     """Write the states a sampling time later."""
     components, n_x = C.shape[1], C.shape[2]
     shape = (components, n_x)
-    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    force, value, moved = np.empty(shape), np.empty(n_x), np.empty(n_x)
     stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
     for m in range(len(states)):
         copy(states[m], after[m])
         z = after[m].reshape(shape)
         forcing(actions[m], B, constant, force)
         if substeps == 0:
-            mapped(z, table, axes, C, force, ring, value, k[0])
+            mapped(z, table, axes, C, force, value, moved, k[0])
         for _ in range(substeps):
-            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
+            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, value, moved)
 
 
 @cached_njit()
@@ -215,7 +241,7 @@ def pull_back(
     """Write the transposed products."""
     components, n_x = C.shape[1], C.shape[2]
     shape, h = (components, n_x), 1.0 / max(substeps, 1)
-    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    force, value, moved = np.empty(shape), np.empty(n_x), np.empty(n_x)
     tape, k = np.empty((substeps, 4, components, n_x)), np.empty((4, components, n_x))
     z, on_m, on_force = np.empty(shape), np.empty(n_x), np.empty(shape)
     own, y, g = np.empty(shape), np.empty(shape), np.empty(shape)
@@ -224,12 +250,12 @@ def pull_back(
         copy(states[m], flat)
         forcing(actions[m], B, constant, force)
         for n in range(substeps):
-            runge_kutta(z, table, axes, C, force, h, tape[n], k, ring, value)
+            runge_kutta(z, table, axes, C, force, h, tape[n], k, value, moved)
         copy(covectors[m], flat_own)
         on_force[:] = 0.0
         if substeps == 0:
             copy(flat_own, on_force.reshape(on_force.size))
-            transposed_rate(z, on_force, table, axes, C, ring, value, on_m, g)
+            transposed_rate(z, on_force, table, axes, C, value, moved, on_m, g)
             for c in range(components):
                 for i in range(n_x):
                     own[c, i] += g[c, i]
@@ -243,7 +269,7 @@ def pull_back(
                     for i in range(n_x):
                         y[c, i] = weight * own[c, i] + reach * g[c, i]
                         on_force[c, i] += y[c, i]
-                transposed_rate(tape[n, stage], y, table, axes, C, ring, value, on_m, g)
+                transposed_rate(tape[n, stage], y, table, axes, C, value, moved, on_m, g)
                 for c in range(components):
                     for i in range(n_x):
                         total[c, i] += g[c, i]
@@ -265,7 +291,7 @@ def mean_features(
     """Write the features' means by the trapezoidal rule, and the misses."""
     components, n_x = C.shape[1], C.shape[2]
     shape = (components, n_x)
-    force, ring, value = np.empty(shape), np.empty(n_x + 2), np.empty(n_x)
+    force, value, moved = np.empty(shape), np.empty(n_x), np.empty(n_x)
     stages, k = np.empty((4, components, n_x)), np.empty((4, components, n_x))
     path, bent = np.empty((substeps + 1, components, n_x)), np.empty(shape)
     z = np.empty(shape)
@@ -275,9 +301,9 @@ def mean_features(
         copy(flat, path[0].reshape(z.size))
         forcing(actions[m], B, constant, force)
         if substeps == 0:  # its features are those of its beginning
-            mapped(z, table, axes, C, force, ring, value, k[0])
+            mapped(z, table, axes, C, force, value, moved, k[0])
         for n in range(substeps):
-            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, ring, value)
+            runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, value, moved)
             copy(flat, path[n + 1].reshape(z.size))
         end = after[m].reshape(shape)
         for i in range(z.size):
@@ -293,7 +319,10 @@ def mean_features(
                     bent[c, i] = path[n, c, i] + share * (end[c, i] - z[c, i])
             for f in range(len(table)):
                 if table[f, -1] == 0:
-                    monomial(bent, table[f], ring)
-                difference(ring, table[f, -1], axes, value)
+                    monomial(bent, table, f, value)
+                    for i in range(n_x):
+                        found[m, f, i] += weight * value[i]
+                    continue
+                difference(value, table[f, -1], axes, moved)
                 for i in range(n_x):
-                    found[m, f, i] += weight * value[i]
+                    found[m, f, i] += weight * moved[i]
