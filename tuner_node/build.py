@@ -21,7 +21,7 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
 from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
 from pdeloop.method.laws import Affine, Law
-from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models.settings import SENSED_MOST
@@ -131,10 +131,22 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
             f"optimizer '{values['optimizer']}' does not support; choose model_based, or another law"
         )
     if issubclass(law, Predictive):
-        if sensors := few_sensors(values):
+        sensors, estimates = few_sensors(values), issubclass(law, PredictiveKalman)
+        if sensors and not estimates:
             raise ParameterError(
                 f"the law '{law.name}' plans from the whole state, but {sensors} sensors measure the "
                 "plant; give --law extended_kalman"
+            )
+        if estimates and not sensors:
+            raise ParameterError(
+                f"the law '{law.name}' plans from an estimate of the field between few sensors, but "
+                "the whole state is measured; give --law predictive"
+            )
+        if estimates and not between_sensors(values):
+            raise ParameterError(
+                f"the law '{law.name}' plans on the equation of a field of one component on a periodic "
+                f"axis, between at most {SENSED_MOST} sensors of which only the last readings are "
+                "known; give --law extended_kalman"
             )
         if law.settings.steps > values["horizon"]:
             raise ParameterError(
@@ -205,6 +217,14 @@ def few_sensors(values: Mapping[str, Any]) -> int:
     """The number of sensors; 0 where the whole state is measured, as by one at every point."""
     newest = measured_size({**values, "sensor_delays": 1})
     return int(values["sensors"]) if newest < values["n_z"] else 0
+
+
+def between_sensors(values: Mapping[str, Any]) -> bool:
+    """Whether a field of one component on a periodic axis is measured by few enough sensors."""
+    grid = Grid.parse(values["grid"]) if values["grid"] else None
+    sensors = few_sensors(values)
+    alone = measured_size(values) == sensors <= SENSED_MOST
+    return bool(sensors) and alone and (grid is None or grid.is_circle)
 
 
 def build_training(values: Mapping[str, Any]) -> Training:

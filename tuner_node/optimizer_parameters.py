@@ -86,10 +86,13 @@ def _preferred(
     few = (
         0 < _number(given, "sensors") < _number({POINTS.name: POINTS.default, **given}, POINTS.name)
     )
-    if few and kind.law_of_sensors and _number(given, "sensor_delays") <= 1:
+    few_now = few and _number(given, "sensor_delays") <= 1
+    if few_now and kind.law_of_sensors:
         preferences[LAW.name] = kind.law_of_sensors
     elif kind.law_with_constants and not few and constants:
         preferences[LAW.name] = kind.law_with_constants
+    if few_now and given.get(LAW.name) in kind.laws_of_sensors:
+        given = {**given, LAW.name: kind.laws_of_sensors[given[LAW.name]]}
     readings = law_of({**preferences, **given}).from_readings
     if few and readings:
         preferences["identification"] = readings

@@ -140,7 +140,7 @@ def acting(training: Training) -> list[dict[str, Any]]:
     ):
         assert isinstance(law, Predictive) and known is not None
         first, others = law.step_times(policy, known.states[0])
-        name = Predictive.name if law.plans(policy) else Affine.name
+        name = Predictive.name if law.plans(policy) else law.base.name
         found.append({"law": name, "first_step": first, "step": others})
     return found
 

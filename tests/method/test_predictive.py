@@ -366,9 +366,5 @@ def test_without_a_model_the_affine_law_stays_and_says_why() -> None:
 def test_what_it_does_not_support_is_refused_in_a_sentence() -> None:
     with pytest.raises(ParameterError, match=r"'law_settings.steps' is 60; expected at most .* 50"):
         pdeloop.train("burgers", law="predictive", law_settings={"steps": 60}, horizon=50)
-    with pytest.raises(ParameterError, match="plans from the whole state, but 8 sensors"):
-        pdeloop.train("burgers", law="predictive", sensors=8)
     with pytest.raises(ParameterError, match="choose model_based, or another law"):
         pdeloop.train("burgers", law="predictive", optimizer="two_point")
-    with pytest.raises(ParameterError, match="law 'auto' plans from the whole state, but 8"):
-        pdeloop.train("burgers", law="auto", sensors=8)

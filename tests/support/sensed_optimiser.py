@@ -15,7 +15,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Context, ModelBased, Optimizer, Rollout, RolloutResult, Trajectory
 from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.laws import Observer
+from pdeloop.method.laws import Law, Observer
 from tests.support.sensed import SENSORS
 
 Array = np.ndarray
@@ -52,10 +52,11 @@ def small() -> tuple[pdeloop.Problem, Context]:
     return problem, context
 
 
-def measured(asked: Rollout) -> RolloutResult:
+def measured(asked: Rollout, other: Law | None = None) -> RolloutResult:
+    """Of the context's law, or another one."""
     problem, context = small()
-    law = context.law
-    assert isinstance(law, Observer)
+    law = other or context.law
+    assert law is not None
     theta, memory = law.parts(np.ravel(asked.policy)), law.memory_start()
 
     def act(k: int, y: Array) -> Array:

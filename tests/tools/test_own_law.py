@@ -173,7 +173,10 @@ def test_a_file_alone_does_not_run_it(
 def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    adapted = "affine, observer, extended_kalman, feedforward, predictive and auto"
+    adapted = (
+        "affine, observer, extended_kalman, feedforward, predictive, auto, predictive_kalman and "
+        "auto_kalman"
+    )
     words = ["train", str(SMALL), "--law", OWN, "--optimizer", "model_based"]
     assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
     told = capsys.readouterr().err

@@ -258,6 +258,8 @@ class Optimizer(Protocol):
     rests; empty: as without."""
     law_of_sensors: ClassVar[str] = ""
     """The law preferred where the state is that of few sensors; empty: as without."""
+    laws_of_sensors: ClassVar[Mapping[str, str]] = {}
+    """By the name of a law of the whole state, the one that few sensors have in its place."""
     iteration_rollouts: ClassVar[int] = 0
     """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
     preferences: ClassVar[Mapping[str, Any]] = {}

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,7 +71,7 @@ from pdeloop.method.adapt.verdict import (
 )
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.laws.predictive import Predictive
+from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.seeds import field_seed
 from pdeloop.process.one_thread import one_thread
 
@@ -109,12 +110,21 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
-    also_improves = ("observer", "extended_kalman", "feedforward", "predictive", "auto")
+    also_improves = (
+        "observer",
+        "extended_kalman",
+        "feedforward",
+        "predictive",
+        "auto",
+        "predictive_kalman",
+        "auto_kalman",
+    )
     in_coordinates = True
     judges_first_law = True
     explorations = 2
     law_with_constants = "feedforward"
     law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
+    laws_of_sensors: ClassVar = {"predictive": "predictive_kalman", "auto": "auto_kalman"}
 
     def __init__(
         self,
@@ -150,11 +160,13 @@ class ModelBased(Optimizer):
         """Another one for a law that plans, or estimates the state from few readings."""
         # Not at the top: they know this class.
         from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
+        from pdeloop.method.adapt.model_based_predictive_sensed import ModelBasedPredictiveSensed
         from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
         from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
 
         if isinstance(context.law, Predictive):
-            return ModelBasedPredictive
+            few = isinstance(context.law, PredictiveKalman)
+            return ModelBasedPredictiveSensed if few else ModelBasedPredictive
         if not (context.sensors and isinstance(context.law, Observer)):
             return cls
         return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings

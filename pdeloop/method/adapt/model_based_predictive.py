@@ -41,6 +41,7 @@ from pdeloop.method.adapt.estimate import ZERO, mean_change
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, PREDICTIVE, Evidence, choose
+from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Predictive
 from pdeloop.method.models.base import FieldModel
@@ -96,10 +97,12 @@ class ModelBasedPredictive(Optimizer):
             raise ValueError("this optimiser needs a context with a law that plans")
         self._law, self._seed = context.law, seed
         self._settings = settings or ModelBasedSettings()
-        self._shape = self._law.model.policy.shape
+        self._shape = self._law.without_plans.shape
         self._first = np.reshape(np.asarray(policy0, dtype=np.float64), self._shape)
         measured = [self._matrix(record) for record in context.measured]
-        self._context = replace(context, measured=measured, law=None)
+        own = self._law.without_plans
+        law = None if isinstance(own, Affine) else own
+        self._context = replace(context, measured=measured, law=law)
         spare = rollouts - ModelBased.first_step(self._settings)
         self._budget, self._judging = rollouts, max(min(self._settings.judging, spare), 0)
         self._kept = 0 if self._law.worth else self._judging
@@ -110,7 +113,9 @@ class ModelBasedPredictive(Optimizer):
 
     def _trained(self) -> ModelBased:
         """The training of the affine law with all rollouts but those that are kept for plans."""
-        return ModelBased(
+        kind = ModelBased.for_context(self._context)
+        assert issubclass(kind, ModelBased)
+        return kind(
             self._first,
             seed=self._seed,
             rollouts=self._budget - self._kept,
@@ -144,8 +149,11 @@ class ModelBasedPredictive(Optimizer):
             return self._affine.ask()
         if self._candidate is None:
             return []
-        numbers = range(self._count, self._count + self._left)
-        return [Rollout(self._candidate.theta.copy(), field_seed(self._seed, n)) for n in numbers]
+        return [Rollout(self._candidate.theta.copy(), seed) for seed in self._seeds()]
+
+    def _seeds(self) -> list[int]:
+        """Of the initial fields of the last rollouts: fresh ones."""
+        return [field_seed(self._seed, self._count + n) for n in range(self._left)]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts."""
@@ -166,7 +174,7 @@ class ModelBasedPredictive(Optimizer):
         if not diverged:
             row["cost"] = float(np.mean([result.cost for result in results]))
         with one_thread():
-            self._judge(results, row)
+            self._judge(asked, results, row)
         self._stage = _ENDED
         return row
 
@@ -178,11 +186,11 @@ class ModelBasedPredictive(Optimizer):
     def _look(self, row: Row) -> None:
         """Keep rollouts for a law that plans, if another one could save enough on the model."""
         belief = self._affine.belief
-        if belief is None or self._too_large or not self._judging:
+        if belief is None or self._unplanned(belief) or not self._judging:
             return
         fields, before = self._simulated(belief, self._affine.policy)
         horizon = self._context.horizon
-        planner = replace(self._plain(belief.model, fields), around=True, steps=horizon)
+        planner = replace(self._plain(belief, self._affine.policy, fields), steps=horizon)
         least = np.minimum(planner.begin(planner.after(fields))[1] / horizon, before)
         self._share = share_saved(least, before)
         if self._share > self._law.worth and not self._affine.done:  # is that of affine laws, too?
@@ -194,10 +202,11 @@ class ModelBasedPredictive(Optimizer):
             self._affine = self._trained()
             self._affine.restore(known)
 
-    @property
-    def _too_large(self) -> bool:
-        """Whether the affine law is adapted in coordinates of a large state."""
-        return len(self._context.U) != len(self._law.model.U)
+    def _unplanned(self, belief: Belief) -> str:
+        """Why nothing can be planned on a model; empty if it can be."""
+        if len(self._context.U) == len(self._law.model.U):
+            return ""  # else the affine law is adapted in coordinates of a large state
+        return f"plans use states of at most {len(self._context.U)} numbers"
 
     def _simulated(self, belief: Belief, policy: Array) -> tuple[Array, Array]:
         """A few measured initial fields, and an affine law's costs from them on the model."""
@@ -213,8 +222,8 @@ class ModelBasedPredictive(Optimizer):
             self._look(row)
         if belief is None:
             why = "no model of the whole field was accepted"
-        elif self._too_large:
-            why = f"plans use states of at most {len(self._context.U)} numbers"
+        elif unplanned := self._unplanned(belief):
+            why = unplanned
         elif self._share <= self._law.worth:
             why = f"on the model another law saves at most {100 * self._share:.2g} % more"
         elif not self._left:
@@ -232,37 +241,48 @@ class ModelBasedPredictive(Optimizer):
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law that plans on this model; or why there is none."""
+        known = self._compared(belief)
+        if known is None:
+            return "no law on an estimate stays finite on the model"
         fields, before = self._simulated(belief, self._affine.policy)
-        planner, costs = self._planner(belief.model, fields)
+        planner, costs = self._planner(belief, known, fields)
         row["plan_steps"], row["plan_saves"] = planner.steps, share_saved(costs, before)
         if not np.sum(costs) < np.sum(before):
             return "on the model no plan is better"
         try:
-            theta = self._law.theta_of(self._affine.policy, planner)
+            theta = self._law.theta_of(known, planner)
         except ValueError as error:
             return str(error)
         return Candidate(theta, costs, before)
 
-    def _plain(self, model: FieldModel, fields: Array) -> Planner:
-        """Plans of one step of actions."""
-        context, settings = self._context, self._law.settings
-        n_s, policy = context.U.shape[1], self._affine.policy
+    def _compared(self, belief: Belief) -> Array | None:
+        """The law whose plan is compared with others at every step; None: there is none."""
+        return self._affine.policy
+
+    def _feedback(self, policy: Array) -> tuple[Array, Array]:
+        """K and b of that law, a = K z + b, for states of the model."""
+        U, n_s = self._context.U, self._context.U.shape[1]
+        s_r = np.sum(U * self._context.target[:, None], axis=0)
+        return np.ascontiguousarray(policy[:, :n_s] @ U.T), policy[:, n_s:] @ s_r
+
+    def _plain(self, belief: Belief, policy: Array, fields: Array) -> Planner:
+        """Plans of one step around a law."""
+        context, settings, model = self._context, self._law.settings, belief.model
+        loop = belief.loop(context)
         cost = context.cost or Cost(
             model.n_z,
             model.n_a,
             context.horizon,
-            state_weight=context.state_weight,
-            action_weight=context.action_weight,
-            target=context.target,
+            state_weight=loop.state_weight,
+            action_weight=loop.action_weight,
+            target=loop.target,
         )
-        s_r = np.sum(context.U * context.target[:, None], axis=0)
         return Planner(
             model,
             cost,
             context.action_set,
-            np.ascontiguousarray(policy[:, :n_s] @ context.U.T),
-            policy[:, n_s:] @ s_r,
-            around=False,
+            *self._feedback(policy),
+            around=True,
             steps=1,
             terminal=rests(model, cost, fields),
             iterations=settings.iterations,
@@ -270,9 +290,9 @@ class ModelBasedPredictive(Optimizer):
             starts=settings.starts,
         )
 
-    def _planner(self, model: FieldModel, fields: Array) -> tuple[Planner, Array]:
+    def _planner(self, belief: Belief, policy: Array, fields: Array) -> tuple[Planner, Array]:
         """The plans to use, and their costs from initial fields."""
-        plain, settings = self._plain(model, fields), self._law.settings
+        plain, settings = self._plain(belief, policy, fields), self._law.settings
         lengths = sorted({min(steps, self._law.longest) for steps in LENGTHS})
         if settings.steps:
             lengths = [settings.steps]
@@ -281,17 +301,48 @@ class ModelBasedPredictive(Optimizer):
             ways = (True, False) if not tried else (tried[-1][1].around,)
             for around in ways:
                 planner = replace(plain, around=around, steps=steps)
-                costs = simulated(planner, fields)
+                costs = self._costs(belief, policy, planner, fields)
                 tried.append((float(np.sum(costs)), planner, costs))
             if len(ways) == 2:
                 tried = [min(tried, key=lambda each: each[0])]
         most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
         return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
 
-    def _judge(self, results: Sequence[RolloutResult], row: Row) -> None:
+    def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
+        """Costs of plans from initial fields on the model."""
+        return simulated(planner, fields)
+
+    def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
         candidate, belief = self._candidate, self._affine.belief
         assert candidate is not None and belief is not None
+        base = self._base_name
+        verdict = choose(
+            self._evidence(candidate, belief, base, asked, results, row),
+            base,
+            self._settings.confidence,
+        )
+        if verdict.chosen == PREDICTIVE:
+            self._chosen = candidate.theta
+        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+
+    @property
+    def _base_name(self) -> str:
+        """What the law to stay with is."""
+        policy = self._affine.policy
+        return FIRST if np.array_equal(policy, self._first) else ADAPTED if policy.any() else NONE
+
+    def _evidence(
+        self,
+        candidate: Candidate,
+        belief: Belief,
+        base: str,
+        asked: Sequence[Rollout],
+        results: Sequence[RolloutResult],
+        row: Row,
+    ) -> Mapping[str, Evidence]:
+        """Of the law that plans and the one to stay with, from their rollouts."""
         loop, policy = belief.loop(self._context), self._affine.policy
         theta = loop.theta(policy)
         planner = self._law.planner(self._law.parts(candidate.theta))
@@ -305,22 +356,16 @@ class ModelBasedPredictive(Optimizer):
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
         excess += [np.inf] * (len(results) - len(usable))
-        base = FIRST if np.array_equal(policy, self._first) else ADAPTED if policy.any() else NONE
         rolled = [r for r in self._affine.records if np.array_equal(r.policy, policy)]
         of_base = [
             record.cost - float(loop.costs(theta, loop.beginnings([record]))[0])
             for record in rolled
         ]
         change = mean_change(np.concatenate(costs), np.concatenate(before))
-        evidence = {
+        return {
             base: Evidence(ZERO, np.array([e for e in of_base if not np.isnan(e)])),
             PREDICTIVE: Evidence(change, np.array(excess), (change,)),
         }
-        verdict = choose(evidence, base, self._settings.confidence)
-        if verdict.chosen == PREDICTIVE:
-            self._chosen = candidate.theta
-        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
-        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
 
     def _matrix(self, record: Record) -> Record:
         return replace(record, policy=np.reshape(record.policy, self._shape))

@@ -111,14 +111,14 @@ class ExtendedKalman(Observer):
         p, _ = self._split(memory)
         a = super().action(theta, z, p, k)
         if theta["K_e"].any():
-            found = self._estimate(theta, z, memory, k)
+            found = self.estimate(theta, z, memory, k)
             a = a + theta["K_e"] @ (np.full(self.points, np.nan) if found is None else found[0][0])
         return a
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
         p, rest = self._split(memory)
         p = super().memory_update(theta, z, p, action, k)
-        found = self._estimate(theta, z, memory, k) if theta["K_e"].any() else None
+        found = self.estimate(theta, z, memory, k) if theta["K_e"].any() else None
         if found is None:
             return np.concatenate([p, np.zeros_like(rest)])
         known = self.filter(theta)
@@ -130,9 +130,11 @@ class ExtendedKalman(Observer):
         n_s = len(self.model.A)
         return memory[:n_s], memory[n_s:]
 
-    def _estimate(
-        self, theta: Parts, z: Array, memory: Array, k: int
-    ) -> tuple[Array, Array] | None:
+    def prediction(self, memory: Array) -> Array:
+        """The field (n,) that a memory after step 0 predicts for the next reading."""
+        return self._split(memory)[1][: self.points]
+
+    def estimate(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array] | None:
         """x and S of one environment after its newest reading."""
         known = self.filter(theta)
         if known is None:

@@ -19,9 +19,11 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import Arrays, FieldModel
 from pdeloop.method.models.files import model_of, packed, unpacked
+from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.settings import Settings, setting
 
 LONGEST = 80
@@ -69,13 +71,16 @@ class Predictive(Law):
     needs_model = True
     Settings = PredictiveSettings
     settings: ClassVar[PredictiveSettings] = PredictiveSettings()
+    base: ClassVar[type[Law]] = Affine
+    """The law that it begins as, and stays where nothing better is found."""
     worth: ClassVar[float] = 0.0
     """Share of the affine law's cost that must be to be had on the model before rollouts are kept for a
     law that plans; 0: they always are."""
 
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)
-        self._affine = Affine(model, horizon)
+        self.without_plans = self.base(model, horizon)
+        """The law without a plan, whose parts and memory come first."""
         self._planners: OrderedDict[tuple[int, bytes], Planner] = OrderedDict()
         self._plans: OrderedDict[bytes, tuple[Array, Array, bool]] = OrderedDict()
 
@@ -86,27 +91,30 @@ class Predictive(Law):
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]
-        return (self.longest + 1) * self.n_a + 1
+        return self.without_plans.memory_size + (self.longest + 1) * self.n_a + 1
+
+    def memory_start(self) -> Array:
+        own = np.zeros((self.longest + 1) * self.n_a + 1)
+        return np.concatenate([self.without_plans.memory_start(), own])
 
     def start(self) -> Parts:
-        """K_a and K_b of the model, (n_a, n_s) each, and no plan."""
-        return {**self._affine.start(), "plan": np.zeros(0)}
+        """The parts of the law without plans, and no plan."""
+        return {**self.without_plans.start(), "plan": np.zeros(0)}
 
     def parts(self, theta: Array) -> Parts:
-        """K_a and K_b stand side by side in the rows of its beginning; the rest is `plan`."""
-        size = self._affine.size
-        return {**self._affine.parts(theta[:size]), "plan": theta[size:]}
+        """Those of the law without plans are its beginning; the rest is `plan`."""
+        size = self.without_plans.size
+        return {**self.without_plans.parts(theta[:size]), "plan": theta[size:]}
 
     def vector(self, parts: Parts) -> Array:
-        return np.concatenate([self._affine.vector(parts), parts["plan"]])
+        return np.concatenate([self.without_plans.vector(parts), parts["plan"]])
 
-    def theta_of(self, gains: Array, planner: Planner) -> Array:
-        """Theta of plans on a model; gains (n_a, 2 n_s): [K_a K_b] of the affine law.
+    def theta_of(self, without_plans: Array, planner: Planner) -> Array:
+        """Theta of plans on a model; without_plans: theta of the law that they are compared with.
 
         ValueError for a model of too many numbers.
         """
-        arrays: Arrays = {_MODEL + name: own for name, own in planner.model.arrays().items()}
-        cost, actions = planner.cost, planner.action_set
+        arrays, cost, actions = self._kept(planner.model), planner.cost, planner.action_set
         if self.cost is None:
             arrays |= {
                 "weights": np.array([float(cost.state_weight), float(cost.action_weight)]),
@@ -127,24 +135,28 @@ class Predictive(Law):
             raise ValueError(
                 f"its model has {len(numbers):,} numbers, and plans use at most {MOST_NUMBERS:,}"
             )
-        return np.concatenate([np.ravel(gains), numbers])
+        return np.concatenate([np.ravel(without_plans), numbers])
+
+    def _kept(self, model: FieldModel) -> Arrays:
+        """What theta has of the model besides the law without plans."""
+        return {_MODEL + name: own for name, own in model.arrays().items()}
 
     def plans(self, theta: Array) -> bool:
         """Whether this theta has a model to plan on."""
-        return bool(theta[self._affine.size :].any())
+        return bool(theta[self.without_plans.size :].any())
 
     def has_gains(self, theta: Array) -> bool:
-        """Without a model it is the affine law, to the bit."""
-        return not self.plans(theta)
+        """Without a model it is the law that it began as, to the bit."""
+        size = self.without_plans.size
+        return not self.plans(theta) and self.without_plans.has_gains(theta[:size])
 
     def gains(self, theta: Array) -> Array:
-        return self._affine.gains(theta[: self._affine.size])
+        return self.without_plans.gains(theta[: self.without_plans.size])
 
     def planner(self, theta: Parts) -> Planner:
         """The planner in theta; ValueError where its numbers are those of none."""
-        gains = np.ascontiguousarray(np.hstack([theta["K_a"], theta["K_b"]]))
         # Its model may be used by one thread at a time.
-        key = get_ident(), gains.tobytes() + theta["plan"].tobytes()
+        key = get_ident(), self.vector(theta).tobytes()
         known = self._planners.get(key)
         if known is None:
             known = self._planners[key] = self._made(theta, unpacked(theta["plan"]))
@@ -153,11 +165,8 @@ class Predictive(Law):
         return known
 
     def _made(self, theta: Parts, arrays: Mapping[str, Any]) -> Planner:
-        n_z, n_a = self.model.U.shape[0], self.n_a
-        part = {name: own for name, own in arrays.items() if name.startswith(_MODEL)}
-        model: FieldModel = model_of({n.removeprefix(_MODEL): own for n, own in part.items()})
-        if (model.n_z, model.n_a) != (n_z, n_a):
-            raise ValueError(f"its model has sizes {model.n_z}, {model.n_a}; expected {n_z}, {n_a}")
+        model = self._model(theta, arrays)
+        n_z, n_a = model.n_z, self.n_a
         cost = self.cost
         if cost is None:
             q, r = checked_array(arrays, "weights", "f", (2,)).tolist()
@@ -184,25 +193,45 @@ class Predictive(Law):
             starts=starts,
         )
 
+    def _model(self, theta: Parts, arrays: Mapping[str, Any]) -> FieldModel:
+        """The model in theta; ValueError for one of another plant."""
+        part = {name: own for name, own in arrays.items() if name.startswith(_MODEL)}
+        model: FieldModel = model_of({n.removeprefix(_MODEL): own for n, own in part.items()})
+        n_z, n_a = self.model.U.shape[0], self.n_a
+        if (model.n_z, model.n_a) != (n_z, n_a):
+            raise ValueError(f"its model has sizes {model.n_z}, {model.n_a}; expected {n_z}, {n_a}")
+        return model
+
     def _feedback(self, theta: Parts) -> tuple[Array, Array]:
-        """K and b of a = K z + b."""
+        """K and b of a = K z + b for states of the model."""
         K: Array = np.ascontiguousarray(theta["K_a"] @ self.model.U.T)
         return K, theta["K_b"] @ self.model.s_r
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         if not theta["plan"].any():
-            return self._affine.action(theta, z, memory, k)
+            return self.without_plans.action(theta, z, self._split(memory)[0], k)
         return self._planned(theta, z, memory, k)[0]
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
-        if not theta["plan"].any():
-            return np.zeros(self.memory_size)
-        _, plan, fell = self._planned(theta, z, memory, k)
-        after = np.zeros(self.memory_size)
-        after[: plan[1:].size] = plan[1:].ravel()
-        after[-1 - self.n_a : -1] = action
-        after[-1] = memory[-1] + fell
-        return after
+        first, own = self._split(memory)
+        after = np.zeros_like(own)
+        if theta["plan"].any():
+            _, plan, fell = self._planned(theta, z, memory, k)
+            after[: plan[1:].size] = plan[1:].ravel()
+            after[-1 - self.n_a : -1] = action
+            after[-1] = memory[-1] + fell
+        if not len(first):
+            return after
+        return np.concatenate([self.without_plans.memory_update(theta, z, first, action, k), after])
+
+    def _split(self, memory: Array) -> tuple[Array, Array]:
+        """The memory of the law without plans, and that of plans."""
+        size = self.without_plans.memory_size
+        return memory[:size], memory[size:]
+
+    def _state(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+        """The state (1, n_z) that a plan starts from."""
+        return z[None]
 
     def step_times(self, theta: Array, z: Array, steps: int = TIMED) -> tuple[float, float]:
         """Seconds of the first step from a state (n_z,), and of one of the next, in the median.
@@ -218,8 +247,13 @@ class Predictive(Law):
             a = own.action(parts, z, memory, k)
             memory = own.memory_update(parts, z, memory, a, k)
             took.append(perf_counter() - began)
-            z = z if model is None else model.step(z[None], a[None])[0]
+            z = z if model is None else self._measured(model, z, memory, a)
         return took[0], float(np.median(took[1:]))
+
+    def _measured(self, model: FieldModel, z: Array, memory: Array, a: Array) -> Array:
+        """What follows the measurement z and the action a on the model; memory: after that step."""
+        after: Array = model.step(z[None], a[None])[0]
+        return after
 
     def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array, bool]:
         """The action (n_a,), its plan (H, n_a), and whether that came from the affine law.
@@ -233,9 +267,11 @@ class Predictive(Law):
         known = self._plans.get(key)
         if known is None:
             planner, H = self.planner(theta), self.longest
-            plan = memory[: H * self.n_a].reshape(1, H, self.n_a)[:, : planner.steps]
-            last = memory[None, H * self.n_a : -1] if k else None
-            a, plan, fell = planner.step(plan, planner.after(z[None], last), k)
+            first, own = self._split(memory)
+            plan = own[: H * self.n_a].reshape(1, H, self.n_a)[:, : planner.steps]
+            last = own[None, H * self.n_a : -1] if k else None
+            start = self._state(theta, z, first, k)
+            a, plan, fell = planner.step(plan, planner.after(start, last), k)
             known = self._plans[key] = a[0], plan[0], bool(fell[0])
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
@@ -247,3 +283,50 @@ class Auto(Predictive):
 
     name = "auto"
     worth = 0.03
+
+
+class PredictiveKalman(Predictive):
+    """`Predictive` from the field that an extended Kalman filter estimates between few sensors.
+
+    It begins as the law `extended_kalman`, and what that law knows is a part of its own theta and
+    memory: a plan starts from its estimate x_k, on the equation that its filter integrates, and is
+    compared with a_k = K_e x_k + b.
+    """
+
+    name = "predictive_kalman"
+    base = ExtendedKalman
+    filtered = True
+    from_readings = ExtendedKalman.from_readings
+
+    @property
+    def kalman(self) -> ExtendedKalman:
+        """The law without plans."""
+        assert isinstance(self.without_plans, ExtendedKalman)
+        return self.without_plans
+
+    def _kept(self, model: FieldModel) -> Arrays:
+        return {}
+
+    def _model(self, theta: Parts, arrays: Mapping[str, Any]) -> FieldModel:
+        known = self.kalman.filter(theta)
+        if known is None or not theta["K_e"].any():
+            raise ValueError("it has no filter whose estimates a plan could start from")
+        return known.model
+
+    def _feedback(self, theta: Parts) -> tuple[Array, Array]:
+        return np.ascontiguousarray(theta["K_e"]), theta["b"]
+
+    def _state(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+        found = self.kalman.estimate(theta, z, memory, k)
+        return np.full((1, self.kalman.points), np.nan) if found is None else found[0]
+
+    def _measured(self, model: FieldModel, z: Array, memory: Array, a: Array) -> Array:
+        assert isinstance(model, SensedModel)
+        return self.kalman.prediction(self._split(memory)[0])[model.seen]
+
+
+class AutoKalman(PredictiveKalman):
+    """As `Auto`, with few sensors."""
+
+    name = "auto_kalman"
+    worth = Auto.worth

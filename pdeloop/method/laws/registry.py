@@ -18,7 +18,7 @@ from pdeloop.method.laws.base import Law
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.laws.predictive import Auto, Predictive
+from pdeloop.method.laws.predictive import Auto, AutoKalman, Predictive, PredictiveKalman
 from pdeloop.method.settings import settings_from
 
 OWN_LAWS = OwnCode(
@@ -27,7 +27,16 @@ OWN_LAWS = OwnCode(
     MappingProxyType(
         {
             kind.name: kind
-            for kind in (Affine, FeedForward, Observer, ExtendedKalman, Predictive, Auto)
+            for kind in (
+                Affine,
+                FeedForward,
+                Observer,
+                ExtendedKalman,
+                Predictive,
+                Auto,
+                PredictiveKalman,
+                AutoKalman,
+            )
         }
     ),
 )
