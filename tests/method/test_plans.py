@@ -13,6 +13,7 @@ from scipy.optimize import LinearConstraint, minimize
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
+from pdeloop.method.design.finite_horizon import finite_horizon
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
@@ -116,6 +117,29 @@ def test_of_a_linear_plant_it_is_the_regulator_of_the_riccati_equation(around: b
     a, _, fell = own.step(np.zeros((2, 3, N_A)), z, 0)
     np.testing.assert_allclose(a, z @ K.T, rtol=1e-3, atol=1e-3)
     assert not fell.any()
+
+
+def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others() -> None:
+    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
+    own = planner(spectral(), cost, regulated=True, first=0, starts=1)
+    affine = replace(own, regulated=False)
+    z = np.random.default_rng(8).standard_normal((2, N_Z))
+    none = np.zeros((2, 12, N_A))
+    plan = own._affine_plan(z, 12)
+    assert plan.any() and not affine._affine_plan(z, 12).any()
+    np.testing.assert_allclose(own.costs(plan, z, 0), affine.costs(none, z, 0), rtol=1e-9)
+    target = np.full((1, N_Z), 0.3)
+    model, a_r = own.model, np.zeros(N_A)
+    A, B = model.linearise(target[0], a_r)
+    K, b = finite_horizon(A, B, model.step(target, a_r[None])[0] - target[0], 1.0, 0.5, T)
+    a, found, _ = own.step(none, z, 0)
+    np.testing.assert_allclose(a, (z - target) @ K.T + b, rtol=1e-6)
+    assert not found.any()
+    without = replace(own, terminal=False)
+    assert without.regulator is None
+    assert np.array_equal(
+        without.costs(none, z, 0), replace(affine, terminal=False).costs(none, z, 0)
+    )
 
 
 def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:

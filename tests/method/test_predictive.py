@@ -123,6 +123,13 @@ def test_what_theta_holds_is_the_planner_and_zeros_at_its_end_mean_nothing(
     assert (acted >= -0.5).all() and (acted[:, 0] <= 0.4).all()
 
 
+def test_theta_holds_which_law_a_plan_deviates_from() -> None:
+    own = law()
+    found = own.planner(own.parts(theta(own, regulated=True)))
+    assert found.regulated and not own.planner(own.parts(theta(own))).regulated
+    assert own.plans(theta(own, regulated=True)) and found.regulator is not None
+
+
 def test_its_memory_is_a_function_of_the_states_of_the_episode() -> None:
     """Another controller that is given the same states answers with the same bits."""
     own = law()

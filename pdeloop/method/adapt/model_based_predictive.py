@@ -2,8 +2,9 @@
 """`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
 
 The affine law is trained as ever. On the last model that predicts the rollouts, plans of 20, 40 and 80
-steps are simulated in closed loop from a few measured initial fields, as actions or as deviations from
-the affine law, whichever is cheaper there; the shortest within 2 % of the cheapest is taken. The last
+steps are simulated in closed loop from a few measured initial fields, as actions, as deviations from
+the affine law, or from the linear-quadratic one of the whole state at the target, whichever is cheaper
+there; the shortest within 2 % of the cheapest is taken. The last
 rollouts are of the law with that plan, from fresh fields. It replaces the affine law only if it is
 better by more than chance (`verdict`).
 
@@ -298,15 +299,22 @@ class ModelBasedPredictive(Optimizer):
             lengths = [settings.steps]
         tried: list[tuple[float, Planner, Array]] = []
         for steps in lengths:
-            ways = (True, False) if not tried else (tried[-1][1].around,)
-            for around in ways:
-                planner = replace(plain, around=around, steps=steps)
+            first = not tried
+            ways = self._ways(plain) if first else [tried[-1][1]]
+            for way in ways:
+                planner = replace(way, steps=steps)
                 costs = self._costs(belief, policy, planner, fields)
                 tried.append((float(np.sum(costs)), planner, costs))
-            if len(ways) == 2:
+            if first:
                 tried = [min(tried, key=lambda each: each[0])]
         most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
         return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
+
+    @staticmethod
+    def _ways(plain: Planner) -> list[Planner]:
+        """Plans around the trained law, of actions alone, and around the law of the whole state."""
+        ways = [plain, replace(plain, around=False)]
+        return ways + [replace(plain, regulated=True)] * (plain.regulator is not None)
 
     def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
         """Costs of plans from initial fields on the model."""

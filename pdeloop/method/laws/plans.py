@@ -7,8 +7,9 @@ At step k a plan v_0 .. v_{H-1} from the state z_k costs
     z_{i+1} = f(z_i, a_i),        a_i = P(K z_i + b + v_i),
 
 with f the model, l the stage cost, P(a) the nearest admissible action, and V the cost to go of the
-linear-quadratic problem at the target, or nothing. K and b are those of an affine law, from which v is
-then the deviation, or zero. The gradient is the adjoint of all of it, about three times as much work:
+linear-quadratic problem at the target, or nothing. K and b are those of the law from which v is then
+the deviation, an affine one or that of the linear-quadratic problem, or zero. The gradient is the
+adjoint of all of it, about three times as much work:
 
     eta_H = dV/dz,    g_i = P'^T ((df/da)^T eta_{i+1} + dl/da),
     eta_i = (df/dz)^T eta_{i+1} + dl/dz + K^T g_i,    dJ/dv_i = g_i.
@@ -42,7 +43,7 @@ from scipy import linalg
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.finite_horizon import cost_to_go
+from pdeloop.method.design.finite_horizon import cost_to_go, finite_horizon_of
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
@@ -79,7 +80,7 @@ class Planner:
     K, b : (n_a, n_z) and (n_a,) arrays
         The affine law a = K z + b.
     around : bool
-        Whether a plan is a deviation from that law; else it is the actions themselves.
+        Whether a plan is a deviation from a law; else it is the actions themselves.
     steps : int
         H.
     terminal : bool
@@ -88,6 +89,9 @@ class Planner:
         Of the search at each step, and at the first.
     starts : int
         Plans that the first search begins from: no action, the affine law, and drawn ones.
+    regulated : bool
+        Whether that law is the linear-quadratic one of the whole state at the target, which V belongs
+        to; else, or without V, it is the affine law.
     """
 
     model: FieldModel
@@ -101,6 +105,7 @@ class Planner:
     iterations: int = 2
     first: int = 60
     starts: int = 5
+    regulated: bool = False
 
     def length(self, k: int) -> int:
         """Steps of a plan that is made at step k: an episode ends after T, whoever goes on does not."""
@@ -113,7 +118,8 @@ class Planner:
         affine = self._affine_plan(z, H)
         own = self.actions_of(affine, z)
         size = np.sqrt((own**2).mean(axis=(1, 2)))[:, None, None]
-        starts = [np.zeros_like(affine)] if self.around else [np.zeros_like(affine), affine]
+        starts = [np.zeros_like(affine)]
+        starts += [affine] if affine.any() else []
         rng = np.random.default_rng(0)
         waves = np.cos(np.pi * np.outer(np.arange(H) + 0.5, np.arange(WAVES)) / H)
         while len(starts) < self.starts:
@@ -159,8 +165,8 @@ class Planner:
                 J, g, plan = self.gradient(plan, z, k)
             plan, J = self.improved(plan, z, k, self.iterations, (J, g))
         lost = ~np.isfinite(J)
-        of_law = self._affine(z)
-        base = of_law if self.around else 0.0
+        of_law = self._law(z, self.K, self.b)
+        base = self._law(z, *self._feedback) if self.around else 0.0
         after = z[:, self.model.n_z :] if self.action_set.rated else None
         a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]), after=after)
         plan = np.where(lost[:, None, None], 0.0, plan)
@@ -176,7 +182,7 @@ class Planner:
             return plan
         found, states = plan.copy(), self._rolled(z, plan)[0]
         with np.errstate(all="ignore"):
-            found[:, -1] = self.action_set.project(self._affine(states[:, -2]))
+            found[:, -1] = self.action_set.project(self._law(states[:, -2], self.K, self.b))
         return found
 
     def costs(self, v: Array, z: Array, k: int) -> Array:
@@ -308,9 +314,14 @@ class Planner:
     def _affine_plan(self, z: Array, H: int) -> Array:
         """The plans (M, H, n_a) with which the affine law acts on the model."""
         none = np.zeros((len(z), H, len(self.b)))
-        if self.around:
+        K, b = self._feedback
+        if K is self.K:
             return none
-        found = rolled(self._sweep, len(self.b), z, none, self.K, self.b)[2]
+        states, _, found = rolled(self._sweep, len(self.b), z, none, self.K, self.b)
+        if self.around:
+            with np.errstate(all="ignore"):
+                law = self._law(states[:, :-1].reshape(-1, states.shape[2]), K, b)
+                found = found - law.reshape(found.shape)
         found[~np.isfinite(found).all(axis=(1, 2))] = 0.0
         return found
 
@@ -319,15 +330,26 @@ class Planner:
         states, _, actions = rolled(self._sweep, len(self.b), z, v, *self._feedback)
         return states, actions
 
-    def _affine(self, z: Array) -> Array:
-        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], self.K) + self.b
+    def _law(self, z: Array, K: Array, b: Array) -> Array:
+        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], K) + b
         return a
 
     @cached_property
     def _feedback(self) -> tuple[Array, Array]:
-        if self.around:
-            return self.K, self.b
-        return np.zeros_like(self.K), np.zeros_like(self.b)
+        """K and b of the law that a plan deviates from."""
+        if not self.around:
+            return np.zeros_like(self.K), np.zeros_like(self.b)
+        return (self.regulated and self.regulator) or (self.K, self.b)
+
+    @cached_property
+    def regulator(self) -> tuple[Array, Array] | None:
+        """K and b of the linear-quadratic law of the whole state; None without V."""
+        if self._to_go is None:
+            return None
+        point, A, B, drift = self._at_target
+        K, b = finite_horizon_of(A, B, drift, self.cost, point)
+        known = bool(np.isfinite(K).all() and np.isfinite(b).all())
+        return (np.ascontiguousarray(K), b - K @ point) if known else None
 
     @cached_property
     def _sweep(self) -> Sweep:
@@ -338,22 +360,28 @@ class Planner:
         """P of [z - z_r; 1]^T P [z - z_r; 1], the cost to go; None where there is none."""
         if not self.terminal or self.model.n_z > LARGEST:
             return None
-        point, a_r = self.cost.field_target, self.cost.action_target
         with np.errstate(all="ignore"):
             try:
-                A, B = self.model.linearise(point, a_r)
-                drift = self.model.step(point[None], a_r[None])[0] - point
-                P = cost_to_go(A, B, drift - B @ a_r, self.cost, point)
+                point, A, B, drift = self._at_target
+                P = cost_to_go(A, B, drift, self.cost, point)
             except (np.linalg.LinAlgError, ValueError):
                 return None
         return 0.5 * (P + P.T) if np.isfinite(P).all() else None
+
+    @cached_property
+    def _at_target(self) -> tuple[Array, Array, Array, Array]:
+        """The target, and A, B and d of e_{k+1} = A e_k + B a_k + d about it."""
+        point, a_r = self.cost.field_target, self.cost.action_target
+        A, B = self.model.linearise(point, a_r)
+        drift = self.model.step(point[None], a_r[None])[0] - point
+        return point, A, B, drift - B @ a_r
 
     @cached_property
     def _metric(self) -> Array:
         """(R + B^T P B)^-1, or R^-1 where there is no cost to go."""
         R = self.cost.action_matrix
         if self._to_go is not None:
-            _, B = self.model.linearise(self.cost.field_target, self.cost.action_target)
+            _, _, B, _ = self._at_target
             R = R + B.T @ self._to_go[:-1, :-1] @ B
         found: Array = linalg.inv(0.5 * (R + R.T))
         return found

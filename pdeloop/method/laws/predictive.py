@@ -128,6 +128,8 @@ class Predictive(Law):
             "terminal": np.array(planner.terminal),
             "search": np.array([planner.steps, planner.iterations, planner.first, planner.starts]),
         }
+        if planner.regulated:
+            arrays["regulated"] = np.array(True)
         if actions.rated:
             arrays["rate"] = np.broadcast_to(actions.rate, n_a)
         numbers = packed(arrays)
@@ -191,6 +193,7 @@ class Predictive(Law):
             iterations=iterations,
             first=first,
             starts=starts,
+            regulated="regulated" in arrays,
         )
 
     def _model(self, theta: Parts, arrays: Mapping[str, Any]) -> FieldModel:
