@@ -76,6 +76,8 @@ SQUARES_ENOUGH = 0.01
 """`enough` of an equation with squares alone, as cubes may be small where it was measured."""
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
+ACCURATE = 5e-3
+"""E of the first three of them at which no other kind is tried: hardly one is `BETTER` times better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,6 +400,8 @@ def fit_field_model(
                 error = own[kind].simulated if by_scale else error
                 judged[kind] = error
                 if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
+                    break
+                if kind.name == FORMS[SIMPLEST - 2].name and min(judged.values()) <= ACCURATE:
                     break
         if not judged:
             return None
