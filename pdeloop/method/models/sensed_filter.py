@@ -6,9 +6,14 @@ estimate is z_k ~ N(x_k, S_k S_k^T). Plants without process noise keep errors in
 initial ones have, so that the filter carries the columns of S, as many as there are Fourier
 coefficients of an initial field. At a reading
 
-    D = I + S^T H^T H S / sigma^2,    S <- S D^{-1/2},    x <- x + S S^T H^T (y - H x) / sigma^2
+    D = I + N N^T,    N = S^T H^T / sigma,    S <- S D^{-1/2},    x <- x + S S^T H^T (y - H x) / sigma^2
 
-with the new S in the last term, and over a step
+with the new S in the last term. Of n_y readings D differs from I by the rank n_y at most: with the
+eigenvectors V and values g of N^T N
+
+    D^{-1/2} = I - N V diag(1 / (1 + g + sqrt(1 + g))) V^T N^T,    D^{-1} N = N V diag(1 / (1 + g)) V^T.
+
+Over a step
 
     x <- f(x, a),    S <- kappa (df/dz) S,
 
@@ -76,15 +81,17 @@ class SensedFilter:
         """After a reading: x (M, n), S (M, 33, n) and y (M, n_y)."""
         seen, sigma = self.model.seen, self.sigma
         H = S[:, :, seen] / sigma
-        D = np.eye(H.shape[1]) + H @ H.swapaxes(1, 2)
+        G = H.swapaxes(1, 2) @ H
         missed = (y - x[:, seen]) / sigma
         # What has overflowed stays so: LAPACK takes finite numbers only.
-        lost = ~(np.isfinite(D).all(axis=(1, 2)) & np.isfinite(missed).all(axis=1))
-        values, vectors = np.linalg.eigh(np.where(lost.reshape(-1, 1, 1), np.eye(H.shape[1]), D))
-        turned = vectors.swapaxes(1, 2)
-        share = (turned @ (H @ missed[:, :, None]))[:, :, 0] / values
-        x = x + np.einsum("mij,mj,min->mn", vectors, share, S)
-        S = (vectors / np.sqrt(values)[:, None]) @ (turned @ S)
+        lost = ~(np.isfinite(G).all(axis=(1, 2)) & np.isfinite(missed).all(axis=1))
+        H[lost], G[lost], missed[lost] = 0.0, 0.0, 0.0
+        values, V = np.linalg.eigh(G)
+        inflated = 1.0 + np.maximum(values, 0.0)[:, :, None]
+        told = V @ ((V.swapaxes(1, 2) @ missed[:, :, None]) / inflated)
+        x = x + ((H @ told).swapaxes(1, 2) @ S)[:, 0]
+        root = np.sqrt(inflated).swapaxes(1, 2)
+        S = S - (H @ V / (root + root * root)) @ (V.swapaxes(1, 2) @ (H.swapaxes(1, 2) @ S))
         return np.where(lost.reshape(-1, 1), np.nan, x), S
 
     def predicted(self, x: Array, S: Array, a: Array) -> tuple[Array, Array]:
