@@ -166,6 +166,12 @@ class DynamicsPlant(BatchPlant):
         state: Array = self._numbers(method, returned, 1)[0]
         if not np.isfinite(state).all():
             raise OwnCodeError(f"{self.name}.{method} returned NaN or infinity")
+        if (largest := float(np.abs(state).max())) > self.divergence_bound:
+            raise OwnCodeError(
+                f"{self.name}.{method} returned a state of magnitude {largest:g}, and rollouts beyond "
+                f"divergence_bound, {self.divergence_bound:g}, count as diverged; set divergence_bound "
+                "above it"
+            )
         return state
 
     def _advance(self) -> None:

@@ -163,6 +163,10 @@ def test_an_initial_state_that_is_wrong_is_told_and_changes_nothing() -> None:
     for begins, words in (
         (np.full(3, np.inf), "Unfit.initial_state returned NaN or infinity"),
         (np.zeros(2), r"Unfit.initial_state returned an array of shape \(2,\)"),
+        (
+            np.full(3, -293.0),
+            "Unfit.initial_state returned a state of magnitude 293, .*_bound, 100,",
+        ),
     ):
         plant.dynamics.begins = begins
         with pytest.raises(OwnCodeError, match=words):
