@@ -194,6 +194,33 @@ def test_steps_are_compared_on_the_fields_of_the_first_law_and_with_no_control()
     assert all(rollout.policy.any() for rollout in optimizer.ask())
 
 
+def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without noise that would be the same rollout; fresh fields tell more of the plant."""
+    monkeypatch.setattr(model_based, "step", lambda *_: None)
+    plant = Plant(chaotic)
+    optimizer = make(plant)
+    known: list[tuple[bytes, int]] = []
+    while not optimizer.done:
+        known += [(asked.policy.tobytes(), asked.field_seed) for asked in optimizer.ask()]
+        optimizer.tell(measured(plant, optimizer))
+    assert len(set(known)) == len(known) == 18
+
+
+def test_where_no_law_stays_finite_on_the_model_steps_follow_measured_rollouts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
+    plant = Plant()
+    optimizer = make(plant)
+    rows = finished(plant, optimizer)
+    told = "no improved law stays finite on the model: steps along measured ones"
+    assert rows[0]["reason"] == told and rows[0]["steps"] > 0
+    start, best = plant.cost(0.6 * plant.best), plant.cost(plant.best)
+    assert plant.cost(optimizer.policy) <= best + 0.35 * (start - best)
+
+
 def test_no_rollout_is_unused_where_there_are_few() -> None:
     plant = Plant(chaotic)
     optimizer = make(plant, rollouts=8)

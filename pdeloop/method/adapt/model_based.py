@@ -68,6 +68,7 @@ from pdeloop.method.adapt.verdict import (
     evidence_of,
     evidence_of_rollouts,
     measured_change,
+    of_the_last,
 )
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
@@ -250,20 +251,25 @@ class ModelBased(Optimizer):
         if progress.stage == RENEWING:
             left = self._schedule.last - self._records.count
             count = min(judging, left, len(known))
-            asked = [Rollout(progress.policy.copy(), seed) for seed in known[:count]]
+            asked = self._on_new(known, progress.policy)[:count]
+            numbers = range(self._records.count, self._records.count + count - len(asked))
+            asked += [self._rollout(progress.policy, number) for number in numbers]
             if not costs_by_field(self._records.all(), self._none):
                 free = max(min(_NONE_ROLLOUTS, left - count), 0)
                 asked += [Rollout(self._none.copy(), seed) for seed in known[:free]]
             return asked
-        own = costs_by_field(self._records.all(), progress.policy)
-        asked = [Rollout(progress.policy.copy(), seed) for seed in known if seed not in own]
-        asked, fresh = asked[:judging], self._records.count
+        asked, fresh = self._on_new(known, progress.policy)[:judging], self._records.count
         while len(asked) < judging:
             asked.append(self._rollout(progress.policy, fresh))
             if len(asked) < judging and not np.array_equal(progress.policy, self._first):
                 asked.append(self._rollout(self._first, fresh))
             fresh += 1
         return asked
+
+    def _on_new(self, known: Sequence[int], policy: Array) -> list[Rollout]:
+        """Rollouts of a law on those of these fields that it was not measured on."""
+        own = costs_by_field(self._records.all(), policy)
+        return [Rollout(policy.copy(), seed) for seed in known if seed not in own]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts, and carry out the next stage."""
@@ -410,11 +416,12 @@ class ModelBased(Optimizer):
         progress, records = self._progress, self._records.all()
         laws = {record.policy.tobytes(): record.policy for record in records}
         best = best_on_same_fields(records, list(laws.values()), self._first)
-        if progress.replayed:
+        progress.replayed = True
+        if progress.trust:
             good = np.array_equal(best, progress.policy)
             progress.trust = min(progress.trust * (GROWS if good else SHRINKS), LARGEST_TRUST)
         else:
-            progress.replayed, progress.trust = True, FIRST_TRUST
+            progress.trust = FIRST_TRUST
         progress.policy = best.copy()
         row["reason"] = f"{self._unpredicted}: steps along measured ones"
         if final:
@@ -458,8 +465,13 @@ class ModelBased(Optimizer):
                 final=final,
             )
         if found is None:
-            row["reason"] = "no improved law stays finite on the model; the law is kept"
+            self._replay(belief, row, final)
+            reason = str(row["reason"])
+            row["reason"] = reason.replace(
+                self._unpredicted, "no improved law stays finite on the model"
+            )
             return
+        self._progress.trust = 0.0
         self._progress.improved, self._progress.parts = found.improved, found.parts
         self._progress.fraction, self._progress.change = found.fraction, found.change
         self._progress.policy = loop.policy(found.theta, near) if found.fraction else near.copy()
@@ -518,7 +530,8 @@ class ModelBased(Optimizer):
         name = FIRST if np.array_equal(law, self._first) else ADAPTED
         size = f"{-saved.value:.4g} (standard error {saved.error:.2g})"
         other = "the first law" if name == FIRST else "an earlier adapted law"
-        row["reason"] = f"{row['reason']}; {other} costs {size} less and is returned"
+        dropped = of_the_last(str(row["reason"]))
+        row["reason"] = f"{dropped}; {other} costs {size} less and is returned"
         change = measured_change(known, law, laws[base])
         if change is None:
             change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))

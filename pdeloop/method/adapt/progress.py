@@ -46,7 +46,7 @@ class Progress:
     replayed : bool
         True if the law was last improved along measured rollouts, as no model predicts them.
     trust : float
-        Weight of the distance from a law in such a step.
+        Weight of the distance from a law in such a step; 0: the law was last improved on a model.
     none_is_close : bool
         True if no control is judged as well.
     safe : bool

@@ -113,7 +113,17 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
                 likely.append(Verdict(name, *size, f"{missed[-1]}, {ALL_AGREE}"))
     if missed and stays.reason == NO_OTHER:
         stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
+    stays = replace(stays, reason=of_the_last(stays.reason))
     return min(found or likely, key=lambda verdict: verdict.change, default=stays)
+
+
+def of_the_last(reason: str) -> str:
+    """A reason for which the adapted law is not the one that is returned, so that another is.
+
+    >>> of_the_last("the adapted law costs 3 (standard error 1) more than no control")
+    'the last law costs 3 (standard error 1) more than no control'
+    """
+    return reason.replace(NAMES[ADAPTED], "the last law")
 
 
 def size_of(name: str, base: str, change: float, deviation: float) -> str:
