@@ -31,8 +31,8 @@ SEPARATORS = (",", ";", "\t", "|")
 """Tried in this order; without any of them columns are separated by spaces."""
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 """Lower-case texts that stand for a missing value."""
-TIME = re.compile(r"t(_[a-zµμ]+|\s*[\[(][^\])]*[\])])?")
-"""The column of times where none is named: t, or t with its unit, such as t_ms or t [ms]."""
+TIME = re.compile(r"(t|[Tt]ime)(_[a-zµμ]+|\s*[\[(][^\])]*[\])])?")
+"""The column of times where none is named: t or time, also with its unit, as t_ms or Time [ms]."""
 TARGET = "target"
 """The word in the column of t whose row has z_r."""
 

@@ -191,6 +191,16 @@ def test_missing_rows_are_cut_at_and_never_interpolated_over(tmp_path: Path) -> 
         np.testing.assert_allclose(poles(found), TRUE, atol=0.01)
 
 
+@pytest.mark.parametrize("name", ["t_ms", "time_ms", "Time [ms]", "time (ms)"])
+def test_the_column_of_times_is_found_by_its_name(tmp_path: Path, name: str) -> None:
+    """Also beside a temperature T, which is none."""
+    names = [name, *NAMES[1:]]
+    path = write(tmp_path / "own.csv", Z, U, t=100.0 * T, names=names)
+    found = read_measurements(path, states=",".join(NAMES[1:4]), inputs=",".join(NAMES[4:]))
+    assert found.sample_time == pytest.approx(0.1)
+    assert list(found.channels.states) == NAMES[1:4]
+
+
 @pytest.mark.parametrize(
     ("name", "step", "seconds"),
     [
