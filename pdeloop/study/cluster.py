@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
+import json
 import logging
 import time
 import warnings
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future
 from importlib import metadata
@@ -19,7 +21,7 @@ from pdeloop.process.module_path import SAFE_PATH
 from pdeloop.study import training
 from pdeloop.study.deaths import LINES
 from pdeloop.study.description import StudyError
-from pdeloop.study.executors import AHEAD, Death, LostWorkerError, Workers
+from pdeloop.study.executors import AHEAD, Death, LostWorkerError, Workers, lost
 from pdeloop.study.results import Ended
 
 CONNECTING = 10.0
@@ -28,6 +30,10 @@ WAITING = 30.0
 """Seconds in which a first worker has to come."""
 WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
 """The command that starts a worker, which must not run modules of its working directory either."""
+ANY = "pdeloop"
+"""A Dask resource of every worker that is known; those of one kind also have `resource_of` it."""
+MANY = 1e9
+"""What a worker has of a resource, of which a training takes 1."""
 ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
 """Events of workers, in a topic of the study's, and of the scheduler."""
 PACE = 0.1
@@ -42,17 +48,25 @@ class Cluster(Workers):
     A worker tells by an event which training it begins; when the scheduler removes it, that is the one
     that has lost its worker, and not the ones that wait there. What is submitted is published, so
     that the scheduler keeps it, and its result, for the next driver when this one dies.
+
+    A training asks for a Dask resource, which a worker has once its environment is known: one that
+    comes later, and is of another kind or has no pdeloop, is not given what it must not carry out.
     """
+
+    grows = True
 
     def __init__(self, client: Any, environments: Mapping[str, Mapping[str, str]]) -> None:
         self._client = client
         self._study = ""
         self.environments = {}
         self._kinds: dict[str, str] = {}
-        self._meet(environments)
+        self._strangers: dict[str, str] = {}
         self._waiting = {}
         self._at: dict[str, Any] = {}
-        self._only: dict[str, list[str]] = {}
+        self._kind_of: dict[str, str] = {}
+        self._again: set[str] = set()
+        for at, environment in environments.items():
+            self._meet(at, environment)
         self._datasets: dict[str, str] = {}
         self._left: set[str] = set()
         self._new: dict[str, Any] = {}
@@ -73,22 +87,27 @@ class Cluster(Workers):
                 self._client.subscribe_topic(topic, hear)
             mine = f"pdeloop/{study}/"
             self._left = {n for n in map(str, self._client.list_datasets()) if n.startswith(mine)}
+            present = self._client.nthreads()
+        self._kinds = {at: kind for at, kind in self._kinds.items() if at in present}
+        came = [{"action": "add-worker", "worker": at} for at in present if at not in self._kinds]
+        self._events.extend(came)
 
-    def kinds(self) -> Mapping[str, int]:
-        return Counter(self._kinds.values())
+    def left(self) -> Mapping[str, str]:
+        known = {resource_of(own): kind for kind, own in self.environments.items()}
+        words = [dataset.split("/", 4)[3:] for dataset in self._left]
+        return {name: known[resource] for resource, name in words if resource in known}
 
-    @property
-    def window(self) -> int:
-        return AHEAD * max(1, len(self._kinds))
+    def window(self, kind: str) -> int:
+        own = [each for each in self._kinds.values() if kind in ("", each)]
+        return AHEAD * len(own)
 
     def submit(
         self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
     ) -> None:
         from distributed.protocol import pickle
 
-        dataset = f"pdeloop/{self._study}/{identity}/{name}"
-        only = [at for at, own in self._kinds.items() if own == kind]
-        self._only[name] = only if len(self.environments) > 1 else []
+        resource = resource_of(self.environments[kind]) if kind else ANY
+        dataset = f"pdeloop/{self._study}/{identity}/{resource}/{name}"
         with _of_the_scheduler():
             if dataset in self._left:  # of a driver that has died
                 self._left.discard(dataset)
@@ -101,22 +120,25 @@ class Cluster(Workers):
                     pickle.dumps((task, arguments)),  # Dask looks into every argument for its own
                     key=f"pdeloop-{name}-{uuid4().hex}",
                     retries=0,
-                    workers=self._only[name] or None,
+                    resources={resource: 1},
                 )
                 self._new[dataset] = future
         own: Future[Ended] = Future()
         self._waiting[own], self._at[name], self._datasets[name] = name, future, dataset
+        self._kind_of[name] = kind
         self._client.loop.add_callback(self._pass_on, future, own)
 
     def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
         time.sleep(PACE)
-        found = super().collect(timeout)
-        for name, _ in found:
+        found = []
+        for name, future in super().collect(timeout):
+            again = name in self._again and future.cancelled()
+            found.append((name, lost() if again else future))
             self._leave(name)
         return found
 
     def deaths(self) -> list[Death]:
-        found, changed = [], False
+        found = []
         while self._events:
             event = self._events.popleft()
             worker, name = event.get("worker", ""), event.get("name", "")
@@ -129,23 +151,24 @@ class Cluster(Workers):
                 case "ended":
                     self._running[worker].discard(name)
                 case "add-worker":
-                    changed = True
-                    self._kinds[worker] = next(iter(self.environments))
-                    if len(self.environments) > 1:
-                        here = training.environment
-                        self._meet(self._client.run(here, workers=[worker], on_error="ignore"))
+                    self._strangers[worker] = ""
+                    self._client.loop.add_callback(self._ask, worker)
+                case "met" if worker in self._strangers:  # and has not gone since
+                    if "environment" in event:
+                        del self._strangers[worker]
+                        self._meet(worker, event["environment"])
+                    else:
+                        self._strangers[worker] = event["why"]
                 case "remove-worker":
-                    changed = True
                     self._kinds.pop(worker, None)
+                    self._strangers.pop(worker, None)
                     # Of a training that had just begun the event may be lost with the worker.
                     waited = [n for n in self._at if self._at[n].key in event["processing-tasks"]]
                     only = waited if len(waited) == 1 else []
-                    for lost in self._running.pop(worker, None) or only:
-                        if lost in self._at:
-                            rows = [*self._progress.get(lost, ())]
-                            found.append(Death(lost, rows, bool(event.get("expected"))))
-        if changed:
-            self._free()
+                    for name in self._running.pop(worker, None) or only:
+                        if name in self._at:
+                            rows = [*self._progress.get(name, ())]
+                            found.append(Death(name, rows, bool(event.get("expected"))))
         return found
 
     def settle(self) -> None:
@@ -172,19 +195,41 @@ class Cluster(Workers):
             self.settle()
 
     def remark(self) -> str:
-        if self._kinds:
-            return ""
-        start = WORKER.format(address=self._client.scheduler.address)
-        return f"no worker is left; waiting for one to be started: {start}"
+        words = [f"the worker at {at} {why}" for at, why in self._strangers.items() if why][:1]
+        if not self._kinds:
+            start = WORKER.format(address=self._client.scheduler.address)
+            words = [f"no worker is left; waiting for one to be started: {start}", *words]
+        return ", ".join(words)
 
-    def _meet(self, environments: Mapping[str, Mapping[str, str]]) -> None:
-        """Know these workers, by their addresses."""
-        for at, environment in environments.items():
-            kind = environment["processor"]
-            if self.environments.get(kind, environment) != environment:  # other versions there
-                kind = f"{kind} at {at}"
-            self.environments = {kind: environment, **self.environments}
-            self._kinds[at] = kind
+    async def _ask(self, at: str) -> None:
+        """What a worker is that has come, for `deaths`, which must not wait for it."""
+        event: dict[str, Any] = {"action": "met", "worker": at}
+        try:
+            found = await self._client.run(meet, workers=[at], on_error="return")
+            answer = found[at]
+            if isinstance(answer, BaseException):
+                raise answer
+            event["environment"] = answer
+        except Exception as error:
+            event["why"] = f"gets no trainings, as it does not answer ({error}); is pdeloop there?"
+        self._events.append(event)
+
+    def _meet(self, at: str, environment: Mapping[str, str]) -> None:
+        """Know the worker at this address."""
+        kind = environment["processor"]
+        same = [each for each, own in self.environments.items() if own == environment]
+        if not same and kind in self.environments:  # with other versions
+            kind = f"{kind} at {at}"
+        kind = same[0] if same else kind
+        self.environments = {**self.environments, kind: environment}
+        if kind not in self._kinds.values():
+            # The scheduler looks for a worker of it only when one comes, which had no resource then.
+            for own, name in self._waiting.items():
+                if not own.done() and (self._kind_of[name] == kind or not self._kinds):
+                    self._again.add(name)
+                    with _of_the_scheduler():
+                        self._at[name].cancel()
+        self._kinds[at] = kind
 
     @property
     def _topic(self) -> str:
@@ -195,16 +240,9 @@ class Cluster(Workers):
         dataset = self._datasets.pop(name)
         if self._new.pop(dataset, None) is None:
             self._old.append(dataset)
-        del self._at[name], self._only[name]
+        del self._at[name], self._kind_of[name]
+        self._again.discard(name)
         self._progress.pop(name, None)
-
-    def _free(self) -> None:
-        """Have those submitted again whose workers of one kind have all gone."""
-        for own, name in self._waiting.items():
-            only = self._only[name]
-            if only and not any(at in self._kinds for at in only) and not own.done():
-                self._at[name].cancel()
-                own.set_exception(LostWorkerError())
 
     async def _pass_on(self, future: Any, own: Future[Ended]) -> None:
         """Give a future of Dask's outcome to one of concurrent.futures."""
@@ -224,6 +262,20 @@ class Cluster(Workers):
         else:
             if own.set_running_or_notify_cancel():
                 own.set_result(found)
+
+
+def resource_of(environment: Mapping[str, str]) -> str:
+    """The Dask resource of workers with this environment."""
+    text = json.dumps(dict(environment), sort_keys=True)
+    return f"{ANY}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+async def meet(dask_worker: Any) -> dict[str, str]:
+    """On a worker: its environment, whose resources it has from now on."""
+    own = training.environment()
+    if (resource := resource_of(own)) not in dask_worker.state.total_resources:
+        await dask_worker.set_resources(**{ANY: MANY, resource: MANY})
+    return own
 
 
 def on_worker(topic: str, name: str, pickled: bytes) -> Ended:
@@ -309,7 +361,14 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
                     f"the {whose} has pdeloop {version}, and this machine has "
                     f"{metadata.version('pdeloop')}; install the same on all"
                 )
-        pool = Cluster(client, client.run(training.environment))
+        environments = client.run(meet, on_error="return")
+        for at, answer in environments.items():
+            if isinstance(answer, Exception):
+                raise StudyError(
+                    f"the worker at {at} has another pdeloop, or cannot answer ({answer}); install the "
+                    "same on all"
+                )
+        pool = Cluster(client, environments)
         try:
             yield pool
         finally:

@@ -45,6 +45,13 @@ class LostWorkerError(RuntimeError):
     """A training whose worker has died, and which has to be submitted again."""
 
 
+def lost() -> Future[Ended]:
+    """The outcome of a training whose worker has died."""
+    future: Future[Ended] = Future()
+    future.set_exception(LostWorkerError())
+    return future
+
+
 class Workers:
     """The workers of an executor, for trainings that have names.
 
@@ -53,22 +60,23 @@ class Workers:
 
     environments: Mapping[str, Mapping[str, str]] = {}
     """The environments of the workers, by a name for each kind; empty: unknown until one answers."""
+    grows = False
+    """Whether workers may come, also of further kinds."""
 
     def __init__(self, pool: Executor) -> None:
         self.pool = pool
         self._waiting: dict[Future[Ended], str] = {}
 
-    def kinds(self) -> Mapping[str, int]:
-        """The number of workers by the kinds of `environments`."""
-        return dict.fromkeys(self.environments, 1)
-
-    @property
-    def window(self) -> int:
-        """Trainings that may be submitted at a time."""
+    def window(self, kind: str) -> int:
+        """Trainings that workers of a kind may have at a time; of "": all workers."""
         return AHEAD * (getattr(self.pool, "_max_workers", None) or UNKNOWN)
 
     def begin(self, study: str) -> None:
         """Work for the study with this id."""
+
+    def left(self) -> Mapping[str, str]:
+        """The kinds of workers that have trainings of an earlier driver, by training."""
+        return {}
 
     def submit(
         self, name: str, kind: str, identity: str, task: Callable[..., Ended], *arguments: Any
@@ -114,8 +122,7 @@ class Processes(Workers):
         here = training.environment()
         self.environments = {here["processor"]: here}
 
-    @property
-    def window(self) -> int:
+    def window(self, kind: str) -> int:
         return len(self._pools)
 
     def submit(
@@ -145,8 +152,7 @@ class Processes(Workers):
             if isinstance(future.exception(), BrokenExecutor):
                 self._pools[place] = None
                 self._died.append(Death(name, []))
-                future = Future()
-                future.set_exception(LostWorkerError())
+                future = lost()
             found.append((name, future))
         return found
 

@@ -11,11 +11,12 @@ import json
 import shlex
 import shutil
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -266,42 +267,51 @@ class _Driver:
 
     def carry_out(self, workers: Workers) -> None:
         """Train what is missing."""
-        todo = deque(name for name in self._trainings if name not in self._finished)
-        self._environments.meet(workers.environments, workers.kinds())
+        todo = Todo([name for name in self._trainings if name not in self._finished])
+        self._environments.begin(workers.environments)
         workers.begin(self._study)
+        for name, kind in workers.left().items():
+            self._environments.prefer(name, kind)
         if isinstance(workers, Processes):  # of this machine: once for all of them
-            heads = {name.rpartition("/")[0]: name for name in todo}
+            heads = {name.rpartition("/")[0]: name for name in todo.names}
             each = [self._trainings[name] for name in heads.values()]
             for values in {(v["equation"], v["optimizer"]): v for v in each}.values():
                 load_compiled(values, fits=True)
-        waiting: set[str] = set()
+        waiting: dict[str, str] = {}  # its kind of worker, by training
         ended: list[Ended] = []
         try:
             while todo or waiting:
-                while todo and len(waiting) < workers.window:
-                    name = todo.popleft()
-                    self._submit(workers, name)
-                    waiting.add(name)
+                given = Counter(waiting.values())
+                for kind in self._environments.kinds(workers.environments):
+                    room = workers.window(kind) - given[kind]
+                    for name in todo.taken(room, kind, self._environments.kind_of):
+                        self._submit(workers, name, kind)
+                        waiting[name] = kind
+                if todo and not waiting and not workers.grows:
+                    raise StudyError(self._environments.lacking(todo.names[0]))
                 self._keep(ended)  # when the workers have something to do
                 ended.clear()
                 workers.settle()
-                self._tell(self.done, len(self._trainings), self._status(workers))
+                idle = [name for name, kind in waiting.items() if not workers.window(kind)]
+                if not waiting:
+                    idle = todo.names[:1]
+                lacking = self._environments.lacking(idle[0]) if idle and workers.window("") else ""
+                self._tell(self.done, len(self._trainings), self._status(workers, lacking))
                 for name, future in workers.collect(POLL):
-                    waiting.discard(name)
+                    kind = waiting.pop(name)
                     one = self._outcome(name, future)
                     if one is None:
-                        todo.appendleft(name)
+                        todo.put_back(name, kind)
                     else:
                         ended.append(one)
                         self._deaths.ended(name)
                 for death in workers.deaths():
                     reason = self._died(death)
-                    if reason and death.name in todo:
-                        todo.remove(death.name)
-                    elif reason and death.name in waiting:
+                    if not reason:
+                        continue
+                    if waiting.pop(death.name, None) is not None:
                         workers.take_back(death.name)
-                        waiting.discard(death.name)
-                    else:
+                    elif not todo.without(death.name):
                         continue
                     ended.append(Ended.failed(death.name, self._trainings[death.name], reason))
         finally:
@@ -315,9 +325,8 @@ class _Driver:
         self._results.died(death.name, self._deaths.of(death.name))
         return reason
 
-    def _submit(self, workers: Workers, name: str) -> None:
-        values, task = self._trainings[name], self._task(name)
-        kind, identity = self._environments.kind_for(name), self._identity(name)
+    def _submit(self, workers: Workers, name: str, kind: str) -> None:
+        values, task, identity = self._trainings[name], self._task(name), self._identity(name)
         if task is not None:
             workers.submit(name, kind, identity, ended_well, name, values, task)
             return
@@ -332,10 +341,10 @@ class _Driver:
             return None
         except (BrokenExecutor, CancelledError):
             raise
-        except (ValueError, RuntimeError) as error:
-            return Ended.failed(name, self._trainings[name], str(error))
-        except Exception as error:  # of a worker: no memory, no disk
+        except Exception as error:  # of the executor, such as a result that cannot be sent
             return Ended.failed(name, self._trainings[name], f"{type(error).__name__}: {error}")
+        if one.row["failure"] is not None:
+            return one
         self._environments.require(name, json.loads(one.row["environment"]))
         if (plant := one.row["plant"]) is not None and plant != self._plant(name):
             raise StudyError(
@@ -370,9 +379,7 @@ class _Driver:
         except (OSError, ValueError):
             return []
 
-    def _status(self, workers: Workers) -> str:
-        if lacking := workers.remark():
-            return lacking
+    def _status(self, workers: Workers, lacking: str) -> str:
         minutes = (time.monotonic() - self._began) / 60
         words = []
         if self._ended_here:
@@ -383,14 +390,63 @@ class _Driver:
             words.append(f"{len(self._failures)} failed")
         if self._deaths.total:
             words.append(f"{self._deaths.total} workers lost")
-        return ", ".join([*words, *filter(None, [self._environments.remark])])
+        remarks = [self._environments.remark(), workers.remark(), lacking]
+        return ", ".join([*words, *filter(None, remarks)])
 
 
 def ended_well(
     name: str, values: Mapping[str, Any], task: Callable[..., Files], *arguments: Any
 ) -> Ended:
-    """Carry out a task, and do on its worker what would occupy the driver of many."""
-    return Ended.well(name, values, task(values, *arguments))
+    """Carry out a task, and do on its worker what would occupy the driver of many.
+
+    What it raises becomes a failure here: another process may not know the exception's type, or take a
+    SystemExit for its own.
+    """
+    try:
+        return Ended.well(name, values, task(values, *arguments))
+    except (ValueError, RuntimeError) as error:
+        why = str(error)
+    except (Exception, SystemExit) as error:  # such as no memory, no disk
+        why = f"{type(error).__name__}: {error}"
+    return Ended.failed(name, values, why)
+
+
+class Todo:
+    """The trainings that are not submitted yet, in the order of the study, by kind of worker."""
+
+    def __init__(self, names: list[str]) -> None:
+        self._any = deque(names)
+        self._own: dict[str, deque[str]] = defaultdict(deque)  # by kind
+
+    def __bool__(self) -> bool:
+        return bool(self._any or any(self._own.values()))
+
+    @property
+    def names(self) -> list[str]:
+        return [*chain(*self._own.values(), self._any)]
+
+    def taken(self, count: int, kind: str, kind_of: Callable[[str, str], str]) -> Iterator[str]:
+        """Take so many for workers of a kind; `kind_of` (name, kind) is the one that it needs."""
+        own = self._own[kind]
+        while count > 0 and (own or self._any):
+            name = own.popleft() if own else self._any.popleft()
+            if (needed := kind_of(name, kind)) == kind:
+                count -= 1
+                yield name
+            else:
+                self._own[needed].append(name)
+
+    def put_back(self, name: str, kind: str) -> None:
+        """It was taken for this kind, and is the first again."""
+        self._own[kind].appendleft(name)
+
+    def without(self, name: str) -> bool:
+        """Take this one out; whether it was there."""
+        for names in (*self._own.values(), self._any):
+            if name in names:
+                names.remove(name)
+                return True
+        return False
 
 
 class Environments:
@@ -404,9 +460,8 @@ class Environments:
         self._anything = anything
         self._versions: dict[str, str] | None = None
         self._kinds: dict[tuple[str, str], str] = {}
-        self._workers: Mapping[str, int] = {}
-        self._given: Counter[str] = Counter()
-        self.remark = ""
+        self._workers: Mapping[str, Mapping[str, str]] = {}
+        self._fit: list[str] = []
 
     def know(self, name: str, environment: Mapping[str, str]) -> None:
         """A training was carried out in this environment, before."""
@@ -414,41 +469,53 @@ class Environments:
         self._versions = versions if self._versions is None else self._versions
         if not self._anything and (other := differences(versions, self._versions)):
             raise StudyError(f"{name} was trained with {other}: {_OTHER}")
+        self.prefer(name, kind)
+
+    def prefer(self, name: str, kind: str) -> None:
+        """Carry out this training, and those that are compared with it, on this kind if on no other."""
         self._kinds.setdefault(_group(name), kind)
 
-    def meet(
-        self, environments: Mapping[str, Mapping[str, str]], workers: Mapping[str, int]
-    ) -> None:
-        """These are the workers' environments, and their numbers by kind of processor."""
-        if self._anything:
-            return
-        self._workers = workers
-        for environment in environments.values():
-            self._same_versions(_split(environment)[0])
-        if len(workers) > 1:
-            kinds = ", ".join(f"{number} {kind}" for kind, number in workers.items())
-            self.remark = (
-                f"workers have different processors ({kinds}), so the trainings of a seed of a problem "
-                "stay on one kind"
-            )
+    def begin(self, workers: Mapping[str, Mapping[str, str]]) -> None:
+        """These are the workers' environments, by kind. StudyError unless the versions are the same."""
+        for environment in workers.values():
+            if not self._anything:
+                self._same_versions(_split(environment)[0])
 
-    def kind_for(self, name: str) -> str:
-        """The kind of processor that a training is carried out on; empty: any."""
-        if not self._workers:
-            return ""
-        group = _group(name)
-        if group not in self._kinds:
-            kind = min(self._workers, key=lambda own: self._given[own] / self._workers[own])
-            self._kinds[group] = kind
-        kind = self._kinds[group]
-        self._given[kind] += 1
-        if kind not in self._workers:
-            raise StudyError(
-                f"other trainings of seed {group[1]} of {group[0]} were carried out on a processor "
-                f"{kind}, which no worker has: start one that has it, or accept results that may "
-                "differ in the last bits with --any-environment"
+    def kinds(self, workers: Mapping[str, Mapping[str, str]]) -> list[str]:
+        """The kinds of workers that may carry out trainings; "" is any. Others may have come by now."""
+        if self._anything or not workers:
+            return [""]
+        self._workers = workers
+        versions = {kind: _split(environment)[0] for kind, environment in workers.items()}
+        return [kind for kind, own in versions.items() if own == self._versions]
+
+    def kind_of(self, name: str, offered: str) -> str:
+        """The kind that carries out a training: where it has none yet, the one that is offered."""
+        return self._kinds.setdefault(_group(name), offered) if offered else ""
+
+    def lacking(self, name: str) -> str:
+        """Why a training cannot be carried out, where no worker of its kind can come."""
+        problem, seed = _group(name)
+        kind = self._kinds.get((problem, seed), "of its own")
+        return (
+            f"other trainings of seed {seed} of {problem} were carried out on a processor {kind}, "
+            "which no worker has: start one that has it, or accept results that may differ in the last "
+            "bits with --any-environment"
+        )
+
+    def remark(self) -> str:
+        """What is to be said of workers that differ."""
+        words, own = [], self.kinds(self._workers)
+        if len(own) > 1:
+            words.append(
+                f"workers have different processors ({', '.join(own)}), so the trainings of a seed of "
+                "a problem stay on one kind"
             )
-        return kind
+        for kind in self._workers:
+            if kind not in own and own != [""]:
+                other = differences(_split(self._workers[kind])[0], self._versions or {})
+                words.append(f"a worker that came later has {other}, and gets no trainings")
+        return ", ".join(words)
 
     def require(self, name: str, environment: Mapping[str, str]) -> None:
         """StudyError unless this environment of a result is that of the others."""

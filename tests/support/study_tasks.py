@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,6 +36,13 @@ def noted(folder: str, seconds: float, values: Values) -> dict[str, bytes]:
     return result(values)
 
 
+def waiting(file: str, values: Values) -> dict[str, bytes]:
+    """Wait for a file, but with the first seed."""
+    while values["seed"] and not Path(file).exists():
+        time.sleep(0.05)
+    return result(values)
+
+
 def killing(folder: str, values: Values) -> dict[str, bytes]:
     """End the worker, as one that has no memory left is ended."""
     noted(folder, 0.3, values)  # so that what it tells has been sent
@@ -46,6 +54,25 @@ def raising(folder: str, values: Values) -> dict[str, bytes]:
     """Fail."""
     noted(folder, 0.0, values)
     raise ValueError("no model can be had")
+
+
+class UnsendableError(Exception):
+    """Cannot be made again from what another process is sent of it."""
+
+    def __init__(self, number: int, unit: str) -> None:
+        super().__init__(f"{number} {unit} are too much")
+
+
+def unsendable(folder: str, values: Values) -> dict[str, bytes]:
+    """Fail with an exception of its own."""
+    noted(folder, 0.0, values)
+    raise UnsendableError(7, "MPa")
+
+
+def exiting(folder: str, values: Values) -> dict[str, bytes]:
+    """Fail as a program's script does."""
+    noted(folder, 0.0, values)
+    sys.exit("no licence")
 
 
 def runs_in(folder: Path) -> list[int]:

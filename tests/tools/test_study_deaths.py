@@ -22,6 +22,7 @@ from pdeloop.study.deaths import Deaths
 from pdeloop.study.executors import local_workers
 from pdeloop.study.status import status
 from pdeloop.study.training import Place, listening, train_one
+from tests.support import study_tasks
 from tests.support.loop_harness import until
 from tests.support.small_study import CONTENT, LIMIT, contents, here
 
@@ -118,6 +119,25 @@ def test_a_process_that_is_killed_costs_only_its_training(reference: Path, tmp_p
     assert killed and contents(out) == contents(reference)
     found = status(out)
     assert found["workers_lost"] == 1 and found["finished"] == 4 and not found["failed"]
+
+
+@pytest.mark.usefixtures("forked_workers")
+@pytest.mark.parametrize("name", ["unsendable", "exiting"])
+def test_what_a_training_raises_costs_it_alone_also_in_a_process(tmp_path: Path, name: str):
+    """Neither its process, which would have it repeated, nor the driver."""
+    study, notes = Study.of({**CONTENT, "variants": {name: {}, "noted": {}}}), tmp_path / "notes"
+    notes.mkdir()
+    tasks: dict[str, Any] = {
+        name: partial(vars(study_tasks)[name], str(notes)),
+        "noted": study_tasks.result,
+    }
+    failures = run(study, tmp_path / "out", partial(local_workers, 1), tasks=tasks)
+    assert [failure.training for failure in failures] == [f"small/{name}/{seed}" for seed in (0, 1)]
+    reasons = ("UnsendableError: 7 MPa are too much", "SystemExit: no licence")
+    assert {failure.reason for failure in failures} <= {*reasons}
+    assert study_tasks.runs_in(notes) == [1, 1]
+    found = status(tmp_path / "out")
+    assert (found["finished"], found["failed"], found["workers_lost"]) == (2, 2, 0)
 
 
 def test_a_killed_driver_leaves_no_temporary_folder_and_is_continued(

@@ -82,7 +82,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path,
 def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    older = installed_before("numpy", tmp_path / "packages")
+    older = f"{installed_before('numpy', tmp_path / 'packages')}:{ROOT}"
     file, out = tmp_path / "study.yaml", str(tmp_path / "out")
     file.write_text(json.dumps({**CONTENT, "seeds": 1}))
     with dask_cluster(tmp_path / "dask", 1, worker=older) as dask:
@@ -156,26 +156,29 @@ def test_a_driver_that_dies_loses_nothing_and_what_was_finished_is_not_done_agai
 
 @pytest.mark.filterwarnings("default")
 def test_what_kills_its_worker_or_raises_is_told_from_what_a_dying_worker_loses(tmp_path: Path):
-    names = ("killing", "raising", "noted")
+    names = ("killing", "raising", "unsendable", "exiting", "noted")
     study = Study.of({**CONTENT, "seeds": 1, "variants": {name: {} for name in names}})
     places = {name: tmp_path / name for name in study.variants}
     for place in places.values():
         place.mkdir()
     tasks: dict[str, Any] = {
         "killing": partial(study_tasks.killing, str(places["killing"])),
-        "raising": partial(study_tasks.raising, str(places["raising"])),
+        **{name: partial(vars(study_tasks)[name], str(places[name])) for name in names[1:4]},
         "noted": partial(study_tasks.noted, str(places["noted"]), 0.0),
     }
     with dask_cluster(tmp_path / "dask", 2, nanny=True) as dask:
         failures = run(study, tmp_path / "out", partial(cluster, dask.address), tasks=tasks)
     reasons = {failure.training: failure.reason for failure in failures}
-    assert {*reasons} == {"small/killing/0", "small/raising/0"}
+    assert {*reasons} == {f"small/{name}/0" for name in names[:4]}
     assert "it kills its workers: 3 died in a row" in reasons["small/killing/0"]
     assert reasons["small/raising/0"] == "no model can be had"
+    assert reasons["small/unsendable/0"] == "UnsendableError: 7 MPa are too much"
+    assert reasons["small/exiting/0"] == "SystemExit: no licence"
     # The scheduler has it run again before the driver takes it back.
-    assert runs_in(places["raising"]) == [1] and runs_in(places["killing"])[0] in (3, 4)
+    assert all(runs_in(places[name]) == [1] for name in names[1:])
+    assert runs_in(places["killing"])[0] in (3, 4)
     found = status(tmp_path / "out")
-    assert (found["finished"], found["failed"]) == (1, 2) and found["workers_lost"] >= 3
+    assert (found["finished"], found["failed"]) == (1, 4) and found["workers_lost"] >= 3
 
 
 @pytest.mark.filterwarnings("default")
@@ -205,17 +208,83 @@ def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
     assert f"trainings are kept in {out}, which `pdeloop study --out {out}` continues" in line
 
 
+def other_processor(folder: Path) -> str:
+    """Packages of a worker that has another processor."""
+    return _packages(
+        folder,
+        "import llvmlite.binding\nllvmlite.binding.get_host_cpu_name = lambda: 'nocona'\n",
+    )
+
+
+def no_pdeloop(folder: Path) -> str:
+    """Packages of a worker on a machine where pdeloop is not installed."""
+    return _packages(
+        folder,
+        "import sys\n"
+        "class Missing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] in ('pdeloop', 'pde_sim_node', 'tests'):\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Missing())\n",
+    )
+
+
+def _packages(folder: Path, content: str) -> str:
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(content)
+    return f"{folder}:{ROOT}"
+
+
+def processors_by_seed(out: Path) -> dict[int, set[str]]:
+    found: dict[int, set[str]] = {}
+    with reading(out) as results:
+        for row in results.rows("seed, environment"):
+            processor = json.loads(row["environment"])["processor"]
+            found.setdefault(row["seed"], set()).add(processor)
+    return found
+
+
+@pytest.mark.filterwarnings("default")
+def test_workers_that_come_later_are_taken_by_their_kind_and_waited_for_when_they_go(
+    tmp_path: Path,
+):
+    """One of another processor, which is killed and comes again, and one without pdeloop."""
+    study = Study.of({**CONTENT, "variants": {"a": {}, "b": {}}, "seeds": 12})
+    out, all_are_there = tmp_path / "out", tmp_path / "all are there"
+    tasks = dict.fromkeys(study.variants, partial(study_tasks.waiting, str(all_are_there)))
+    packages, bare = other_processor(tmp_path / "packages"), no_pdeloop(tmp_path / "bare")
+    told: set[str] = set()
+    with dask_cluster(tmp_path / "dask", 1) as dask:
+
+        def come_and_go(done: int, total: int, status: str) -> None:
+            told.add(status)
+            if "workers have different processors (" in status and "gets no trainings" in status:
+                all_are_there.touch()
+            if done and len(dask.workers) == 1:
+                dask.start_worker(packages)
+                dask.start_worker(bare)
+            elif len(dask.workers) == 3 and {"nocona"} in processors_by_seed(out).values():
+                # Of its seeds those of the second variant are still to come.
+                dask.workers[1].kill()
+            if len(dask.workers) == 3 and "a processor nocona, which no worker has" in status:
+                dask.start_worker(packages)
+
+        run(study, out, partial(cluster, dask.address), tasks=tasks, tell=come_and_go)
+        assert len(dask.workers) == 4
+    processors = processors_by_seed(out)
+    assert len(processors) == 12 and {len(own) for own in processors.values()} == {1}
+    assert len(set.union(*processors.values())) == 2
+    found = status(out)
+    assert found["finished"] == 24 and found["workers_lost"] <= 1
+    assert any("it does not answer (ModuleNotFoundError" in text for text in told)
+
+
 @pytest.mark.filterwarnings("default")
 def test_workers_with_other_processors_divide_the_study(tmp_path: Path):
-    packages = tmp_path / "packages"
-    packages.mkdir()
-    (packages / "sitecustomize.py").write_text(
-        "import llvmlite.binding\nllvmlite.binding.get_host_cpu_name = lambda: 'nocona'\n"
-    )
     study, told = Study.of({**CONTENT, "variants": {"a": {}, "b": {}}, "seeds": 4}), set()
     tasks = dict.fromkeys(study.variants, study_tasks.result)
     with dask_cluster(tmp_path / "dask", 1) as dask:
-        dask.start_worker(f"{packages}:{ROOT}")
+        dask.start_worker(other_processor(tmp_path / "packages"))
         dask.await_workers(2)
         run(
             study,
@@ -224,15 +293,10 @@ def test_workers_with_other_processors_divide_the_study(tmp_path: Path):
             tasks=tasks,
             tell=lambda done, total, status: told.add(status),
         )
-    processors: dict[int, set[str]] = {}
-    with reading(tmp_path / "out") as results:
-        for row in results.rows("seed, environment"):
-            processors.setdefault(row["seed"], set()).add(
-                json.loads(row["environment"])["processor"]
-            )
+    processors = processors_by_seed(tmp_path / "out")
     assert len(processors) == 4 and {len(own) for own in processors.values()} == {1}
     assert len(set.union(*processors.values())) == 2
-    assert any("workers have different processors (1 " in text for text in told)
+    assert any("workers have different processors (" in text for text in told)
 
 
 @pytest.mark.filterwarnings("default")
