@@ -354,6 +354,8 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
         except metadata.PackageNotFoundError as error:
             installed["scheduler"] = error
         for whose, version in installed.items():
+            if isinstance(version, OSError):
+                continue  # it has gone meanwhile
             if isinstance(version, Exception):
                 raise StudyError(f"the {whose} has no pdeloop; install pdeloop[cluster] there")
             if version != metadata.version("pdeloop"):
@@ -361,7 +363,8 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
                     f"the {whose} has pdeloop {version}, and this machine has "
                     f"{metadata.version('pdeloop')}; install the same on all"
                 )
-        environments = client.run(meet, on_error="return")
+        answers = client.run(meet, on_error="return")
+        environments = {at: own for at, own in answers.items() if not isinstance(own, OSError)}
         for at, answer in environments.items():
             if isinstance(answer, Exception):
                 raise StudyError(
@@ -375,9 +378,15 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
             pool.end()
 
 
+def _is_news(record: logging.LogRecord) -> bool:
+    """False for what a client says of a lost connection some seconds after its end."""
+    return not record.msg.startswith("Failed to reconnect to scheduler")
+
+
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Without the library's own words on a lost connection, which is reported in one sentence."""
+    logging.getLogger("distributed.client").addFilter(_is_news)
     loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
     before = [logger.level for logger in loggers]
     for logger in loggers:

@@ -114,6 +114,16 @@ class Results:
         for row in self._rows(f"SELECT {columns} FROM trainings WHERE {where} ORDER BY ended"):
             yield dict(zip(names, row, strict=True))
 
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Have what is read in the block be of one moment; the writer waits for its end."""
+        with _reported(self.folder, "read"):
+            self._execute("BEGIN")
+            try:
+                yield
+            finally:
+                self._execute("COMMIT")
+
     def names(self) -> set[str]:
         """The trainings that have ended, with results or without."""
         return {row["name"] for row in self.rows("name")}
@@ -227,9 +237,8 @@ def writing(folder: Path, study: Study) -> Iterator[Results]:
             why = error.strerror if isinstance(error, OSError) else error
             raise StudyError(f"cannot write to {folder}: {why}") from error
         yield results
-        files = [path for path in (folder / UNFINISHED).rglob("*") if path.is_file()]
-        if files == [folder / UNFINISHED / "study"]:
-            shutil.rmtree(folder / UNFINISHED)
+        # All trainings have ended; others may have finished the same ones meanwhile.
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
 
 
 @contextmanager

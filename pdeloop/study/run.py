@@ -6,8 +6,10 @@ The folder's files: pdeloop.study.results.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import platform
 import shlex
 import shutil
 import time
@@ -282,7 +284,7 @@ class _Driver:
         try:
             while todo or waiting:
                 given = Counter(waiting.values())
-                for kind in self._environments.kinds(workers.environments):
+                for kind in self._environments.kinds(workers):
                     room = workers.window(kind) - given[kind]
                     for name in todo.taken(room, kind, self._environments.kind_of):
                         self._submit(workers, name, kind)
@@ -341,6 +343,11 @@ class _Driver:
             return None
         except (BrokenExecutor, CancelledError):
             raise
+        except FullDiskError as error:
+            raise StudyError(
+                f"{name} cannot be carried out: {error}; free some space there, and continue with "
+                f"`pdeloop study --out {shlex.quote(str(self._results.folder))}`"
+            ) from error
         except Exception as error:  # of the executor, such as a result that cannot be sent
             return Ended.failed(name, self._trainings[name], f"{type(error).__name__}: {error}")
         if one.row["failure"] is not None:
@@ -400,15 +407,23 @@ def ended_well(
     """Carry out a task, and do on its worker what would occupy the driver of many.
 
     What it raises becomes a failure here: another process may not know the exception's type, or take a
-    SystemExit for its own.
+    SystemExit for its own. FullDiskError, which is no fault of the training, where no space is left.
     """
     try:
         return Ended.well(name, values, task(values, *arguments))
-    except (ValueError, RuntimeError) as error:
-        why = str(error)
-    except (Exception, SystemExit) as error:  # such as no memory, no disk
-        why = f"{type(error).__name__}: {error}"
-    return Ended.failed(name, values, why)
+    except (Exception, SystemExit) as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise FullDiskError(f"{cause} on {platform.node()}") from None
+            cause = cause.__cause__
+        plain = isinstance(error, ValueError | RuntimeError)
+        why = str(error) if plain else f"{type(error).__name__}: {error}"
+        return Ended.failed(name, values, why)
+
+
+class FullDiskError(Exception):
+    """A worker has no space left."""
 
 
 class Todo:
@@ -481,13 +496,17 @@ class Environments:
             if not self._anything:
                 self._same_versions(_split(environment)[0])
 
-    def kinds(self, workers: Mapping[str, Mapping[str, str]]) -> list[str]:
+    def kinds(self, workers: Workers) -> list[str]:
         """The kinds of workers that may carry out trainings; "" is any. Others may have come by now."""
-        if self._anything or not workers:
+        if self._anything or not (workers.environments or workers.grows):
             return [""]
-        self._workers = workers
-        versions = {kind: _split(environment)[0] for kind, environment in workers.items()}
-        return [kind for kind, own in versions.items() if own == self._versions]
+        self._workers, self._fit = workers.environments, []
+        for kind, environment in self._workers.items():
+            versions, _ = _split(environment)
+            self._versions = self._versions or versions
+            if versions == self._versions:
+                self._fit.append(kind)
+        return self._fit
 
     def kind_of(self, name: str, offered: str) -> str:
         """The kind that carries out a training: where it has none yet, the one that is offered."""
@@ -505,14 +524,14 @@ class Environments:
 
     def remark(self) -> str:
         """What is to be said of workers that differ."""
-        words, own = [], self.kinds(self._workers)
-        if len(own) > 1:
+        words = []
+        if len(self._fit) > 1:
             words.append(
-                f"workers have different processors ({', '.join(own)}), so the trainings of a seed of "
-                "a problem stay on one kind"
+                f"workers have different processors ({', '.join(self._fit)}), so the trainings of a "
+                "seed of a problem stay on one kind"
             )
         for kind in self._workers:
-            if kind not in own and own != [""]:
+            if kind not in self._fit:
                 other = differences(_split(self._workers[kind])[0], self._versions or {})
                 words.append(f"a worker that came later has {other}, and gets no trainings")
         return ", ".join(words)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pdeloop.study.results import is_worked_on, read_study, reading
-from pdeloop.study.table import rows
+from pdeloop.study.table import finished, table
 
 RECENT = 100
 """Trainings from whose times of ending the rate follows."""
@@ -38,13 +38,15 @@ def status(folder: Path) -> dict[str, Any]:
     failures: dict[str, str] = {}
     deaths: Counter[str] = Counter()
     ended: list[float] = []
-    with reading(folder) as results:
-        for row in results.rows("name, ended, failure, deaths", "1"):
-            deaths[row["name"]] = row["deaths"]
-            if row["failure"] is not None:
-                failures[row["name"]] = row["failure"]
-            if row["ended"] is not None:
-                ended.append(row["ended"])
+    with reading(folder) as results, results.unchanged():
+        trainings = [*results.rows("name, ended, failure, deaths", "1")]
+        known = finished(results)
+    for row in trainings:
+        deaths[row["name"]] = row["deaths"]
+        if row["failure"] is not None:
+            failures[row["name"]] = row["failure"]
+        if row["ended"] is not None:
+            ended.append(row["ended"])
     total = len(study.problems) * len(study.variants) * len(study.seeds)
     running = is_worked_on(folder)
     recent = ended[-RECENT:]
@@ -62,7 +64,7 @@ def status(folder: Path) -> dict[str, Any]:
         "workers_lost": deaths.total(),
         "deaths": {name: count for name, count in deaths.most_common(SHOWN) if count},
         "failures": failures,
-        "rows": rows(study, folder),
+        "rows": table(study, known),
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -18,7 +18,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.output import aligned
 from pdeloop.study.description import Study
-from pdeloop.study.results import reading
+from pdeloop.study.results import Results, reading
 from pdeloop.study.training import differences
 from tuner_node.rollouts import EVALUATED
 
@@ -39,17 +39,27 @@ def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
 
     `other_environments` says how those differ from most of the study in which some were carried out.
     """
+    with reading(folder) as results:
+        return table(study, finished(results))
+
+
+def finished(results: Results) -> list[dict[str, Any]]:
+    """What `table` takes of the trainings that are finished."""
+    columns = "problem, variant, seed, costs, rollouts, environment"
+    return [*results.rows(columns, "costs IS NOT NULL")]
+
+
+def table(study: Study, finished: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of a study's table, from those of its trainings."""
     found: dict[tuple[str, str], dict[int, tuple[Any, float]]] = {}
     environments: dict[tuple[str, str], Counter[str]] = {}
-    with reading(folder) as results:
-        columns = "problem, variant, seed, costs, rollouts, environment"
-        for row in results.rows(columns, "costs IS NOT NULL"):
-            key = row["problem"], row["variant"]
-            found.setdefault(key, {})[row["seed"]] = json.loads(row["costs"]), row["rollouts"]
-            environments.setdefault(key, Counter())[row["environment"]] += 1
+    for row in finished:
+        key = row["problem"], row["variant"]
+        found.setdefault(key, {})[row["seed"]] = json.loads(row["costs"]), row["rollouts"]
+        environments.setdefault(key, Counter())[row["environment"]] += 1
     together = sum(environments.values(), Counter[str]())
     most = json.loads(together.most_common(1)[0][0]) if together else {}
-    table = []
+    rows = []
     for problem in study.problems:
         for variant in study.variants:
             own = found.get((problem, variant), {})
@@ -61,8 +71,8 @@ def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
                 }
                 entries = figures(costs, [paid for _, paid in seeds])
                 entries["other_environments"] = sorted(others - {""})
-                table.append({"problem": problem, "variant": variant, **entries})
-    return table
+                rows.append({"problem": problem, "variant": variant, **entries})
+    return rows
 
 
 def figures(measured: Mapping[str, Array], rollouts: Sequence[float]) -> dict[str, Any]:

@@ -75,6 +75,16 @@ def exiting(folder: str, values: Values) -> dict[str, bytes]:
     sys.exit("no licence")
 
 
+def full(values: Values) -> dict[str, bytes]:
+    """Write on a full disk."""
+    try:
+        with Path("/dev/full").open("wb", buffering=0) as file:
+            file.write(b"progress")
+    except OSError as error:
+        raise RuntimeError("cannot write") from error
+    return result(values)
+
+
 def runs_in(folder: Path) -> list[int]:
     """How often each seed was carried out."""
     return [len(path.read_text().split()) for path in sorted(folder.iterdir())]

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -17,9 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdeloop.study import Study, run, training
+from pdeloop.study import Study, StudyError, run, training
 from pdeloop.study.deaths import Deaths
 from pdeloop.study.executors import local_workers
+from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.status import status
 from pdeloop.study.training import Place, listening, train_one
 from tests.support import study_tasks
@@ -138,6 +140,58 @@ def test_what_a_training_raises_costs_it_alone_also_in_a_process(tmp_path: Path,
     assert study_tasks.runs_in(notes) == [1, 1]
     found = status(tmp_path / "out")
     assert (found["finished"], found["failed"], found["workers_lost"]) == (2, 2, 0)
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_a_workers_full_disk_ends_the_study_and_fails_no_training(tmp_path: Path):
+    study, out = Study.of({**CONTENT, "variants": {"noted": {}, "full": {}}}), tmp_path / "out"
+    tasks = {"noted": study_tasks.result, "full": study_tasks.full}
+    with pytest.raises(StudyError, match=r"small/full/0 cannot be carried out: .*No space left on"):
+        run(study, out, partial(local_workers, 1), tasks=tasks)
+    assert (status(out)["finished"], status(out)["failed"]) == (2, 0)
+    assert run(study, out, here, tasks=dict.fromkeys(study.variants, study_tasks.result)) == []
+
+
+def test_what_workers_finish_while_there_is_no_driver_is_taken_once(
+    reference: Path, tmp_path: Path
+):
+    out, study, seen = tmp_path / "out", Study.of(CONTENT), []
+
+    def stop_after_one(done: int, total: int, status: str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(study, out, here, tell=stop_after_one)
+    root, name = out / "unfinished", [*study.trainings()][-1]
+    train_one(study.trainings()[name], Place(str(root), (root / "study").read_text(), name))
+    run(study, out, here, tell=lambda done, total, status: seen.append(done))
+    assert seen[0] >= 2 and contents(out) == contents(reference)
+    assert {path.name for path in out.iterdir()} == {"study.json", "results.sqlite", "lock"}
+
+
+def test_a_status_is_of_one_moment(tmp_path: Path):
+    """A driver that has a result meanwhile waits for the reader."""
+    study, added = Study.of(CONTENT), threading.Event()
+    name, values = next(iter(study.trainings().items()))
+
+    def add() -> None:
+        with writing(tmp_path, study) as results:
+            added.set()
+            results.add([Ended.well(name, values, study_tasks.result(values))])
+
+    with writing(tmp_path, study):
+        pass
+    with reading(tmp_path) as results:
+        driver = threading.Thread(target=add)
+        with results.unchanged():
+            before = results.names()
+            driver.start()
+            assert added.wait(LIMIT)
+            driver.join(0.3)
+            assert driver.is_alive() and results.names() == before == set()
+        driver.join(LIMIT)
+        assert results.names() == {name}
 
 
 def test_a_killed_driver_leaves_no_temporary_folder_and_is_continued(

@@ -194,15 +194,15 @@ def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
 
         def kill(folder: Path) -> None:
             until(lambda: [*folder.rglob("run.json")], LIMIT, "training that has begun")
-            monkeypatch.setattr(dask_client, "CONNECTING", 1.0)
             scheduler.kill()
 
+        monkeypatch.setattr(dask_client, "CONNECTING", 5.0)
         killer = threading.Thread(target=kill, args=(out,))
         killer.start()
         assert main(["study", str(file), "--out", str(out), "--scheduler", dask.address]) == 1
         killer.join()
     told = capfd.readouterr()
-    assert "Traceback" not in told.err + told.out, told
+    assert "Traceback" not in told.err + told.out and "distributed" not in told.err, told
     (line,) = [line for line in told.err.splitlines() if line.startswith("pdeloop: ")]
     assert "no Dask scheduler answers at tcp://127.0.0.1:" in line
     assert f"trainings are kept in {out}, which `pdeloop study --out {out}` continues" in line
