@@ -284,9 +284,9 @@ class _Driver:
         try:
             while todo or waiting:
                 given = Counter(waiting.values())
-                for kind in self._environments.kinds(workers):
-                    room = workers.window(kind) - given[kind]
-                    for name in todo.taken(room, kind, self._environments.kind_of):
+                windows = {kind: workers.window(kind) for kind in self._environments.kinds(workers)}
+                for kind, window in windows.items():
+                    for name in todo.taken(window - given[kind], kind, self._environments.kind_of):
                         self._submit(workers, name, kind)
                         waiting[name] = kind
                 if todo and not waiting and not workers.grows:
@@ -294,10 +294,12 @@ class _Driver:
                 self._keep(ended)  # when the workers have something to do
                 ended.clear()
                 workers.settle()
-                idle = [name for name, kind in waiting.items() if not workers.window(kind)]
+                idle = [name for name, kind in waiting.items() if not windows.get(kind)]
                 if not waiting:
                     idle = todo.names[:1]
-                lacking = self._environments.lacking(idle[0]) if idle and workers.window("") else ""
+                lacking = (
+                    self._environments.lacking(idle[0]) if idle and any(windows.values()) else ""
+                )
                 self._tell(self.done, len(self._trainings), self._status(workers, lacking))
                 for name, future in workers.collect(POLL):
                     kind = waiting.pop(name)
