@@ -29,6 +29,8 @@ from pdeloop.study.results import Ended
 
 AHEAD = 2
 """Trainings for each worker that an executor has at a time, the running ones among them."""
+STILLBORN = 2
+"""Processes in a row, for each one that there may be, that may end before they can train."""
 UNKNOWN = 64
 """Workers of an executor that does not say how many it has."""
 
@@ -116,8 +118,10 @@ class Processes(Workers):
 
     def __init__(self, count: int) -> None:
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._begun: list[Future[int]] = [Future() for _ in self._pools]
         self._at: dict[str, int] = {}
         self._died: list[Death] = []
+        self._stillborn = 0
         self._waiting = {}
         here = training.environment()
         self.environments = {here["processor"]: here}
@@ -134,7 +138,7 @@ class Processes(Workers):
         if pool is None:
             context = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(1, context, _begin, (os.getpid(), None))
-            self._pools[place] = pool
+            self._pools[place], self._begun[place] = pool, pool.submit(os.getpid)
         self._at[name] = place
         try:
             future = pool.submit(task, *arguments)
@@ -151,13 +155,20 @@ class Processes(Workers):
             place = self._at.pop(name)
             if isinstance(future.exception(), BrokenExecutor):
                 self._pools[place] = None
-                self._died.append(Death(name, []))
+                begun = self._begun[place]
+                if begun.done() and begun.exception() is None:
+                    self._died.append(Death(name, []))
+                    self._stillborn = 0
+                else:
+                    self._stillborn += 1
                 future = lost()
             found.append((name, future))
         return found
 
     def deaths(self) -> list[Death]:
         found, self._died = self._died, []
+        if self._stillborn >= STILLBORN * len(self._pools):
+            raise BrokenExecutor("processes end when they start")
         return found
 
     def shutdown(self, *, wait: bool) -> None:

@@ -25,6 +25,7 @@ from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.status import status
 from pdeloop.study.training import Place, listening, train_one
 from tests.support import study_tasks
+from tests.support.interpreter import ROOT
 from tests.support.loop_harness import until
 from tests.support.small_study import CONTENT, LIMIT, contents, here
 
@@ -150,6 +151,26 @@ def test_a_workers_full_disk_ends_the_study_and_fails_no_training(tmp_path: Path
         run(study, out, partial(local_workers, 1), tasks=tasks)
     assert (status(out)["finished"], status(out)["failed"]) == (2, 0)
     assert run(study, out, here, tasks=dict.fromkeys(study.variants, study_tasks.result)) == []
+
+
+def test_processes_that_cannot_start_fail_no_training(tmp_path: Path):
+    """As where there is not enough memory for what they import."""
+    file, out = tmp_path / "study.yaml", tmp_path / "out"
+    file.write_text(json.dumps({**CONTENT, "variants": {"two-point": {}}}))
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, sys\nif 'spawn_main' in ' '.join(sys.orig_argv):\n    os._exit(7)\n"
+    )
+    words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    done = subprocess.run(
+        [*words, "--processes", "1"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "the workers ended 3 times before their trainings (processes end when" in done.stderr
+    assert (status(out)["failed"], status(out)["workers_lost"]) == (0, 0)
 
 
 def test_what_workers_finish_while_there_is_no_driver_is_taken_once(
