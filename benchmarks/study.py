@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -97,21 +98,26 @@ def overhead(problem: str, folder: Path, blocks: int) -> dict[str, Any]:
     """Seconds per training on one process of a study, against the same one in a bare loop here.
 
     Both take turns, block by block, so that what else the machine does meets both: the medians are of
-    pairs of the same training. Then the speed-up with two processes.
+    pairs of the same training. Processor seconds, of driver and process together, are those of a block,
+    and depend less on what else the machine does. Then the speed-up with two processes.
     """
     use_cores(usable_cores()[:1])  # as a process of a study does
     pairs: list[tuple[float, float]] = []
+    spent: list[tuple[float, float, float]] = []  # processor time: bare loop, driver, process
     with local_workers(1) as one:
         for block in range(blocks + 1):
             study = _study(problem, range(block * BLOCK, (block + 1) * BLOCK))
-            bare = []
+            bare, first = [], time.process_time()
             for values in study.trainings().values():
                 began = time.perf_counter()
                 train_one(values)
                 bare.append(time.perf_counter() - began)
+            second, before = time.process_time(), _of_children()
             at = _ends(study, folder / f"block{block}", lambda: contextlib.nullcontext(one))
+            own = time.process_time() - second
             if block:  # the first one compiles and loads
                 pairs += [*zip(bare[1:], map(sub, at[1:], at), strict=True)]
+                spent.append((second - first, own, _of_children() - before))
     rates = []
     for count in (1, 2):
         study = _study(problem, range(2 * BLOCK))
@@ -123,8 +129,21 @@ def overhead(problem: str, folder: Path, blocks: int) -> dict[str, Any]:
         "bare_seconds": median(bare for bare, _ in pairs),
         "study_seconds": median(own for _, own in pairs),
         "overhead_percent": 100 * (median(own / bare for bare, own in pairs) - 1),
+        "bare_processor_seconds": median(bare for bare, *_ in spent) / BLOCK,
+        "driver_processor_seconds": median(driver for _, driver, _ in spent) / BLOCK,
+        "processor_overhead_percent": 100
+        * (median((driver + process) / bare for bare, driver, process in spent) - 1),
         "speed_up_two": rates[1] / rates[0],
     }
+
+
+def _of_children() -> float:
+    """Processor seconds of the processes that this one has started."""
+    fields = [
+        Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()
+        for child in multiprocessing.active_children()
+    ]
+    return sum(int(own[11]) + int(own[12]) for own in fields) / os.sysconf("SC_CLK_TCK")
 
 
 def _ends(study: Study, folder: Path, pool: Pool) -> list[float]:
