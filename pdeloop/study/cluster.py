@@ -14,6 +14,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future
 from importlib import metadata
+from itertools import chain
 from typing import Any
 from uuid import uuid4
 
@@ -38,6 +39,8 @@ ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
 """Events of workers, in a topic of the study's, and of the scheduler."""
 PACE = 0.1
 """Seconds in which results gather; meanwhile workers begin with what waits there."""
+SETTLED, LOOK_PERIOD = 1.0, 30.0
+"""Seconds after which the scheduler has what was submitted, and between two looks at what it has."""
 TELL_PERIOD = 0.1
 """Seconds between two events of a training, at least."""
 
@@ -64,7 +67,10 @@ class Cluster(Workers):
         self._waiting = {}
         self._at: dict[str, Any] = {}
         self._kind_of: dict[str, str] = {}
+        self._since: dict[str, float] = {}
         self._again: set[str] = set()
+        self._look_at = 0.0
+        self._there: set[str] = set()
         for at, environment in environments.items():
             self._meet(at, environment)
         self._datasets: dict[str, str] = {}
@@ -87,7 +93,7 @@ class Cluster(Workers):
                 self._client.subscribe_topic(topic, hear)
             mine = f"pdeloop/{study}/"
             self._left = {n for n in map(str, self._client.list_datasets()) if n.startswith(mine)}
-            present = self._client.nthreads()
+            present, self._there = self._client.nthreads(), self._with_a_worker()
         self._kinds = {at: kind for at, kind in self._kinds.items() if at in present}
         came = [{"action": "add-worker", "worker": at} for at in present if at not in self._kinds]
         self._events.extend(came)
@@ -109,10 +115,11 @@ class Cluster(Workers):
         resource = resource_of(self.environments[kind]) if kind else ANY
         dataset = f"pdeloop/{self._study}/{identity}/{resource}/{name}"
         with _of_the_scheduler():
+            future = None
             if dataset in self._left:  # of a driver that has died
                 self._left.discard(dataset)
                 future = self._client.get_dataset(dataset)
-            else:
+            if future is None or future.key not in self._there:
                 future = self._client.submit(
                     on_worker,
                     self._topic,
@@ -125,7 +132,7 @@ class Cluster(Workers):
                 self._new[dataset] = future
         own: Future[Ended] = Future()
         self._waiting[own], self._at[name], self._datasets[name] = name, future, dataset
-        self._kind_of[name] = kind
+        self._kind_of[name], self._since[name] = kind, time.monotonic()
         self._client.loop.add_callback(self._pass_on, future, own)
 
     def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
@@ -156,6 +163,7 @@ class Cluster(Workers):
                 case "met" if worker in self._strangers:  # and has not gone since
                     if "environment" in event:
                         del self._strangers[worker]
+                        self._look_at = min(self._look_at, time.monotonic() + SETTLED)
                         self._meet(worker, event["environment"])
                     else:
                         self._strangers[worker] = event["why"]
@@ -169,6 +177,8 @@ class Cluster(Workers):
                         if name in self._at:
                             rows = [*self._progress.get(name, ())]
                             found.append(Death(name, rows, bool(event.get("expected"))))
+        if time.monotonic() > self._look_at:
+            self._revive()
         return found
 
     def settle(self) -> None:
@@ -222,14 +232,29 @@ class Cluster(Workers):
             kind = f"{kind} at {at}"
         kind = same[0] if same else kind
         self.environments = {**self.environments, kind: environment}
-        if kind not in self._kinds.values():
-            # The scheduler looks for a worker of it only when one comes, which had no resource then.
-            for own, name in self._waiting.items():
-                if not own.done() and (self._kind_of[name] == kind or not self._kinds):
-                    self._again.add(name)
-                    with _of_the_scheduler():
-                        self._at[name].cancel()
         self._kinds[at] = kind
+
+    def _with_a_worker(self) -> set[str]:
+        """The keys of what a worker has, or has the result of."""
+        results = {key for key, workers in self._client.who_has().items() if workers}
+        return {*chain(*self._client.processing().values()), *results}
+
+    def _revive(self) -> None:
+        """Have those submitted again that have no worker, though there is one for them.
+
+        The scheduler looks for one only when it comes, and then it has no resource yet.
+        """
+        now = time.monotonic()
+        self._look_at = now + LOOK_PERIOD
+        with _of_the_scheduler():
+            there = self._with_a_worker()
+            for own, name in self._waiting.items():
+                future, settled = self._at[name], now > self._since[name] + SETTLED
+                if future.key in there or own.done() or not settled:
+                    continue
+                if self.window(self._kind_of[name]):
+                    self._again.add(name)
+                    future.cancel()
 
     @property
     def _topic(self) -> str:
@@ -240,7 +265,7 @@ class Cluster(Workers):
         dataset = self._datasets.pop(name)
         if self._new.pop(dataset, None) is None:
             self._old.append(dataset)
-        del self._at[name], self._kind_of[name]
+        del self._at[name], self._kind_of[name], self._since[name]
         self._again.discard(name)
         self._progress.pop(name, None)
 

@@ -155,6 +155,23 @@ def test_a_driver_that_dies_loses_nothing_and_what_was_finished_is_not_done_agai
 
 
 @pytest.mark.filterwarnings("default")
+def test_what_a_driver_has_left_goes_on_where_its_workers_were_replaced_meanwhile(tmp_path: Path):
+    notes, out = tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    with dask_cluster(tmp_path / "dask", 1) as dask:
+        words = [sys.executable, "-c", DRIVER, dask.address, str(out), str(notes)]
+        first = subprocess.Popen(words, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        until(lambda: len(runs_in(notes)) > 2, LIMIT, "third task")
+        first.kill()
+        first.wait()
+        dask.workers[0].kill()
+        dask.start_worker()
+        tasks = {"noted": partial(study_tasks.noted, str(notes), 0.1)}
+        assert run(read_study(out), out, partial(cluster, dask.address), tasks=tasks) == []
+    assert len(runs_in(notes)) == 6 and status(out)["finished"] == 6
+
+
+@pytest.mark.filterwarnings("default")
 def test_what_kills_its_worker_or_raises_is_told_from_what_a_dying_worker_loses(tmp_path: Path):
     names = ("killing", "raising", "unsendable", "exiting", "noted")
     study = Study.of({**CONTENT, "seeds": 1, "variants": {name: {} for name in names}})
