@@ -20,7 +20,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajectory
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
+from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive, around
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.calls import action, updated
@@ -128,6 +128,14 @@ def test_theta_holds_which_law_a_plan_deviates_from() -> None:
     found = own.planner(own.parts(theta(own, regulated=True)))
     assert found.regulated and not own.planner(own.parts(theta(own))).regulated
     assert own.plans(theta(own, regulated=True)) and found.regulator is not None
+
+
+def test_plans_are_tried_around_the_law_of_the_whole_state_where_the_target_has_one() -> None:
+    own = law()
+    plain = own.planner(own.parts(theta(own)))
+    assert [way.regulated for way in around(plain)] == [False, True]
+    (alone,) = around(replace(plain, terminal=False))
+    assert not alone.regulated
 
 
 def test_its_memory_is_a_function_of_the_states_of_the_episode() -> None:

@@ -10,9 +10,9 @@ better by more than chance (`verdict`).
 
 The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
 the affine law but the last, the best inputs for an episode are searched on the model from several
-starts. If they save more than 3 % of the cost of the affine law, also once that is improved as far as
-at the last update, the last rollouts are kept; else they are the affine law's, which is then that of
-`law: affine` to the bit.
+starts, around both laws. If they save more than 3 % of the cost of the affine law, also once that is
+improved as far as at the last update, the last rollouts are kept; else they are the affine law's, which
+is then that of `law: affine` to the bit.
 """
 
 from __future__ import annotations
@@ -191,8 +191,10 @@ class ModelBasedPredictive(Optimizer):
             return
         fields, before = self._simulated(belief, self._affine.policy)
         horizon = self._context.horizon
-        planner = replace(self._plain(belief, self._affine.policy, fields), steps=horizon)
-        least = np.minimum(planner.begin(planner.after(fields))[1] / horizon, before)
+        plain = replace(self._plain(belief, self._affine.policy, fields), steps=horizon)
+        least = before
+        for way in around(plain):
+            least = np.minimum(way.begin(way.after(fields))[1] / horizon, least)
         self._share = share_saved(least, before)
         if self._share > self._law.worth and not self._affine.done:  # is that of affine laws, too?
             _, before = self._simulated(belief, self._affine.last_law())
@@ -300,7 +302,7 @@ class ModelBasedPredictive(Optimizer):
         tried: list[tuple[float, Planner, Array]] = []
         for steps in lengths:
             first = not tried
-            ways = self._ways(plain) if first else [tried[-1][1]]
+            ways = [*around(plain), replace(plain, around=False)] if first else [tried[-1][1]]
             for way in ways:
                 planner = replace(way, steps=steps)
                 costs = self._costs(belief, policy, planner, fields)
@@ -309,12 +311,6 @@ class ModelBasedPredictive(Optimizer):
                 tried = [min(tried, key=lambda each: each[0])]
         most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
         return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
-
-    @staticmethod
-    def _ways(plain: Planner) -> list[Planner]:
-        """Plans around the trained law, of actions alone, and around the law of the whole state."""
-        ways = [plain, replace(plain, around=False)]
-        return ways + [replace(plain, regulated=True)] * (plain.regulator is not None)
 
     def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
         """Costs of plans from initial fields on the model."""
@@ -415,6 +411,11 @@ class ModelBasedPredictive(Optimizer):
         if (plans or stage == _JUDGING) and self._candidate is None:
             raise ValueError("it has no law that plans")
         self._chosen = self._candidate.theta if plans and self._candidate else None
+
+
+def around(plain: Planner) -> list[Planner]:
+    """Plans around the trained law, and around that of the whole state where the target has one."""
+    return [plain, *([replace(plain, regulated=True)] if plain.regulator else [])]
 
 
 def share_saved(costs: Array, before: Array) -> float:
