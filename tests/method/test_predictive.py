@@ -19,8 +19,13 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive, around
+from pdeloop.method.adapt.model_based_predictive import (
+    ModelBasedPredictive,
+    around,
+    simulated,
+)
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.calls import action, updated
@@ -28,6 +33,7 @@ from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto
 from pdeloop.method.models.files import LARGEST, packed, unpacked
 from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.models.spectral import SpectralModel
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
 from tuner_node.narration import closing_lines
 
@@ -359,6 +365,30 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
     assert sum("could_save" in row for row in rows) == (kind is Eager)
     assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
+
+
+@pytest.mark.parametrize(("effect", "closed"), [(1e-3, False), (1.0, True)])
+def test_plans_are_closed_by_a_cost_to_go_where_that_is_cheaper_on_the_model(
+    effect: float, closed: bool
+) -> None:
+    """A wave that grows to a bound: where inputs hardly move it, the linear problem costs far more."""
+    x, k = 2 * np.pi * np.arange(N_Z) / N_Z, np.arange(N_Z // 2 + 1)
+    growth = np.where(k == 1, 0.3, -1.0) + 0j
+    B = effect * np.stack([np.cos(x), np.sin(x)], axis=1)
+    cubes = np.array([[0.0, -1.0]])
+    model = SpectralModel("poly3", growth, np.ones((1, len(k))) + 0j, cubes, B, np.zeros(N_Z), 4)
+    own = optimizer()
+    bounds = ActionSet(N_A, -1.0, 1.0)
+    own._context = replace(own._context, target=np.zeros(N_Z), action_set=bounds)
+    fields = 0.5 * np.stack([np.cos(x), np.sin(x)])
+    chosen, costs = own._planner(Belief(model, 0.0, 1), own._affine.policy, fields)
+    assert chosen.terminal == closed
+    ways = [
+        simulated(replace(chosen, around=around, terminal=terminal), fields).sum()
+        for around in (True, False)
+        for terminal in (True, False)
+    ]
+    assert costs.sum() <= 1.02 * min(ways) < max(ways)
 
 
 def test_without_a_model_the_affine_law_stays_and_says_why() -> None:

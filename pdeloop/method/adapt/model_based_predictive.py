@@ -4,9 +4,10 @@
 The affine law is trained as ever. On the last model that predicts the rollouts, plans of 20, 40 and 80
 steps are simulated in closed loop from a few measured initial fields, as actions, as deviations from
 the affine law, or from the linear-quadratic one of the whole state at the target, whichever is cheaper
-there; the shortest within 2 % of the cheapest is taken. The last
-rollouts are of the law with that plan, from fresh fields. It replaces the affine law only if it is
-better by more than chance (`verdict`).
+there; the shortest within 2 % of the cheapest is taken. They are closed by the cost to go at the target
+unless plans without it are 2 % cheaper: it is that of the linear problem, and far too high where
+bounded actuators can do little near the target. The last rollouts are of the law with that plan, from
+fresh fields. It replaces the affine law only if it is better by more than chance (`verdict`).
 
 The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
 the affine law but the last, the best inputs for an episode are searched on the model from several
@@ -52,7 +53,7 @@ from pdeloop.process.one_thread import one_thread
 LENGTHS = (20, 40, 80)
 """Steps H of the plans that are tried."""
 SHORTER = 0.02
-"""Share of the cost that a plan of half the steps may be worse."""
+"""Share of the cost that a plan of half the steps, or one with a cost to go, may be worse."""
 FEW = 4
 """Measured initial fields from which plans are simulated."""
 RESTS = 0.01
@@ -300,15 +301,20 @@ class ModelBasedPredictive(Optimizer):
         if settings.steps:
             lengths = [settings.steps]
         tried: list[tuple[float, Planner, Array]] = []
+
+        def worth(each: tuple[float, Planner, Array]) -> float:
+            """Without a cost to go, which keeps a plant at its target, plans have to be cheaper."""
+            return each[0] * (1.0 + SHORTER * (each[1].terminal != plain.terminal))
+
         for steps in lengths:
             first = not tried
-            ways = [*around(plain), replace(plain, around=False)] if first else [tried[-1][1]]
+            ways = ways_of(plain) if first else [tried[-1][1]]
             for way in ways:
                 planner = replace(way, steps=steps)
                 costs = self._costs(belief, policy, planner, fields)
                 tried.append((float(np.sum(costs)), planner, costs))
             if first:
-                tried = [min(tried, key=lambda each: each[0])]
+                tried = [min(tried, key=worth)]
         most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
         return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
 
@@ -416,6 +422,13 @@ class ModelBasedPredictive(Optimizer):
 def around(plain: Planner) -> list[Planner]:
     """Plans around the trained law, and around that of the whole state where the target has one."""
     return [plain, *([replace(plain, regulated=True)] if plain.regulator else [])]
+
+
+def ways_of(plain: Planner) -> list[Planner]:
+    """Plans around laws and of actions alone, the trained law's and these without a cost to go as well."""
+    ways = [*around(plain), replace(plain, around=False)]
+    without = [replace(way, terminal=False) for way in (plain, ways[-1]) if way.terminal]
+    return ways + without
 
 
 def share_saved(costs: Array, before: Array) -> float:
