@@ -15,6 +15,7 @@ from benchmarks.tasks import (
     falling_film,
     kuramoto_sivashinsky,
     kuramoto_sivashinsky_four,
+    kuramoto_sivashinsky_sensors,
     lid,
 )
 from benchmarks.tasks.common import Row
@@ -26,6 +27,7 @@ Name: TypeAlias = Literal[
     "transport",
     "lid",
     "kuramoto-sivashinsky-eight",
+    "kuramoto-sivashinsky-sensors",
     "kuramoto-sivashinsky-four",
     "film",
     "convection",
@@ -46,6 +48,9 @@ TASKS: dict[str, Task] = {
     "transport": Task(boundary.transport, "PDEControlGym, notebook", 5),
     "lid": Task(lid.rows, "PDEControlGym, NavierStokes", 3),
     "kuramoto-sivashinsky-eight": Task(kuramoto_sivashinsky.rows, "DA-RL, whole field", 30),
+    "kuramoto-sivashinsky-sensors": Task(
+        kuramoto_sivashinsky_sensors.rows, "DA-RL, few sensors", 30
+    ),
     "kuramoto-sivashinsky-four": Task(kuramoto_sivashinsky_four.rows, "Werner and Peitz", 30),
     "film": Task(falling_film.rows, "beacon, shkadov-v0", 2),
     "convection": Task(convection.rows, "beacon, rayleigh-v0", 12),

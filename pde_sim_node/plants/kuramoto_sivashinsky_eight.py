@@ -3,7 +3,7 @@
 
     u_t + u u_x + u_xx + u_xxxx = sum_j a_j b_j(x),    L = 2 pi / sqrt(0.08) = 22.21
 
-with b_j periodic Gaussians of peak 1 and standard deviation 0.1 L / 2 pi at j L / n_a. Rest is
+with b_j periodic Gaussians of peak 1 and standard deviation 0.1 L / 2 pi, L / n_a apart. Rest is
 unstable; an episode begins on the attractor, which small random fields reach without control.
 
 Pseudo-spectral without dealiasing, in three substeps of dt/3, dt/2 and dt from the beginning of a
@@ -45,11 +45,15 @@ class KuramotoSivashinskyEight(Dynamics):
     action_cost
         R; Q is 1 / points.
     steps
-        T, each of 0.05.
+        T.
+    sample_time
+        Of a step, in which an action is held.
     substeps
         Time steps in an action.
     burn_in
         Actions of zero from a small random field to the beginning of an episode.
+    first
+        Position of the first actuator as a share of L.
 
     Raises
     ------
@@ -57,7 +61,7 @@ class KuramotoSivashinskyEight(Dynamics):
         A value is out of its range; the message names it.
     """
 
-    sample_time, batched = 0.05, True
+    batched = True
     grid: Grid
 
     def __init__(
@@ -68,8 +72,10 @@ class KuramotoSivashinskyEight(Dynamics):
         bound: float = 1.0,
         action_cost: float = 0.03,
         steps: int = 1000,
+        sample_time: float = 0.05,
         substeps: int = 1,
         burn_in: int = 1000,
+        first: float = 0.0,
     ) -> None:
         n, self.n_a = whole("points", points, 8), whole("actuators", actuators, 1)
         if n % 2:
@@ -81,8 +87,11 @@ class KuramotoSivashinskyEight(Dynamics):
         self.state_weight, self.action_weight = 1.0 / n, positive("action_cost", action_cost)
         self.horizon, self.substeps = whole("steps", steps, 1), whole("substeps", substeps, 1)
         self.burn_in = whole("burn_in", burn_in, 0)
+        self.sample_time = positive("sample_time", sample_time)
+        if not math.isfinite(first):
+            raise ValueError(f"first must be a finite number, got {first!r}")
         x = self.grid.axes[0].points
-        far = np.abs(x[:, None] - length * np.arange(self.n_a) / self.n_a)
+        far = (x[:, None] - length * (np.arange(self.n_a) / self.n_a + first)) % length
         far = np.minimum(far, length - far)
         self.supports = np.exp(-0.5 * (far / (0.1 * length / (2 * math.pi))) ** 2)
         self._shapes = np.fft.rfft(self.supports, axis=0).T

@@ -10,6 +10,7 @@ from benchmarks.__main__ import parser
 from benchmarks.backstepping import source_reaction_gain, source_transport_gain
 from benchmarks.published import TASKS, Name, run, text
 from benchmarks.tasks import boundary
+from benchmarks.tasks import kuramoto_sivashinsky_sensors as sensors
 from benchmarks.tasks.common import first_law
 
 
@@ -40,6 +41,28 @@ def test_laws_of_one_rollout_are_those_of_the_exact_plant_and_no_inputs_return_m
     for found, better, c in ((near, best_near, 1.0), (far, best_far, 10.0)):
         limit = boundary.most(known, c)
         assert found < better <= limit and limit - better < 0.05, (found, better, limit)
+
+
+def test_the_ensemble_filter_of_many_members_is_the_kalman_filter() -> None:
+    rng, places = np.random.default_rng(0), np.array([0, 2])
+    root = rng.standard_normal((3, 3))
+    members = rng.standard_normal((2, 40_000, 3)) @ root.T
+    reading, deviation = np.array([[1.0, -0.5], [0.3, 2.0]]), np.array([0.5, 1.0])
+    found = sensors.analysed(members, places, reading, deviation, rng)
+    P = root @ root.T
+    for own, y, sd in zip(found, reading, deviation, strict=True):
+        gain = P[:, places] @ np.linalg.inv(P[np.ix_(places, places)] + sd**2 * np.eye(2))
+        assert np.allclose(own.mean(axis=0), gain @ y, atol=0.05)
+        spread = sensors.INFLATION**2 * (P - gain @ P[places])
+        assert np.allclose(np.cov(own.T), spread, atol=0.05)
+
+
+def test_before_the_first_reading_the_plant_is_left_alone_for_a_quarter_of_an_episode() -> None:
+    """So that members drawn around one state are as far apart as any, but no farther."""
+    drawn = sensors.starts(sensors.KuramotoSivashinskyEight(burn_in=400), 3)
+    assert drawn.shape == (20, 3, 64)
+    apart, size = np.std(drawn - drawn[:, :1], axis=(0, 2))[1:], np.std(drawn)
+    assert 0.9 < size < 1.4 and (apart < 2.0 * size).all() and (apart > 0.05 * size).all()
 
 
 def test_tasks_are_listed_with_their_sources_and_unknown_ones_are_refused(

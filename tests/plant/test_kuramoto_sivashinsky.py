@@ -102,6 +102,21 @@ def test_starts_are_on_the_attractor_and_batches_change_nothing() -> None:
         assert np.array_equal(plant.step(starts[m : m + 1], a[m : m + 1])[0], both[m])
 
 
+def test_an_action_may_be_held_over_several_time_steps_and_actuators_may_begin_elsewhere() -> None:
+    plant, held = (
+        KuramotoSivashinskyEight(first=1 / 16),
+        KuramotoSivashinskyEight(first=1 / 16, sample_time=0.5, substeps=10),
+    )
+    rng = np.random.default_rng(0)
+    z, a = rng.standard_normal((1, 64)), rng.uniform(-1.0, 1.0, (1, 8))
+    after = held.step(z, a)
+    for _ in range(10):
+        z = plant.step(z, a)
+    assert np.array_equal(z, after)
+    usual = KuramotoSivashinskyEight().supports
+    assert np.allclose(plant.supports, np.roll(usual, 4, axis=0), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("kind", "arguments", "words"),
     [
@@ -111,6 +126,8 @@ def test_starts_are_on_the_attractor_and_batches_change_nothing() -> None:
             {"viscosity": math.nan},
             "viscosity must be positive and finite",
         ),
+        (KuramotoSivashinskyEight, {"sample_time": 0.0}, "sample_time must be positive and finite"),
+        (KuramotoSivashinskyEight, {"first": math.nan}, "first must be a finite number, got nan"),
         (KuramotoSivashinskyFour, {"points": 8}, "points must be at least 16, got 8"),
         (KuramotoSivashinskyFour, {"bound": -1.0}, "bound must be positive and finite, got -1.0"),
     ],
