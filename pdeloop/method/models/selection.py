@@ -198,12 +198,11 @@ class Selection:
         """A model that predicts pieces of rollouts of a chaotic plant."""
         most = min(self.most, whole.error / CHAOTIC_GROWTH)
         parts = [part for rollout in rollouts for part in pieces(rollout, PIECES)]
-        # What it was fitted to is predicted better than what it was not, and takes no other fit.
+        # Of whole rollouts that none predicts the best kind is so by accident: any may predict pieces.
         worst = self.settings.worst
         known = errors(whole.model, parts, self.target, worst, self.noise, self.weights)
-        if not (len(known) and known.mean() <= most):
-            return None
-        found = self._selected(self.fit(parts, scale, whole.model.kind), parts)
+        kind = whole.model.kind if len(known) and known.mean() <= most else ""
+        found = self._selected(self.fit(parts, scale, kind), parts)
         return replace(found, whole=False) if found and found.error <= most else None
 
     def _near(self, rollouts: list[Measured], scale: Scale, *, linear: bool) -> Selected | None:
