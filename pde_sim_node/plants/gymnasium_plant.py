@@ -42,6 +42,7 @@ def from_gymnasium(
     target: Numbers | None = None,
     state_weight: Numbers = 1.0,
     action_weight: Numbers = 1.0,
+    action_rate: Numbers | None = None,
     horizon: int = 0,
     sample_time: float = 1.0,
     divergence_bound: float = 1e6,
@@ -65,6 +66,9 @@ def from_gymnasium(
         q: of all, of each number, or by key (0 for keys that are left out).
     action_weight : number, (n_a,) or mapping
         r: the same, with 1 for keys that are left out.
+    action_rate : number, (n_a,) or mapping, optional
+        Largest change of each action in a step, which a space does not tell: the same, without a limit
+        for keys that are left out.
     horizon
         Steps of an episode; 0: the limit in the environment's specification, or of its TimeLimit.
     sample_time
@@ -113,6 +117,7 @@ def from_gymnasium(
         sample_time=sample_time,
         state_weight=state_weight,
         action_weight=action_weight,
+        action_rate=action_rate,
         divergence_bound=divergence_bound,
         termination=termination,
     )
@@ -128,6 +133,7 @@ class GymnasiumPlant(BatchPlant):
         env: Env[Any, Any],
         *,
         target: Numbers | None,
+        action_rate: Numbers | None,
         termination: str | None,
         **settings: Any,
     ) -> None:
@@ -152,7 +158,9 @@ class GymnasiumPlant(BatchPlant):
         self._envs: list[Env[Any, Any]] = []
         self.termination, self._said = termination, False
         super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, cost=cost, **settings)
-        self.action_set = ActionSet(n_a, self._acted.low, self._acted.high)
+        rate = np.inf if action_rate is None else action_rate
+        limits = self._acted.by_name("action_rate", rate, np.inf)
+        self.action_set = ActionSet(n_a, self._acted.low, self._acted.high, rate=limits)
 
     def __repr__(self) -> str:
         return (
@@ -169,6 +177,8 @@ class GymnasiumPlant(BatchPlant):
         values["target"] = self.target.tolist() if self.quadratic else None
         if not self.cost.plain:
             values["cost"] = self.cost.texts
+        if self.action_set.rated:
+            values["action_rate"] = self.action_set.rate.tolist()
         if self.termination is not None:
             values["termination"] = self.termination
         values["environment"] = (
@@ -208,7 +218,8 @@ class GymnasiumPlant(BatchPlant):
         observation, _ = self._returned("reset", own, names="observation, info")
         state = self._numbers("reset", observation)
         if not np.isfinite(state).all():
-            raise OwnCodeError(f"{self._first}.reset returned NaN or infinity")
+            where = self._observed.infinite(state)
+            raise OwnCodeError(f"{self._first}.reset returned NaN or infinity{where}")
         return state
 
     def _returned(

@@ -51,6 +51,15 @@ class Boxes:
         """The inverse of `vector`, in the types of the space."""
         return self._filled(self._space, iter(np.split(numbers, np.cumsum(self._sizes)[:-1])))
 
+    def infinite(self, numbers: Array) -> str:
+        """Words on the named parts that are not finite; empty if there are no names."""
+        parts = np.split(numbers, np.cumsum(self._sizes)[:-1])
+        pairs = zip(self.names, parts, strict=True)
+        found = [name for name, part in pairs if name and not np.isfinite(part).all()]
+        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+        left_out = "; a wrapper, such as gymnasium.wrappers.TransformObservation, leaves parts out"
+        return f" in {', '.join(found[:3])}{more}{left_out}" if found else ""
+
     def by_name(self, name: str, given: Any, otherwise: float) -> Array | float:
         """Numbers (size,) of a mapping from names to numbers, or what is given if it is none.
 

@@ -291,6 +291,38 @@ def test_spaces_of_names_and_tuples_are_one_vector_with_targets_and_weights_by_k
     assert run.costs["lqt"].mean() < run.costs["none"].mean()
 
 
+def test_rate_limits_go_by_key() -> None:
+    plant = pdeloop.from_gymnasium(
+        Tanks(), target={"levels": 0.0}, action_rate={"valve": 0.25}, horizon=5
+    )
+    free = pdeloop.from_gymnasium(Tanks(), target={"levels": 0.0}, horizon=5)
+    assert plant.action_set.rate.tolist() == [np.inf, 0.25] and not free.action_set.rated
+    assert plant.definition.fingerprint != free.definition.fingerprint
+    levels = plant.reset([0])[0, :2].copy()
+    for valve in (0.25, 0.5, 0.75, 1.0, 1.0):
+        levels = 0.9 * levels + [valve, 2.0]
+        assert np.allclose(plant.step(np.array([[2.0, 9.0]]))[0, :2], levels, rtol=1e-14)
+    with pytest.raises(
+        ValueError, match=r"action_rate has the key 'pump'; the action has heater, "
+    ):
+        pdeloop.from_gymnasium(Tanks(), action_rate={"pump": 1.0}, horizon=5)
+    with pytest.raises(ValueError, match="action_rate must be positive"):
+        pdeloop.from_gymnasium(Tanks(), action_rate=0.0, horizon=5)
+
+
+class Unknown(Tanks):
+    """Its second reading is infinite."""
+
+    def _observation(self) -> dict[str, Any]:
+        return {"levels": self.levels, "readings": (self.levels[:1], np.full((1, 1), np.inf))}
+
+
+def test_an_infinite_part_of_an_observation_is_named() -> None:
+    plant = pdeloop.from_gymnasium(Unknown(), target={"levels": 0.0}, horizon=5)
+    with pytest.raises(OwnCodeError, match=r"returned NaN or infinity in readings\.1; a wrapper"):
+        plant.reset([0])
+
+
 def test_parts_of_a_space_that_do_not_fit_are_named() -> None:
     with pytest.raises(ValueError, match=r"the part 'mode' of the observation space must be a Box"):
         pdeloop.from_gymnasium(Tanks(mode=True), horizon=5)
