@@ -11,12 +11,15 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
 
 from benchmarks.estimators import Experiment, Identified, KalmanLaw, LikeliestField
+from benchmarks.nonlinear_models import inferred, tracking
+from benchmarks.nonlinear_models import sparse as sparse_model
 from benchmarks.warm_start import warm_start
 from controller_node.identification import identify
 from controller_node.policy import excitation
@@ -258,19 +261,22 @@ class Predictive:
         return self._plan[:, : self._n_a].copy()
 
 
-def identified_again(
-    values: Values, controller: Callable[[Plant, Identified], Law], whole: bool = False
+def refitted(
+    values: Values,
+    design: Callable[[Plant, list[Experiment]], Law],
+    *,
+    whole: bool = False,
+    back: bool = False,
 ) -> tuple[LocalPair, Law, int]:
-    """A controller designed for a model from all rollouts of the budget.
+    """A controller designed from all rollouts of the budget.
 
     The first rollout is an exploration, the others are the controller's own, excited in the same way.
-    The model is identified again whenever the data have doubled; with `whole` from the fields
-    themselves, whatever is measured of them.
+    It is designed again whenever the data have doubled; with `whole` from the fields themselves,
+    whatever is measured of them, and with `back` from another exploration where a controller's
+    rollouts all diverged.
     """
     pair = LocalPair(values)
-    plant, weights = pair.plant, {name: values[name] for name in ("state_weight", "action_weight")}
-    target = build_plant({**values, "sensors": 0}).target if whole else plant.target
-    admissible = ActionSet.of(values)
+    plant, admissible = pair.plant, ActionSet.of(values)
     variance = values["exploration_variance"] or admissible.exploration_variance
     data: list[Experiment] = []
     law: Law | None = None
@@ -290,17 +296,30 @@ def identified_again(
         episode = rollout(plant, excited, fields)
         paid += count
         states = episode.fields if whole else episode.states
+        ended = np.flatnonzero(episode.costs.diverged_step < 0)
         data += [
-            Experiment(states[:, m], episode.actions[:, m], episode.states[:, m])
-            for m in np.flatnonzero(episode.costs.diverged_step < 0)
+            Experiment(states[:, m], episode.actions[:, m], episode.states[:, m]) for m in ended
         ]
+        law = None if back and not ended.size and paid < values["rollouts"] else design(plant, data)
+    assert law is not None
+    return pair, law, paid
+
+
+def identified_again(
+    values: Values, controller: Callable[[Plant, Identified], Law], whole: bool = False
+) -> tuple[LocalPair, Law, int]:
+    """A controller designed for a linear model from all rollouts of the budget, as `refitted`."""
+    weights = {name: values[name] for name in ("state_weight", "action_weight")}
+
+    def design(plant: Plant, data: list[Experiment]) -> Law:
         model = identify(
             [each[:2] for each in data], method="regression", n_s=values["reduced_order"]
         )
+        target = build_plant({**values, "sensors": 0}).target if whole else plant.target
         known = Identified(model, lqt.track(model, **weights), model.U.T @ target, data)
-        law = controller(plant, known)
-    assert law is not None
-    return pair, law, paid
+        return controller(plant, known)
+
+    return refitted(values, design, whole=whole)
 
 
 def lqt_again(values: Values) -> tuple[LocalPair, Law, int]:
@@ -345,6 +364,24 @@ def true_model(values: Values, *, candidates: int) -> tuple[LocalPair, Law, int]
     return sensed, LikeliestField(sensed.plant, true, law, seeds), int(training.budget.paid[0])
 
 
+def opinf(values: Values, *, operators: str, regularizer: float) -> tuple[LocalPair, Law, int]:
+    """LQ tracking on `benchmarks.nonlinear_models.inferred` from all rollouts of the budget."""
+
+    def design(plant: Plant, data: list[Experiment]) -> Law:
+        return tracking(plant, values, data, partial(inferred, operators, regularizer))
+
+    return refitted(values, design, back=True)
+
+
+def sindy(values: Values, *, degree: int, threshold: float) -> tuple[LocalPair, Law, int]:
+    """LQ tracking on `benchmarks.nonlinear_models.sparse` from all rollouts of the budget."""
+
+    def design(plant: Plant, data: list[Experiment]) -> Law:
+        return tracking(plant, values, data, partial(sparse_model, degree, threshold))
+
+    return refitted(values, design, back=True)
+
+
 def ppo(values: Values, **constants: Any) -> tuple[LocalPair, Law, int]:
     """Proximal policy optimisation, as `benchmarks.reinforcement` has it."""
     from benchmarks.reinforcement import learn
@@ -359,6 +396,13 @@ def sac(values: Values, **constants: Any) -> tuple[LocalPair, Law, int]:
     return learn(values, "sac", **constants)
 
 
+def crossq(values: Values, **constants: Any) -> tuple[LocalPair, Law, int]:
+    """CrossQ of sbx, as `benchmarks.reinforcement` has it."""
+    from benchmarks.reinforcement import learn
+
+    return learn(values, "crossq", **constants)
+
+
 METHODS: dict[str, Method] = {
     "no-control": no_control,
     "lqt": lqt_law,
@@ -366,16 +410,22 @@ METHODS: dict[str, Method] = {
     "mpc": mpc,
     "cma-es": cma_es,
     "dfo-ls": dfo_ls,
+    "opinf": opinf,
+    "sindy": sindy,
     "lqg": lqg,
     "true-model": true_model,
     "ppo": ppo,
     "sac": sac,
+    "crossq": crossq,
 }
 LIBRARIES = {
     "mpc": ("osqp", "bench"),
     "cma-es": ("cmaes", "bench"),
     "dfo-ls": ("dfols", "rivals"),
+    "opinf": ("opinf", "rivals"),
+    "sindy": ("pysindy", "rivals"),
     "ppo": ("stable_baselines3", "rl"),
     "sac": ("stable_baselines3", "rl"),
+    "crossq": ("sbx", "rivals,rl"),
 }
 """Modules that a method needs besides the project's dependencies, and the extra that has them."""

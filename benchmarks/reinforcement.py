@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""PPO and SAC of stable-baselines3, for `python -m benchmarks baselines`.
+"""PPO and SAC of stable-baselines3 and CrossQ of sbx, for `python -m benchmarks baselines`.
 
 An agent learns on `VecEnvironment`, in episodes that begin with fields of the training's seed. They
 are paid for like any rollout, as are the exploration and the check if it is told what they found. The
@@ -25,6 +25,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import set_num_threads
 
@@ -110,6 +111,15 @@ class Episodes(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped w
         return self._signals.observe(states), self._factor * rewards, dones, infos
 
 
+def off_policy(algorithm: str) -> Any:
+    """The class of "sac" or "crossq"."""
+    if algorithm == "sac":
+        return SAC
+    from sbx import CrossQ  # sb3-contrib has it too; this one takes a third of its processor time
+
+    return CrossQ
+
+
 def learn(
     values: Mapping[str, Any],
     algorithm: str,
@@ -129,7 +139,7 @@ def learn(
     values
         Resolved parameters.
     algorithm
-        "ppo" or "sac".
+        "ppo", "sac" or "crossq".
     agent, reach, reward
         As above.
     environments
@@ -160,8 +170,9 @@ def learn(
                 **own,
             )
             if algorithm == "ppo"
-            else SAC(**own)
+            else off_policy(algorithm)(**own)
         )
+    made.set_logger(Logger(None, []))  # else each call of `learn` makes a folder
     told.seed(training_field(values, 0))
     while signals.paid + told.ended + update <= values["rollouts"]:
         made.learn(horizon * update, reset_num_timesteps=False)

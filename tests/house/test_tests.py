@@ -61,7 +61,11 @@ SKIPS = {
     "tests/tools/test_logs.py": ["{name} is not installed: extra logs"],
     "tests/tools/test_warm_start.py": ["stable-baselines3 is not installed: extra rl"],
     "tests/tools/test_stable_baselines.py": ["stable-baselines3 is not installed: extra rl"],
-    "tests/benchmarks/test_baselines.py": ["stable-baselines3 is not installed: extra rl"],
+    "tests/benchmarks/test_baselines.py": [
+        "stable-baselines3 is not installed: extra rl",
+        "{library} is not installed: extra {extra}",
+        "sbx is not installed: extra rivals",
+    ],
     "tests/tools/test_environment_pictures.py": ["MoviePy is not installed: extra rl"],
     "tests/tools/test_tensorboard.py": ["tensorboardX is not installed: extra tensorboard"],
     "tests/tools/test_study_on_dask.py": ["another {name} cannot be had: {done.stderr"],
