@@ -425,7 +425,7 @@ def around(plain: Planner) -> list[Planner]:
 
 
 def ways_of(plain: Planner) -> list[Planner]:
-    """Plans around laws, and of actions alone; with the trained law, and alone, also without cost to go."""
+    """Plans around laws, and of actions alone; some of them also without a cost to go."""
     ways = [*around(plain), replace(plain, around=False)]
     without = [replace(way, terminal=False) for way in (plain, ways[-1]) if way.terminal]
     return ways + without
