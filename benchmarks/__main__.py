@@ -31,7 +31,7 @@ PROGRAMS = {
     "train": "a whole training, over topics and in one process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "baselines": "optimisers and other methods at equal rollouts, with intervals over seeds",
-    "agents": "PPO and SAC that begin with a run's law, and without",
+    "agents": "PPO, SAC and CrossQ that begin with a run's law, and without",
     "field_models": "the selected model of the whole field and its error",
     "choices": "how often the law that a training returns is the wrong one",
     "general": "held-out plants and initial fields: first law, adapted law and best known inputs",

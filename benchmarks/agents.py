@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks agents`: PPO and SAC that begin with the law of a run, and without.
+"""`python -m benchmarks agents`: PPO, SAC and CrossQ that begin with the law of a run, and without.
 
 An agent of stable-baselines3 with the library's defaults learns on `VecEnvironment` of the run's
 problem and is evaluated, without exploring, on the fields of the run's evaluation.
@@ -41,7 +41,7 @@ def run(
     folder
         The run of the law.
     algorithms
-        ppo, sac.
+        ppo, sac, crossq.
     starts
         cold, path, frozen, cloned.
     rollouts
@@ -68,12 +68,14 @@ def _learn(
     law: FinishedRun, algorithm: str, start: str, rollouts: Sequence[int], seed: int
 ) -> list[float]:
     """Costs at the beginning and after each number of rollouts."""
+    from sb3_contrib import CrossQ  # in PyTorch, as `warm_start` needs it
     from stable_baselines3 import PPO, SAC
+    from stable_baselines3.common.logger import Logger
 
     from pdeloop.environments import warm_start
     from pdeloop.environments.stable_baselines import VecEnvironment
 
-    algorithms = {"ppo": PPO, "sac": SAC}
+    algorithms = {"ppo": PPO, "sac": SAC, "crossq": CrossQ}
     plant = build_plant(law.values)
     batch = 4 if algorithm == "ppo" else 1
     env = VecEnvironment(plant, num_envs=batch)
@@ -81,10 +83,11 @@ def _learn(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You have specified a mini-batch size")
         agent: Any = algorithms[algorithm]("MlpPolicy", env, seed=seed, device="cpu", **own)
+    agent.set_logger(Logger(None, []))  # else each call of `learn` makes a folder
     if start in ("path", "frozen"):
         warm_start(agent, law)
     if start == "frozen":
-        head = agent.actor.mu if algorithm == "sac" else agent.policy.action_net
+        head = agent.policy.action_net if algorithm == "ppo" else agent.actor.mu
         head.law.requires_grad_(False)
     if start == "cloned":
         _clone(agent, law)
