@@ -186,7 +186,8 @@ def test_where_no_equation_reproduces_the_readings_the_law_stays_and_says_why() 
             mixed = rng.permutation(seen.states)
             results.append(RolloutResult(1.0, False, replace(seen, states=mixed)))
         row = dict(own.tell(results))
-    assert "the affine law stays: no equation of the field reproduces the readings" in row["reason"]
+    why = "the law extended_kalman stays: no equation of the field reproduces the readings"
+    assert why in row["reason"]
 
 
 def test_a_law_that_plans_has_the_one_of_few_sensors_in_its_place() -> None:

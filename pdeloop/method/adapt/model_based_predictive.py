@@ -241,7 +241,8 @@ class ModelBasedPredictive(Optimizer):
             why = made
         if self._left:
             row.setdefault("early", why)
-        row["reason"] = f"{row.get('reason', '')}; the affine law stays: {why}".removeprefix("; ")
+        stays = "affine law" if self._law.base is Affine else f"law {self._law.base.name}"
+        row["reason"] = f"{row.get('reason', '')}; the {stays} stays: {why}".removeprefix("; ")
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law that plans on this model; or why there is none."""
