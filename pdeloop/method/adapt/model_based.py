@@ -6,6 +6,8 @@
                                                             law improved on it (`renewal`)
     judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
 
+Where every episode begins alike and renewing gains nothing more, laws about the target follow, each
+rolled out once (`about_target`); rollouts alone decide then.
 Where no model predicts the rollouts, laws are steps along measured ones (`replay`), each rolled out on
 the fields of the first law, and compared with no control as well; then rollouts alone decide.
 
@@ -22,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.about_target import law_about_target
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
@@ -86,6 +89,8 @@ _FAR_OFF = 0.1
 """Share of a measured cost by which it exceeds the predicted one where the law is renewed at once."""
 _REPEATS = 1e-9
 """Relative difference of the costs of one law up to which its rollouts are the same one."""
+_TRIES = 8
+"""Laws about the target after which no further one is tried if none of them costs less."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
@@ -336,6 +341,33 @@ class ModelBased(Optimizer):
         least = (1.0 - self._settings.least_gain) * min(costs[:-2], default=np.inf)
         return self._repeats and len(costs) > 2 and min(costs[-2:]) >= least
 
+    _about_target = True
+    """Whether laws about the target are tried."""
+
+    def _law_about_target(self) -> Array | None:
+        """One of all that was measured, while rollouts are left; else None."""
+        affine = self._about_target and not isinstance(self._context.law, FeedForward | Observer)
+        left = self._records.count < self._schedule.last
+        if not (affine and left and self._repeats) or self._progress.replayed:
+            return None
+        return law_about_target(self._context, self._measurements())
+
+    def _turns_to_target(self, row: Row) -> bool:
+        """Take the next law about the target, or the cheapest of all laws where none is left to try."""
+        progress = self._progress
+        laws = list({own.policy.tobytes(): own for own in self._records.all()}.values())
+        best = min(range(len(laws)), key=lambda i: laws[i].cost)
+        before = sum(own.stamp < progress.rested for own in laws)
+        law = None
+        if len(laws) - max(best + 1, before) < _TRIES:
+            law = self._law_about_target()
+        progress.policy = laws[best].policy.copy()
+        if law is None or any(np.array_equal(law, own.policy) for own in laws):
+            return False
+        progress.belief, progress.policy = None, law
+        row["reason"] = "improved laws gain nothing more: a law about the target follows"
+        return True
+
     def _rollout(self, policy: Array, number: int) -> Rollout:
         return Rollout(policy.copy(), field_seed(self._seed, number))
 
@@ -381,6 +413,10 @@ class ModelBased(Optimizer):
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or go on without one."""
+        if self._progress.rested:
+            if not self._turns_to_target(row):
+                self._begin_judging()
+            return
         final = self._records.count >= self._schedule.last or self._rests
         belief = self._believe()
         if belief is not None:
@@ -396,7 +432,10 @@ class ModelBased(Optimizer):
         else:
             self._replay(belief, row, final)
         if final and self._progress.stage == RENEWING:
-            self._begin_judging()
+            if self._law_about_target() is None:
+                self._begin_judging()
+            else:  # once this law is measured
+                self._progress.rested = self._records.count + 1
 
     def _believe(self) -> Belief | None:
         """The model that predicts the rollouts; the kind selected before is tried first."""

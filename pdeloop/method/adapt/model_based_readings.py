@@ -27,6 +27,7 @@ class ModelBasedReadings(ModelBased):
 
     _unpredicted = "no model of the readings predicts the rollouts"
     _model_compares = False
+    _about_target = False
 
     def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""

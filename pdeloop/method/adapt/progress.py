@@ -53,6 +53,8 @@ class Progress:
         True if the first law is better than no control on the model.
     noise : float
         Measurement noise that was found in place of the declared one; 0: none was.
+    rested : int
+        Rollouts after which laws about the target took the place of improved ones; 0: they did not.
     """
 
     policy: Array
@@ -68,6 +70,7 @@ class Progress:
     none_is_close: bool = False
     safe: bool = True
     noise: float = 0.0
+    rested: int = 0
 
     def state(self) -> State:
         """All of it, as the arrays of a checkpoint."""
@@ -82,6 +85,8 @@ class Progress:
             "safe": np.array(self.safe),
             "noise": np.array(self.noise),
         }
+        if self.rested:
+            arrays["rested"] = np.array(self.rested)
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
         if self.belief is not None:
@@ -112,6 +117,7 @@ class Progress:
             none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
             safe=bool(checked_array(state, "safe", "b", ())),
             noise=noise_of(state),
+            rested=int(checked_array(state, "rested", "i", ())) if "rested" in state else 0,
         )
 
 
