@@ -90,8 +90,8 @@ def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
     yield row("the same with 4 x 4 probes", probed, short)
     for budget in budgets:
         how = {"reduced_order": MODES[-1], "exploration_variance": EXCITED}
-        own = range(TRAINED, TRAINED + seeds)
-        made = [trained(lambda: Admissible(cells), seed, budget, **how) for seed in own]
+        numbers = range(TRAINED, TRAINED + seeds)
+        made = [trained(lambda: Admissible(cells), seed, budget, **how) for seed in numbers]
         limited = DynamicsPlant(Admissible(cells))
         found = [pdeloop.rollout(limited, law, [0]) for law, _ in made]
         yield row(f"{name_of(budget)} from convection", found, max(spent for _, spent in made))

@@ -60,8 +60,8 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
     try:
         found = np.linalg.solve(gram, features.T @ after / len(x))
         model = ReducedModel(found[:n_s].T, unit * found[n_s : n_s + a.shape[1]].T, U)
-        weights = {"state_weight": context.state_weight, "action_weight": context.action_weight}
-        K = track(model, **weights).K_a
+        q, r = context.state_weight, context.action_weight
+        K = track(model, state_weight=q, action_weight=r).K_a
     except (np.linalg.LinAlgError, ValueError):
         return None
     return np.hstack([K, -K]) if np.isfinite(K).all() else None
