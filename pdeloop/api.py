@@ -361,8 +361,8 @@ def train(
     Warns
     -----
     TrainingWarning
-        The law is no better than no control or than the first one, rollouts were left over, or costs
-        cannot be compared, and why.
+        The law is no better than no control or than the first one, rollouts were left over, costs
+        cannot be compared, or an exploration hardly tells inputs apart or shows dead time, and why.
 
     Examples
     --------
@@ -400,7 +400,8 @@ def train(
         finally:
             display.close()
         run = load_run(folder)
-    for text in (*narration.warnings(run.result), *narration.reasons(run.result)):
+    outcome = narration.warnings(run.result), narration.reasons(run.result)
+    for text in (*display.remarks, *outcome[0], *outcome[1]):
         warnings.warn(text.strip(), TrainingWarning, stacklevel=2)
     return run
 

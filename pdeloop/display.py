@@ -46,9 +46,13 @@ class StreamConsole(Console):
 
 
 class Display:
-    """Shows a training of `seeds` seeds from `seed` on, row by row."""
+    """Shows a training of `seeds` seeds from `seed` on, row by row.
+
+    `remarks`: the lines about its explorations, such as inputs that they hardly tell apart.
+    """
 
     def __init__(self, seed: int, seeds: int, stream: TextIO | None = None) -> None:
+        self.remarks: list[str] = []
         self._console = StreamConsole(stream or sys.stdout)
         self._narration = Narration(seed, seeds)
         self._progress: Progress | None = None
@@ -65,8 +69,11 @@ class Display:
         """Show one row of progress.jsonl."""
         if row.get("event") == "phase":
             self.close()
-        for text in self._narration.lines(row):
+        lines = self._narration.lines(row)
+        for text in lines:
             self.line(text)
+        if row.get("event") == "excitation":
+            self.remarks += lines
         if row.get("event") == "phase" and row["phase"] == "adapt":
             self._progress = Progress(self._console, "  adapting", "rollouts")
             if self._console.is_terminal:  # the first fit of models may take a minute

@@ -83,7 +83,8 @@ def test_the_observer_knows_of_the_dead_time(seed: int, ambient: float, tmp_path
 
 def test_the_affine_law_is_told_of_the_dead_time() -> None:
     told = StringIO()
-    with pytest.warns(pdeloop.TrainingWarning):
+    late = "seed 0: the actions act 3 steps late"
+    with pytest.warns(pdeloop.TrainingWarning, match=late):  # also where nobody reads the progress
         pdeloop.train(plant=Late(), reduced_order=4, rollouts=6, evaluation_fields=2, progress=told)
     assert "the actions act 3 steps late" in told.getvalue()
     assert "train with --law observer" in told.getvalue()
