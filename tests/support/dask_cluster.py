@@ -45,9 +45,11 @@ class DaskCluster:
         self.scheduler = self._started("dask_scheduler", "--port", "0", packages=packages)
         self.address = address_in(self._file)
 
-    def start_worker(self, packages: str = str(ROOT), *, nanny: bool = False) -> Process:
-        """nanny: start it again where it dies."""
-        options = ("--nthreads", "1", "--local-directory", str(self._folder))
+    def start_worker(
+        self, packages: str = str(ROOT), *further: str, nanny: bool = False
+    ) -> Process:
+        """further: options; nanny: start it again where it dies."""
+        options = ("--nthreads", "1", "--local-directory", str(self._folder), *further)
         without = () if nanny else ("--no-nanny",)
         process = self._started("dask_worker", *options, *without, packages=packages)
         self.workers.append(process)

@@ -112,6 +112,22 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
     assert "two-point*" in told and "*: some trainings had numpy " in told
 
 
+@pytest.mark.filterwarnings("default")
+def test_workers_that_are_retired_cost_the_trainings_that_they_run(tmp_path: Path):
+    study, notes = Study.of({**CONTENT, "seeds": 8, "variants": {"noted": {}}}), tmp_path / "notes"
+    notes.mkdir()
+    tasks = {"noted": partial(study_tasks.noted, str(notes), 2.0)}
+    lifetime = ("--lifetime", "12", "--lifetime-restart")
+    with dask_cluster(tmp_path / "dask", 0) as dask:
+        dask.start_worker(str(ROOT), *lifetime, nanny=True)
+        dask.await_workers(1)
+        failures = run(study, tmp_path / "out", partial(cluster, dask.address), tasks=tasks)
+    found = status(tmp_path / "out")
+    assert failures == [] and found["finished"] == 8 and found["workers_lost"] >= 1
+    # A retired worker may carry its training on for a moment, for nothing.
+    assert sum(runs_in(notes)) <= 8 + found["workers_lost"]
+
+
 DRIVER = """
 import sys
 from functools import partial
