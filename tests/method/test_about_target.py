@@ -11,6 +11,7 @@ from benchmarks.tasks.convection import Admissible
 from pde_sim_node.plants import DynamicsPlant
 from pdeloop import rollout
 from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt import model_based
 from pdeloop.method.adapt.about_target import law_about_target
 from pdeloop.method.adapt.base import Context, Record, Trajectory
 from pdeloop.method.design.lqt import track
@@ -57,7 +58,13 @@ def test_there_is_no_law_of_few_samples_or_of_another_cost() -> None:
 
 @pytest.mark.filterwarnings("ignore::pdeloop.IdentifiabilityWarning")
 @pytest.mark.filterwarnings("ignore::pdeloop.TrainingWarning")
-def test_a_training_brings_convection_to_rest_from_rollouts_that_begin_with_it() -> None:
+@pytest.mark.parametrize("safe", [True, False])
+def test_a_training_brings_convection_to_rest_from_rollouts_that_begin_with_it(
+    safe: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the model has it that no control costs less than the first law."""
+    if not safe:
+        monkeypatch.setattr(model_based, "beats_no_control", lambda *given: False)
     how = {"reduced_order": 20, "exploration_variance": 0.3, "law": "affine"}
     run, spent = training(lambda: Admissible(10), 103, 20, **how)
     plant = Admissible(10)
