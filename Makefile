@@ -77,7 +77,8 @@ test-extras: setup packages
 	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
 	$(PYTEST) $(EXTRAS)
 
-EXTRAS := tests/plant/test_fmu.py tests/plant/test_cell.py tests/tools/test_data_sets.py tests/tools/test_model_files.py
+EXTRAS := tests/plant/test_fmu.py tests/plant/test_cell.py tests/plant/test_tokamak.py tests/tools/test_data_sets.py \
+	tests/tools/test_model_files.py
 
 # The libraries of docs/neighbours.md, pinned, against ours.
 test-neighbours: setup

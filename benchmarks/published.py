@@ -17,6 +17,7 @@ from benchmarks.tasks import (
     kuramoto_sivashinsky_four,
     kuramoto_sivashinsky_sensors,
     lid,
+    tokamak,
 )
 from benchmarks.tasks.common import Row
 
@@ -31,6 +32,7 @@ Name: TypeAlias = Literal[
     "kuramoto-sivashinsky-four",
     "film",
     "convection",
+    "tokamak",
 ]
 
 
@@ -54,6 +56,7 @@ TASKS: dict[str, Task] = {
     "kuramoto-sivashinsky-four": Task(kuramoto_sivashinsky_four.rows, "Werner and Peitz", 30),
     "film": Task(falling_film.rows, "beacon, shkadov-v0", 2),
     "convection": Task(convection.rows, "beacon, rayleigh-v0", 12),
+    "tokamak": Task(tokamak.rows, "Gym-TORAX, IterHybrid-v0", 40),
 }
 
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import numpy as np
 import pytest
 
@@ -75,3 +77,9 @@ def test_tasks_are_listed_with_their_sources_and_unknown_ones_are_refused(
     with pytest.raises(SystemExit):
         parser().parse_args(["published", "cavity"])
     assert "invalid choice: 'cavity'" in capsys.readouterr().err
+
+
+def test_a_task_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'pdeloop\[tokamak\]'"):
+        run("tokamak")

@@ -21,6 +21,7 @@ CHECKS = re.compile(r"pytest\.(raises|warns|fail)|np\.testing\.|check_env$|asser
 SKIPS = {
     "tests/neighbours/test_models.py": ["{package} is not installed: extra neighbours"],
     "tests/plant/test_cell.py": ["PyBaMM is not installed: extra battery"],
+    "tests/plant/test_tokamak.py": ["Gym-TORAX is not installed: extra tokamak"],
     "tests/tools/test_data_sets.py": [
         "Minari is not installed: extra minari",
         "pyarrow is not installed: extra logs",
