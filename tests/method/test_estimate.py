@@ -134,7 +134,7 @@ def test_no_control_that_diverged_loses_and_so_does_a_law() -> None:
     assert choose(lost, NONE, 1.0).reason == "a rollout of no control diverged"
     bad = np.array([3.0, np.inf])
     kept = choose(evidence_against_none({ADAPTED: bad, NONE: none}, none, {}), NONE, 1.0)
-    assert kept.chosen == NONE and kept.reason == "a rollout of the adapted law diverged"
+    assert kept.chosen == NONE and kept.reason == "a rollout of the last law diverged"
 
 
 @pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 12), (2, 40), (8, 8)])

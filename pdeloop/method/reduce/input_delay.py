@@ -13,7 +13,8 @@ channel i on the other parts. Of N steps, another n than 0 has a log-likelihood 
 delay of each input on its own follows by a search along single inputs.
 
 Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only if measurements do not improve
-the prediction of inputs from their own past (Granger).
+the prediction of inputs from their own past (Granger). And another delay counts only if the inputs with
+the delay in use add nothing to it.
 
 References
 ----------
@@ -44,6 +45,8 @@ FOLDS = 4
 """Groups of parts of the data that are held out one after the other."""
 EVIDENCE = 10.0
 """Log-likelihood by which another delay must be better."""
+TOO = 0.3
+"""Share of the log-likelihood gained by another delay that the inputs as used may add to it."""
 LOWER = 0.9
 """Squared error, relative to that of the delay before, up to which another one matters."""
 MOST_INPUTS = 16
@@ -173,7 +176,8 @@ def study_delays(
             if not data.is_better(better, best):
                 break
             best = better
-        if not data.is_better(best, used):  # both steps together, of which each was
+        # Both steps together, of which each was.
+        if not data.is_better(best, used) or data.acts_as_well(used, best):
             best = used
         near = data.likelihood(best) - EVIDENCE
         alike = (
@@ -281,6 +285,18 @@ class _Regression:
             and bool(np.all(np.sum(np.log(own / other), axis=1) <= 0.0))
             and self.gain(delays, than) ** 2 * LOWER >= 1.0
         )
+
+    def acts_as_well(self, used: Delays, later: Delays) -> bool:
+        """Whether inputs that are said to act later than used improve the prediction as used, too.
+
+        Of a plant with dead time they do not. Where a few modes are predicted, an earlier input tells
+        of what moves the others, and may predict better than the one that acts.
+        """
+        columns = [*range(1 + 2 * self.n), *self._inputs(later, range(self.n_a))]
+        moved = [j for j in range(self.n_a) if later[j] > used[j]]
+        columns += self._inputs([used[j] for j in moved], moved)
+        both = self._log(self._held_out(columns, self.of_xy, self.of_yy)) - self.likelihood(later)
+        return both > max(EVIDENCE, TOO * (self.likelihood(later) - self.likelihood(used)))
 
     def gain(self, delays: Delays, than: Delays) -> float:
         """The ratio of the errors, the root of its mean square over channels."""
