@@ -37,15 +37,42 @@ def roles(run: pdeloop.FinishedRun) -> list[int]:
     return [int(row["rollouts"]) for row in run.result["history"] if "role" in row]
 
 
-def test_each_law_is_rolled_out_once_until_none_is_better() -> None:
-    with pytest.warns(pdeloop.TrainingWarning, match="every episode begins alike"):
-        run = pdeloop.train(plant=Pendulums(), seed=0, rollouts=20)
+def test_each_law_is_rolled_out_once_and_no_rollout_is_left() -> None:
+    """Laws about the target follow those that gain nothing more."""
+    run = pdeloop.train(plant=Pendulums(), seed=0, rollouts=20)
     known = roles(run)
     assert known[0] == 4  # two explorations, and two of the first law, which are the same
     assert set(np.diff(known[:-1])) == {1}
-    assert run.rollouts[0]["total"] == known[-1] <= 12
+    assert run.rollouts[0]["total"] == known[-1] == 20
+    reasons = [str(row.get("reason", "")) for row in run.result["history"]]
+    assert any("a law about the target follows" in reason for reason in reasons)
     first, adapted = (float(run.costs[name].mean()) for name in ("lqt", "adapted"))
     assert adapted < 0.99 * first
+
+
+class Weighted(Pendulums):
+    """With other weights of angles and velocities."""
+
+    state_weight = np.repeat([1.0, 0.5], 5)
+
+
+class Moving(Pendulums):
+    """To other angles half-way through, for which there is no law about the target."""
+
+    target = np.outer(np.arange(80) >= 40, np.repeat([0.2, 0.0], 5))
+
+
+def test_other_weights_leave_no_rollout_either() -> None:
+    run = pdeloop.train(plant=Weighted(), seed=0, rollouts=14)
+    assert run.rollouts[0]["total"] == 14
+    reasons = [str(row.get("reason", "")) for row in run.result["history"]]
+    assert any("a law about the target follows" in reason for reason in reasons)
+
+
+def test_it_ends_where_no_other_law_is_to_be_tried() -> None:
+    with pytest.warns(pdeloop.TrainingWarning, match="every episode begins alike"):
+        run = pdeloop.train(plant=Moving(), seed=0, rollouts=20)
+    assert run.rollouts[0]["total"] == roles(run)[-1] < 20
 
 
 def test_fields_that_differ_or_noise_are_rolled_out_as_ever() -> None:

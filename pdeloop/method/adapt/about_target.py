@@ -34,9 +34,13 @@ _LINEAR_RIDGE, _PRODUCT_RIDGE = 1e-7, 1e-4
 def law_about_target(context: Context, records: Sequence[Record]) -> Array | None:
     """[K, -K] of the law above, (n_a, 2 n_s), from measured rollouts and explorations.
 
-    None where the cost is not plain, the samples are fewer than the unknowns, or no law stabilises A.
+    None where the target moves, needs an action or is not of the whole state, the samples are fewer than
+    the unknowns, or no law stabilises A.
     """
-    if context.cost is not None and not context.cost.plain:
+    cost, W = context.cost, context.weights
+    if cost is not None and (cost.target.ndim > 1 or cost.action_target.any()):
+        return None
+    if W is not None and np.linalg.matrix_rank(np.diag(W) if W.ndim == 1 else W) < len(context.U):
         return None
     U, n_s = context.U, context.U.shape[1]
     pairs = [
@@ -61,7 +65,7 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
         found = np.linalg.solve(gram, features.T @ after / len(x))
         model = ReducedModel(found[:n_s].T, unit * found[n_s : n_s + a.shape[1]].T, U)
         q, r = context.state_weight, context.action_weight
-        K = track(model, state_weight=q, action_weight=r).K_a
+        K = track(model, state_weight=q, action_weight=r, cost=cost).K_a
     except (np.linalg.LinAlgError, ValueError):
         return None
     return np.hstack([K, -K]) if np.isfinite(K).all() else None
