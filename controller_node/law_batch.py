@@ -18,7 +18,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import digest
 from pdeloop.method.laws.base import Law, Parts
-from pdeloop.method.laws.calls import action, arithmetic_of_laws, updated
+from pdeloop.method.laws.registry import action, arithmetic_of_laws, updated
 
 
 class MemoryUnknownError(Exception):

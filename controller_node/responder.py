@@ -42,8 +42,7 @@ from pdeloop.messages.topics import (
     StartColumn,
     start_rows,
 )
-from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.laws.registry import law_kind, laws_of
 
 MAX_BYTES = 2**29
 """Bytes that are kept of all runs together, and half as many of targets. Less recently used ones are

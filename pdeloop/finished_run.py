@@ -25,8 +25,7 @@ from pdeloop.messages.parameters import noisy
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED
 from pdeloop.method.laws import Affine, Law
-from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import OWN_LAWS, law_kind
+from pdeloop.method.laws.registry import OWN_LAWS, law_kind, laws_of
 from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.batch import stacked
 from tuner_node.rollouts import EVALUATED

@@ -26,7 +26,7 @@ from pdeloop.episode import EpisodeRecord, finite_array, finite_basis, rollout
 from pdeloop.episode import Law as Actions
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Law, differentiable
-from pdeloop.method.laws.calls import action, arithmetic_of_laws, updated
+from pdeloop.method.laws.registry import action, arithmetic_of_laws, updated
 
 __all__ = ["CostGradient", "Gradients", "features"]
 

@@ -21,8 +21,7 @@ from pdeloop.episode import EpisodeRecord, Law, rollout
 from pdeloop.messages import model_rows
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
-from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.laws.registry import law_kind, laws_of
 from tuner_node.batch import Batch, BatchResult, most_environments
 from tuner_node.errors import NoModelError
 from tuner_node.training import Training

@@ -26,8 +26,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.parameters import INSTRUMENTS
-from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.laws.registry import law_kind, laws_of
 from pdeloop.method.reduce.order import study_orders
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
 from tuner_node.build import build_training, few_sensors, remarks_on

@@ -10,7 +10,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.topics import MAX_GAIN
 from pdeloop.method.adapt import Rollout, Trajectory
 from pdeloop.method.laws import Law
-from pdeloop.method.laws.calls import along
+from pdeloop.method.laws.registry import along
 
 TOLERANCE = 1e-6
 """Relative difference of actions that rounding may explain."""

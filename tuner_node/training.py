@@ -32,7 +32,7 @@ from pdeloop.messages.frames import digest
 from pdeloop.messages.topics import CostColumn, StartColumn
 from pdeloop.method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
 from pdeloop.method.laws import Law
-from pdeloop.method.laws.calls import laws_of
+from pdeloop.method.laws.registry import laws_of
 from tuner_node import event_rows, rollouts, void_exploration
 from tuner_node.batch import (
     UNKNOWN_PLANT,

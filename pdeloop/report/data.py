@@ -23,8 +23,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array, unpack_arrays
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.laws.calls import laws_of
-from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.laws.registry import law_kind, laws_of
 from pdeloop.method.reduce.order import OrderStudy, study_orders
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study

@@ -16,7 +16,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.method.laws import Affine, FeedForward, Law, Observer
 from pdeloop.method.laws.base import Parts
-from pdeloop.method.laws.calls import along, laws_of
+from pdeloop.method.laws.registry import along, laws_of
 from tests.support.small import same_bits
 
 N_Z, N_S, N_A, T = 24, 3, 2, 6

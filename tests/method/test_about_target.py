@@ -12,8 +12,8 @@ from pde_sim_node.plants import DynamicsPlant
 from pdeloop import rollout
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import model_based
-from pdeloop.method.adapt.about_target import law_about_target
 from pdeloop.method.adapt.base import Context, Record, Trajectory
+from pdeloop.method.adapt.replay import law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel
 

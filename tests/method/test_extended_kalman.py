@@ -19,19 +19,19 @@ from pdeloop.method.adapt.estimated_loop import (
     noise_of_filter,
     prior,
     root_mean_square,
+    whole_field_law,
 )
-from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.whole_field_law import whole_field_law
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.laws.base import differentiable
-from pdeloop.method.laws.calls import MAX_NUMBER, action, along
+from pdeloop.method.laws.registry import MAX_NUMBER, action, along
 from pdeloop.method.models.sensed import (
     WAVES,
+    SensedFilter,
     coefficients_of,
     field_of,
 )
-from pdeloop.method.models.sensed_filter import SensedFilter
 from pdeloop.method.models.settings import DEFAULTS
 from tests.support.estimated import (
     CUBIC,

@@ -14,8 +14,16 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.method.laws import Affine, FeedForward, Law, Observer
 from pdeloop.method.laws.base import differentiable
-from pdeloop.method.laws.calls import MAX_NUMBER, action, along, laws_of, updated
-from pdeloop.method.laws.registry import OWN_LAWS, law_kind, offered
+from pdeloop.method.laws.registry import (
+    MAX_NUMBER,
+    OWN_LAWS,
+    action,
+    along,
+    law_kind,
+    laws_of,
+    offered,
+    updated,
+)
 
 N_Z, N_S, N_A, T = 7, 3, 2, 5
 SHIPPED = list(OWN_LAWS.shipped.values())

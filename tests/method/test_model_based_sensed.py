@@ -18,8 +18,7 @@ from pdeloop.method.adapt import (
     model_based_sensed,
 )
 from pdeloop.method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
-from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
-from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed, gained
+from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed, gained
 from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.sensed_loop import sensed_from
 from pdeloop.method.adapt.settings import ModelBasedSettings

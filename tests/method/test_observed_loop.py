@@ -12,13 +12,12 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
-from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop, ObservedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import track
 from pdeloop.method.laws import Observer
-from pdeloop.method.laws.calls import along
+from pdeloop.method.laws.registry import along
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import same_bits

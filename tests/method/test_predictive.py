@@ -28,9 +28,9 @@ from pdeloop.method.adapt.model_based_predictive import (
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Law, Predictive
-from pdeloop.method.laws.calls import action, updated
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto
+from pdeloop.method.laws.registry import action, updated
 from pdeloop.method.models.files import LARGEST, packed, unpacked
 from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel

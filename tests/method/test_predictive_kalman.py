@@ -15,15 +15,15 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult
 from pdeloop.method.adapt.base import Optimizer
-from pdeloop.method.adapt.model_based_predictive_sensed import (
+from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictiveSensed,
     simulated_from_estimates,
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman
-from pdeloop.method.laws.calls import action, along, updated
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import PredictiveKalman
+from pdeloop.method.laws.registry import action, along, updated
 from pdeloop.method.models.settings import DEFAULTS
 from tests.support import sensed_optimiser
 from tests.support.estimated import (

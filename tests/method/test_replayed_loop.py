@@ -10,10 +10,10 @@ import pytest
 
 from pdeloop.method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from pdeloop.method.adapt.belief import believe
+from pdeloop.method.adapt.closed_loop import ReplayedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
-from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
+from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.replay import best_measured, step
-from pdeloop.method.adapt.replayed_loop import ReplayedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of, evidence_of_rollouts
 from pdeloop.method.design.lqg import law_of_innovations

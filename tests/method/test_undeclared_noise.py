@@ -15,10 +15,10 @@ from pde_sim_node.build import build_plant
 from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.model_rows import pack
 from pdeloop.method.models import Measured
-from pdeloop.method.models import undeclared_noise as of_models
+from pdeloop.method.models import selection as of_models
 from pdeloop.method.models.noise_level import correlations, is_white, noise_level, short_waves
+from pdeloop.method.models.selection import fit_undeclared_noise
 from pdeloop.method.models.settings import DEFAULTS
-from pdeloop.method.models.undeclared_noise import fit_undeclared_noise
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import misjudged_noise, warnings

@@ -16,8 +16,8 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
 from pdeloop.method.design.finite_horizon import finite_horizon_of, track_horizon
-from pdeloop.method.laws.calls import laws_of
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.registry import laws_of
 from tests.support.small import FEW_FITS
 
 N_Z, N_A, T = 6, 2, 20

@@ -16,12 +16,12 @@ from pdeloop.method.models.sensed import (
     TERMS,
     WAVES,
     Actuators,
+    SensedFilter,
     SensedModel,
     field_of,
     sensed_model,
     unknowns,
 )
-from pdeloop.method.models.sensed_filter import SensedFilter
 
 Array = np.ndarray
 SENSORS, N_A, T, N_S = 8, 3, 24, 6

@@ -15,7 +15,7 @@ from pdeloop.cli import FAILED, main
 from pdeloop.data_file import read_measurements
 from pdeloop.messages.model_rows import unpack
 from pdeloop.method.laws import Observer
-from pdeloop.method.laws.calls import along
+from pdeloop.method.laws.registry import along
 from pdeloop.method.reduce.regression import exact_regression
 from tests.support.linear_system import linear_system, trajectory
 from tuner_node.build import read_model

@@ -16,8 +16,7 @@ from pdeloop.in_process import LocalPair
 from pdeloop.method.adapt import Rollout, StepOptimizer
 from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.method.laws import Affine
-from pdeloop.method.laws.calls import along
-from pdeloop.method.laws.registry import OWN_LAWS
+from pdeloop.method.laws.registry import OWN_LAWS, along
 from pdeloop.report.data import ReportData, of_run
 from pdeloop.report.page import _facts, _of_problem
 from tests.support.interpreter import ROOT

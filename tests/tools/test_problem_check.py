@@ -19,8 +19,8 @@ from pdeloop.control_effect import judged
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.model_rows import pack
 from pdeloop.messages.topics import CostColumn
-from pdeloop.method.laws.calls import laws_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.registry import laws_of
 from pdeloop.problem_check import check
 from pdeloop.training_run import resolve
 from tests.support.small import SMALL, parameters

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record, State, part_of
-from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
-from pdeloop.method.adapt.observed_loop import ObservedLoop
-from pdeloop.method.adapt.replayed_loop import ReplayedLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop, ObservedLoop, ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer

@@ -8,13 +8,17 @@ input of the memory:
     z_{k+1} = f(z_k, a_k),                   p_{k+1} = u_k + B a_k,
 
 with f the model, p_0 = s_0, and P the nearest admissible action (`pdeloop.messages.action_set`). The
-affine law has no memory, and theta = [K_a b]; `observed_loop` has that of a law with an observer. From
-an initial field z_0 the cost is
+affine law has no memory, and theta = [K_a b]. From an initial field z_0 the cost is
 
     J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),
 
 or another quadratic one. With g_k = dJ/d[r_k; u_k] of the adjoint (`pdeloop.method.models.sweep`) its
 gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
+
+The memory of a law with an observer (`ObservedLoop`) is the prediction p of the reduced state, and its
+theta is [D K b; G F c]. On a model of the readings (`ReplayedLoop`) it replays measured innovations: an
+initial field is a row [x_0, e_0, .., e_{T-1}] (`pdeloop.method.models.readings`), where a rollout
+began, and what in it no model predicted. Under its own law it is the rollout again.
 """
 
 from __future__ import annotations
@@ -27,14 +31,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.design.finite_horizon import finite_horizon_of
+from pdeloop.method.design.lqt import DesignError, track_outputs
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models import FieldModel
+from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
 LARGEST = 512
@@ -448,3 +456,117 @@ class FeedForwardLoop(ClosedLoop):
         found[n_s:, :n_s] = found[:n_s, n_s:].T
         found[n_s:, n_s:] = np.eye(T) / T
         return found
+
+
+ROUND = 1e-2
+"""Share of the identity in the cost matrix of a change of the memory, beyond that of the gains."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedLoop(ClosedLoop):
+    """A model under laws with an observer.
+
+    Attributes
+    ----------
+    law : Observer
+        That of the reduced model; policies are its theta, and theta here is Theta.
+    """
+
+    law: Observer = field(kw_only=True)
+
+    constant_feature: ClassVar[float] = 1.0
+    """b and c are gains of their own, whatever the target is."""
+
+    def theta(self, policy: Array) -> Array:
+        """Theta (n_a + n_s, 2 n_s + 1) of the law's vector."""
+        p = self.law.parts(np.ravel(policy))
+        return np.block([[p["D"], p["K"], p["b"][:, None]], [p["G"], p["F"], p["c"][:, None]]])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        """The law's vector, of the shape of `near`."""
+        n_a, n_s = self.law.n_a, len(self.law.model.A)
+        (D, K, b), (G, F, c) = (
+            np.split(rows, [n_s, 2 * n_s], axis=1) for rows in (theta[:n_a], theta[n_a:])
+        )
+        parts = {"D": D, "K": K, "b": b[:, 0], "G": G, "F": F, "c": c[:, 0]}
+        others = self.law.parts(np.zeros(self.law.size))  # of a law that is derived from it
+        return self.law.vector({**others, **parts}).reshape(near.shape)
+
+    @property
+    def memory_input(self) -> Array:
+        """B of the reduced model."""
+        return self.law.model.B
+
+    def curvature(self, own: Array) -> Array:
+        """Cost matrix of a change of [a; u], from that of an action alone, (n_a, n_a).
+
+        A prediction that is wrong by one moves the action by K.
+        """
+        K = self.law.model.K_a
+        moved = K.T @ own @ K
+        size = float(np.trace(moved)) / len(moved)
+        moved[np.diag_indices(len(moved))] += ROUND * (size or 1.0)
+        return np.asarray(linalg.block_diag(own, moved), dtype=np.float64)
+
+    def _noise(self, drawn: Array) -> Array:
+        """Effect of the noise on U^T z, where the columns of U need not be orthonormal."""
+        R = linalg.qr(self.U, mode="r")[0][: min(self.U.shape)]
+        return np.asarray(super()._noise(drawn)[..., : len(R)] @ R, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedLoop(ObservedLoop):
+    """Laws with an observer on a `ReadingsModel`; U and target are those of U^T y."""
+
+    replays: ClassVar[bool] = True
+
+    def beginnings(self, records: Sequence[Record]) -> Array:
+        """[x_0, e] of each rollout; a shorter one continues without innovations."""
+        model, found = self._readings, []
+        for record in records:
+            first, e = model.replay(record.states, record.actions)
+            whole = np.zeros((self.horizon, e.shape[1]))
+            whole[: len(e)] = e[: self.horizon]
+            found.append(np.concatenate([first, whole.ravel()]))
+        return np.stack(found)
+
+    def curvature(self, own: Array) -> Array:
+        """With R + B^T P B of the cost of the readings."""
+        model = self._readings
+        cost = Cost(
+            len(model.C),
+            model.n_a,
+            1,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+        )
+        try:
+            P = track_outputs(model.A, model.B, model.C, cost).P
+            own = self.action_weight * np.eye(model.n_a) + model.B.T @ P @ model.B
+        except DesignError:
+            pass
+        return super().curvature(own)
+
+    @property
+    def _readings(self) -> ReadingsModel:
+        assert isinstance(self.model, ReadingsModel)
+        return self.model
+
+    def _start(self, fields: Array) -> Array:
+        return fields[:, : self.model.n_z]
+
+    def _innovations(self, fields: Array) -> Array:
+        """e of each step."""
+        return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self._readings.C))
+
+    def _disturbances(self, fields: Array) -> Array:
+        moved: Array = self._innovations(fields) @ self._readings.G.T
+        return moved
+
+    def _outputs(self, z: Array) -> Array:
+        v: Array = z @ self._readings.C.T
+        return v
+
+    def _pull_outputs(self, by_outputs: Array) -> Array:
+        by_z: Array = by_outputs @ self._readings.C
+        return by_z

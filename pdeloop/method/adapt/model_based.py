@@ -7,7 +7,7 @@
     judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
 
 Where every episode begins alike and renewing gains nothing more, laws about the target follow, each
-rolled out once (`about_target`); rollouts alone decide then.
+rolled out once (`replay`); rollouts alone decide then.
 Where no model predicts the rollouts, laws are steps along measured ones (`replay`), each rolled out on
 the fields of the first law, and compared with no control as well; then rollouts alone decide.
 
@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.about_target import law_about_target
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
@@ -46,7 +45,7 @@ from pdeloop.method.adapt.initial_fields import (
     initial_fields,
     measured_states,
 )
-from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress
+from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress, Schedule
 from pdeloop.method.adapt.renewal import renew, renew_from_states
 from pdeloop.method.adapt.replay import (
     FIRST_TRUST,
@@ -55,9 +54,9 @@ from pdeloop.method.adapt.replay import (
     SHRINKS,
     best_on_same_fields,
     costs_by_field,
+    law_about_target,
     step,
 )
-from pdeloop.method.adapt.schedule import Schedule
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records, cleaned
@@ -165,10 +164,11 @@ class ModelBased(Optimizer):
     def for_context(cls, context: Context) -> type[Optimizer]:
         """Another one for a law that plans, or estimates the state from few readings."""
         # Not at the top: they know this class.
-        from pdeloop.method.adapt.model_based_predictive import ModelBasedPredictive
-        from pdeloop.method.adapt.model_based_predictive_sensed import ModelBasedPredictiveSensed
-        from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
-        from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
+        from pdeloop.method.adapt.model_based_predictive import (
+            ModelBasedPredictive,
+            ModelBasedPredictiveSensed,
+        )
+        from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
 
         if isinstance(context.law, Predictive):
             few = isinstance(context.law, PredictiveKalman)

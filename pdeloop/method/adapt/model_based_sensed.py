@@ -6,17 +6,20 @@ designed and improved on it as on a model of the whole field, from the initial f
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
 current law and those of `observer_design`. Laws are compared on other draws. In simulations of the
 filter's own equation what trusts it looks too good: the cheapest law on an estimate gets a filter that
-trusts the equation less where it then costs hardly more.
-The last rollouts of the final law begin where those of the first law did, and these pairs decide
-between the two: an equation that reproduces the readings may be wrong where no sensor is. An earlier
-law that measured better than the final one is returned in its place.
-Where no equation reproduces the rollouts, it continues with a model of the readings
-(`model_based_readings`) and tries again with more of them.
+trusts the equation less where it then costs hardly more. The last rollouts of the final law begin where
+those of the first law did, and these pairs decide between the two: an equation that reproduces the
+readings may be wrong where no sensor is. An earlier law that measured better than the final one is
+returned in its place. Where no equation reproduces the rollouts, it continues with a model of the
+readings (`ModelBasedReadings`), in short steps from measured laws, and tries again with more of them. A
+linear model of the readings describes the plant near the fields of one law, and its innovations change
+with the law. So a step stays close to its starting point, the law with the best measured cost, and
+replays the innovations of its rollouts. Under its own law a rollout is reproduced exactly. Measured
+costs alone decide.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,16 +28,15 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Rollout, Row
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate, mean_of
-from pdeloop.method.adapt.estimated_loop import estimated_laws, least_trusting
+from pdeloop.method.adapt.estimated_loop import estimated_laws, least_trusting, whole_field_law
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from pdeloop.method.adapt.initial_fields import mixtures, weighted
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.model_based_readings import ModelBasedReadings
 from pdeloop.method.adapt.observer_design import compensators
 from pdeloop.method.adapt.progress import JUDGING, RENEWING
-from pdeloop.method.adapt.replay import FEWEST
+from pdeloop.method.adapt.replay import FEWEST, best_measured, step
 from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
-from pdeloop.method.adapt.settings import FIRST_GAIN, ModelBasedSettings
+from pdeloop.method.adapt.settings import FIRST_GAIN, READINGS_TRUST, ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -44,10 +46,69 @@ from pdeloop.method.adapt.verdict import (
     evidence_against_none,
     evidence_of_pairs,
 )
-from pdeloop.method.adapt.whole_field_law import whole_field_law
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import SENSED_REPRODUCED
+
+
+class ModelBasedReadings(ModelBased):
+    """`ModelBased` on a model of the readings (`ReplayedLoop`)."""
+
+    _unpredicted = "no model of the readings predicts the rollouts"
+    _model_compares = False
+    _about_target = False
+
+    def _scheduled(self, own: int) -> int:
+        """A law is rolled out no more often than judges it: steps are short."""
+        return self._schedule.often(own)
+
+    def _data(self) -> list[Record]:
+        """All rollouts as they were measured: the model's filter knows their noise."""
+        return self._measurements()
+
+    def _predicted(self, added: Sequence[Record]) -> list[float]:
+        """None: the model gives each rollout its own cost."""
+        return []
+
+    def _fields(self) -> Array:
+        """Initial states of rollouts, with their innovations."""
+        if self._progress.belief is None:
+            return super()._fields()
+        return self._progress.belief.loop(self._context).beginnings(self._data())
+
+    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
+        """More rollouts may determine a model."""
+        row["reason"] = f"{self._unpredicted}; the law is kept"
+
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
+        """A step from the law that measured best."""
+        own = [record for record in self._records.all() if self._is_linear(record.policy)]
+        best = best_measured(own, self._first)
+        if not self._is_linear(self._progress.policy):
+            self._progress.policy = best.copy()
+        loop = belief.loop(self._context)
+        fields = loop.beginnings(own)
+        found = step(loop, fields, best, self._settings, READINGS_TRUST)
+        if found is None:
+            row["reason"] = "the improved law does not stay finite on the model; the law is kept"
+        else:
+            self._progress.policy, row["steps"] = found
+
+    def _judge(self, row: Row) -> None:
+        """Judge the law that measured best in place of the last one."""
+        others = [
+            record
+            for record in self._records.all()
+            if self._is_linear(record.policy) and not np.array_equal(record.policy, self._first)
+        ]
+        self._progress.policy = best_measured(others, self._progress.policy).copy()
+        super()._judge(row)
+
+    def _is_linear(self, policy: Array) -> bool:
+        """False of a law on an estimate of the field, which a model of the readings does not have."""
+        law = self._context.law
+        return not (isinstance(law, ExtendedKalman) and law.estimates(policy))
+
 
 _ATTEMPTS = 5
 """Maximum number of times that an equation is looked for in vain."""

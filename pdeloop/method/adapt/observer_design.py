@@ -35,10 +35,10 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.estimated_loop import WholeFieldLaw
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.sensed_loop import SensedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.whole_field_law import WholeFieldLaw
 from pdeloop.method.design.lqg import kalman_filter
 from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.models.sensed import SensedModel

@@ -15,9 +15,8 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
-from pdeloop.method.adapt.closed_loop import ClosedLoopProblem, Simulation
+from pdeloop.method.adapt.closed_loop import ClosedLoopProblem, ObservedLoop, Simulation
 from pdeloop.method.adapt.estimated_loop import simulate_estimated
-from pdeloop.method.adapt.observed_loop import ObservedLoop
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models.sensed import SensedModel, interpolated, sensed_model

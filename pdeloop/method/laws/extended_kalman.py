@@ -12,8 +12,14 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.observer import Observer
-from pdeloop.method.models.sensed import WAVES, Actuators, grid_points, sensed_model, unknowns
-from pdeloop.method.models.sensed_filter import SensedFilter
+from pdeloop.method.models.sensed import (
+    WAVES,
+    Actuators,
+    SensedFilter,
+    grid_points,
+    sensed_model,
+    unknowns,
+)
 from pdeloop.method.models.settings import DEFAULTS, SENSED_MOST, FieldModelSettings
 
 FIELD_COEFFICIENTS = 1 + 2 * WAVES

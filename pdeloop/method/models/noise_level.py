@@ -11,7 +11,7 @@ sigma^2 itself where a band has no waves of the field.
 
 That alone is no evidence of noise: the short waves of a front that moves over several points between
 two states are white in time as well. But they are not white in space, as they gather around the front.
-Whether there is noise is then decided by a model (`undeclared_noise`).
+Whether there is noise is then decided by a model (`selection`).
 
 Whether residuals are white in time and space, as noise is, is a portmanteau test (`is_white`). The
 residuals of a wrong model are smooth, or gather where the field is steep, so that they or their
