@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from benchmarks.tasks.common import training
 from benchmarks.tasks.convection import Admissible
 from pde_sim_node.plants import DynamicsPlant
 from pdeloop import rollout
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import model_based
 from pdeloop.method.adapt.base import Context, Record, Trajectory
@@ -22,12 +25,14 @@ B = np.array([[0.0], [1.0]])
 TARGET = np.array([0.3, -0.2])
 
 
-def _record(seed: int, steps: int = 40) -> Record:
+def _record(
+    seed: int, steps: int = 40, size: float = 0.3, limits: ActionSet = ANY_ACTION
+) -> Record:
     """x' = A x + B a - 0.1 (x_1^2, 0) about the target, far from it at all times."""
     rng = np.random.default_rng(seed)
-    actions = 0.3 * rng.standard_normal((steps, 1))
+    actions = size * rng.standard_normal((steps, 1))
     x = [np.array([2.0, 0.5])]
-    for a in actions:
+    for a in limits.applied(actions):
         x.append(A @ x[-1] + B @ a - 0.1 * np.array([x[-1][0] ** 2, 0.0]))
     assert min(np.linalg.norm(own) for own in x) > 0.5
     return Record(np.zeros((1, 4)), np.inf, np.array(x) + TARGET, actions)
@@ -46,6 +51,17 @@ def test_the_law_is_that_of_the_plant_linearised_at_the_target() -> None:
     K = track(ReducedModel(A, B, np.eye(2)), state_weight=1.0, action_weight=0.1).K_a
     np.testing.assert_allclose(found[:, :2], K, rtol=0.02)
     assert np.array_equal(found[:, 2:], -found[:, :2])  # none at the target
+
+
+def test_actuators_of_limited_rate_begin_each_rollout_anew() -> None:
+    limits = ActionSet(1, rate=0.3)
+    records = [_record(seed, 8, 0.5, limits) for seed in range(20)]
+    found = law_about_target(_context(records[0], action_set=limits), records)
+    free = law_about_target(
+        _context(records[0]),
+        [replace(own, actions=limits.applied(own.actions)) for own in records],
+    )
+    assert found is not None and free is not None and np.array_equal(found, free)
 
 
 def test_there_is_no_law_of_few_samples_or_of_another_cost() -> None:

@@ -38,6 +38,8 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
 from pdeloop.method.design.lqt import track
+from pdeloop.method.models.base import Measured, Samples
+from pdeloop.method.models.choice import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
 FEWEST = 2
@@ -138,18 +140,13 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
     if W is not None and np.linalg.matrix_rank(np.diag(W) if W.ndim == 1 else W) < len(context.U):
         return None
     U, n_s = context.U, context.U.shape[1]
-    pairs = [
-        (record.states, min(len(record.actions), len(record.states) - 1)) for record in records
-    ]
-    x = np.concatenate([(states[:count] - context.target) @ U for states, count in pairs])
-    after = np.concatenate(
-        [(states[1 : count + 1] - context.target) @ U for states, count in pairs]
-    )
-    asked = [own.actions[:count] for own, (_, count) in zip(records, pairs, strict=True)]
-    a = context.action_set.applied(np.concatenate(asked))
+    rollouts = [Measured(record.states, record.actions) for record in records]
+    samples = Samples.of([limited(rollout, context.action_set) for rollout in rollouts])
     rows, columns = np.triu_indices(n_s)
-    if len(x) < n_s + a.shape[1] + len(rows):
+    a = samples.actions
+    if len(samples) < n_s + a.shape[1] + len(rows):
         return None
+    x, after = ((states - context.target) @ U for states in (samples.before, samples.after))
     unit = float(np.sqrt(np.mean(x**2, axis=0).max())) or 1.0
     x, after = x / unit, after / unit
     features = np.hstack([x, a, x[:, rows] * x[:, columns]])
