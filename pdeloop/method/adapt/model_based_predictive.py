@@ -65,7 +65,7 @@ from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.base import FieldModel
-from pdeloop.method.models.sensed import SensedModel
+from pdeloop.method.models.sensed import SensedFilter, SensedModel
 from pdeloop.method.seeds import field_seed
 from pdeloop.process.one_thread import one_thread
 
@@ -458,18 +458,39 @@ def share_saved(costs: Array, before: Array) -> float:
     return share if np.isfinite(share) else 0.0
 
 
-def simulated(planner: Planner, fields: Array) -> Array:
-    """Mean stage costs (F,) on the planner's own model from initial fields (F, n_z)."""
-    cost, z = planner.cost, fields
-    totals, plan = np.zeros(len(fields)), np.zeros((len(fields), planner.steps, len(planner.b)))
-    a = plan[:, 0]
+def simulated(
+    planner: Planner,
+    fields: Array,
+    sensed: tuple[SensedModel, SensedFilter, float] | None = None,
+) -> Array:
+    """Mean stage costs (F,) of plans in closed loop on a model from initial fields (F, n).
+
+    sensed: the model that is read, the filter from whose estimates plans start, and the noise of the
+    readings; without them, plans start from the states of the planner's own model.
+    """
+    cost, z, a, count = planner.cost, fields, None, len(fields)
+    totals, plan = np.zeros(count), np.zeros((count, planner.steps, len(planner.b)))
+    model: FieldModel = planner.model
+    if sensed is not None:
+        model, known, sigma = sensed
+        x, S = (np.repeat(part[None], count, axis=0) for part in known.start)
+        shape = cost.horizon, count, model.sensors
+        noise = sigma * np.random.default_rng(0).standard_normal(shape)
     with np.errstate(all="ignore"):
         for k in range(cost.horizon):
-            a, plan, _ = planner.step(plan, planner.after(z, a if k else None), k)
+            if sensed is None:
+                x = z
+            else:
+                x, S = known.measured(x, S, z[:, known.model.seen] + noise[k])
+            a, plan, _ = planner.step(plan, planner.after(x, a), k)
             plan = planner.shifted(plan)
             cost.add(totals, z, a, k)
-            z = planner.model.step(z, a)
+            z = model.step(z, a)
             lost = ~np.isfinite(z).all(axis=1)
+            if sensed is not None:
+                x, S = known.predicted(x, S, a)
+                lost |= ~np.isfinite(x).all(axis=1)
+                x[lost], S[lost], a[lost] = 0.0, 0.0, 0.0
             totals[lost], z[lost] = np.inf, 0.0
         cost.add_terminal(totals, z)
     totals[~np.isfinite(totals)] = np.inf
@@ -564,28 +585,9 @@ def simulated_from_estimates(
 
     law, theta: whose filter estimates, from readings with the model's noise.
     """
-    model, T, count = loop.model, loop.horizon, len(fields)
+    model = loop.model
     assert isinstance(model, SensedModel)
     known = law.filter(law.parts(theta))
     if known is None:
-        return np.full(count, np.inf)
-    noise = loop.noise * np.random.default_rng(0).standard_normal((T, count, model.sensors))
-    z, a, cost, totals = fields, None, planner.cost, np.zeros(count)
-    plan = np.zeros((count, planner.steps, len(planner.b)))
-    x, S = (np.repeat(part[None], count, axis=0) for part in known.start)
-    with np.errstate(all="ignore"):
-        for k in range(T):
-            x, S = known.measured(x, S, z[:, model.seen] + noise[k])
-            a, plan, _ = planner.step(plan, planner.after(x, a), k)
-            plan = planner.shifted(plan)
-            cost.add(totals, z, a, k)
-            z = model.step(z, a)
-            x, S = known.predicted(x, S, a)
-            lost = ~(np.isfinite(z).all(axis=1) & np.isfinite(x).all(axis=1) & np.isfinite(totals))
-            totals[lost] = np.inf
-            for part in (z, x, S, a):
-                part[lost] = 0.0
-        cost.add_terminal(totals, z)
-    totals[~np.isfinite(totals)] = np.inf
-    found: Array = totals / T
-    return found
+        return np.full(len(fields), np.inf)
+    return simulated(planner, fields, (model, known, loop.noise))
