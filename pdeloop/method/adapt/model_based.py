@@ -341,12 +341,9 @@ class ModelBased(Optimizer):
         least = (1.0 - self._settings.least_gain) * min(costs[:-2], default=np.inf)
         return self._repeats and len(costs) > 2 and min(costs[-2:]) >= least
 
-    _about_target = True
-    """Whether laws about the target are tried."""
-
     def _law_about_target(self) -> Array | None:
         """One of all that was measured, while rollouts are left; else None."""
-        affine = self._about_target and not isinstance(self._context.law, FeedForward | Observer)
+        affine = not isinstance(self._context.law, FeedForward | Observer)
         left = self._records.count < self._schedule.last
         if not (affine and left and self._repeats) or self._progress.replayed:
             return None
@@ -450,8 +447,12 @@ class ModelBased(Optimizer):
 
     _unpredicted = "no model of the whole field predicts the rollouts"
 
-    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
-        """A step along measured rollouts from the law that is best on fields of the first one."""
+    def _replay(self, model: Belief | None, row: Row, final: bool, why: str = "") -> None:
+        """A step along measured rollouts from the law that is best on fields of the first one.
+
+        why: no law is improved on a model; default: none predicts the rollouts.
+        """
+        why = why or self._unpredicted
         progress, records = self._progress, self._records.all()
         laws = {record.policy.tobytes(): record.policy for record in records}
         best = best_on_same_fields(records, list(laws.values()), self._first)
@@ -462,7 +463,7 @@ class ModelBased(Optimizer):
         else:
             progress.trust = FIRST_TRUST
         progress.policy = best.copy()
-        row["reason"] = f"{self._unpredicted}: steps along measured ones"
+        row["reason"] = f"{why}: steps along measured ones"
         if final:
             return
         found = None
@@ -472,7 +473,7 @@ class ModelBased(Optimizer):
             if usable:
                 found = step(loop, loop.replays_of(usable), best, self._settings, progress.trust)
         if found is None:
-            row["reason"] = f"{self._unpredicted}, and no step along them stays finite"
+            row["reason"] = f"{why}, and no step along them stays finite"
         else:
             progress.policy, row["steps"] = found
 
@@ -504,11 +505,7 @@ class ModelBased(Optimizer):
                 final=final,
             )
         if found is None:
-            self._replay(belief, row, final)
-            reason = str(row["reason"])
-            row["reason"] = reason.replace(
-                self._unpredicted, "no improved law stays finite on the model"
-            )
+            self._replay(belief, row, final, "no improved law stays finite on the model")
             return
         self._progress.trust = 0.0
         self._progress.improved, self._progress.parts = found.improved, found.parts

@@ -56,7 +56,6 @@ class ModelBasedReadings(ModelBased):
 
     _unpredicted = "no model of the readings predicts the rollouts"
     _model_compares = False
-    _about_target = False
 
     def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
@@ -76,9 +75,9 @@ class ModelBasedReadings(ModelBased):
             return super()._fields()
         return self._progress.belief.loop(self._context).beginnings(self._data())
 
-    def _replay(self, model: Belief | None, row: Row, final: bool) -> None:
+    def _replay(self, model: Belief | None, row: Row, final: bool, why: str = "") -> None:
         """More rollouts may determine a model."""
-        row["reason"] = f"{self._unpredicted}; the law is kept"
+        row["reason"] = f"{why or self._unpredicted}; the law is kept"
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """A step from the law that measured best."""
