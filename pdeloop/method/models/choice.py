@@ -76,8 +76,8 @@ SQUARES_ENOUGH = 0.01
 """`enough` of an equation with squares alone, as cubes may be small where it was measured."""
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
-ACCURATE = 5e-3
-"""E of the first three of them at which no other kind is tried: hardly one is `BETTER` times better."""
+ACCURATE, TRIED = 5e-3, "front2"
+"""E at which no kind after this form is tried: hardly one is `BETTER` times better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +401,7 @@ def fit_field_model(
                 judged[kind] = error
                 if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
                     break
-                if kind.name == FORMS[SIMPLEST - 2].name and min(judged.values()) <= ACCURATE:
+                if kind.name == TRIED and min(judged.values()) <= ACCURATE:
                     break
         if not judged:
             return None

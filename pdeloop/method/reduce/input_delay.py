@@ -45,7 +45,7 @@ FOLDS = 4
 """Groups of parts of the data that are held out one after the other."""
 EVIDENCE = 10.0
 """Log-likelihood by which another delay must be better."""
-TOO = 0.3
+ADDED = 0.3
 """Share of the log-likelihood gained by another delay that the inputs as used may add to it."""
 LOWER = 0.9
 """Squared error, relative to that of the delay before, up to which another one matters."""
@@ -296,7 +296,7 @@ class _Regression:
         moved = [j for j in range(self.n_a) if later[j] > used[j]]
         columns += self._inputs([used[j] for j in moved], moved)
         both = self._log(self._held_out(columns, self.of_xy, self.of_yy)) - self.likelihood(later)
-        return both > max(EVIDENCE, TOO * (self.likelihood(later) - self.likelihood(used)))
+        return both > max(EVIDENCE, ADDED * (self.likelihood(later) - self.likelihood(used)))
 
     def gain(self, delays: Delays, than: Delays) -> float:
         """The ratio of the errors, the root of its mean square over channels."""
