@@ -97,9 +97,13 @@ class Browser:
     def wait_for(self, condition: Callable[[], Any], limit: float, what: str) -> Any:
         deadline = time.monotonic() + limit
         while not (found := condition()):
-            assert time.monotonic() < deadline, f"no {what} within {limit} s"
+            assert time.monotonic() < deadline, f"no {what} within {limit} s: {self.text()}"
             time.sleep(0.1)
         return found
+
+    def text(self) -> str:
+        """What the page says, for who reads a failure."""
+        return str(self.ask("document.body.innerText"))[:2000]
 
     def click(self, selector: str) -> None:
         """A click of the mouse in the middle of an element."""

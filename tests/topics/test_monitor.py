@@ -192,6 +192,7 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         assert "ROS domain" in page.ask("document.querySelector('#place').textContent")
 
         monitor.send_signal(signal.SIGKILL)
+        monitor.wait(LIMIT)  # only then its port is free
         page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
         before = page.ask(ROLLOUTS)
         port = urlsplit(url).port

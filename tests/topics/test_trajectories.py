@@ -7,6 +7,7 @@ import pytest
 
 from pdeloop.finished_run import load_run
 from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import operator
 from tests.support.small import FEW_FITS, parameters, train_here
 from tests.support.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
 from tuner_node.run_folder import RunFolderError
@@ -18,14 +19,18 @@ ROLLOUTS = 15
 def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Processes, tmp_path):
     """Somebody who listens to the loop answers each state before, at and after its step."""
     out = tmp_path / "run"
-    plant = start_pair(loop, real_time_factor=20.0)["plant"]  # so that the stranger keeps up
+    plant = start_pair(loop, real_time_factor=1.0)["plant"]  # until the stranger had its say
     stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
     until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
     options = {"rollouts": ROLLOUTS, "optimizer": "model_based", "seeds": 2, **FEW_FITS}
-    loop.wait(start_tuner(loop, out, **options, max_attempts=50), LIMIT)
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, **options, max_attempts=50)
+        until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
+        until(lambda: int(loop.output(stranger).split()[-1]) > 100, LIMIT, "actions")
+        assert tuner.poll() is None
+        assert desk.ask(set=["/pde_sim_node", "real_time_factor", 0.0])[0]
+        loop.wait(tuner, LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
-    until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
-    assert int(loop.output(stranger).split()[-1]) > 100  # it had its say
     stranger.kill()
 
 
