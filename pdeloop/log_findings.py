@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,8 @@ class Finding:
 class _Runs:
     """Equal values in a row, of one channel: first row, length, the changes before and after.
 
-    grain: the last digit of each value, or the resolution if that is larger.
+    grain: the last digit of each value in a column of as many decimals and digits as its longest
+    numbers have, or the resolution if that is larger.
     """
 
     begins: NDArray[np.int64]
@@ -89,11 +91,14 @@ class _Runs:
         moved = change[change > 0.0]
         resolution = float(moved.min()) if moved.size else 0.0
         grain = np.full(len(begins), resolution)
-        for number in np.flatnonzero(lengths >= 3):
-            value = repr(float(x[begins[number]])).lower()
-            mantissa, _, exponent = value.partition("e")
-            digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
-            grain[number] = max(resolution, digit)
+        if (lengths >= 3).any():
+            own = x[begins]
+            written = [Decimal(repr(value)).normalize() for value in own[np.isfinite(own)].tolist()]
+            places = max(len(value.as_tuple().digits) for value in written)
+            last = min(int(value.as_tuple().exponent) for value in written)
+            with np.errstate(divide="ignore"):  # of 0
+                first_digits = np.floor(np.log10(np.abs(own)))
+            grain = np.maximum(resolution, 10.0 ** np.maximum(last, first_digits - places + 1))
         return _Runs(begins, lengths, change, np.r_[change[1:], 0.0], resolution, grain)
 
     @property

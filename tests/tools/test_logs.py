@@ -120,6 +120,16 @@ def saturated(z: np.ndarray, u: np.ndarray) -> None:
     np.minimum(z[:, 0], np.quantile(z[:, 0], 0.8), out=z[:, 0])
 
 
+def stuck_at_a_round_number(z: np.ndarray, u: np.ndarray) -> None:
+    z /= 100.0
+    z[100:115, 1] = np.round(z[100, 1], 1)
+
+
+def saturated_at_a_round_number(z: np.ndarray, u: np.ndarray) -> None:
+    z /= 100.0
+    np.minimum(z[:, 0], np.round(np.quantile(z[:, 0], 0.7), 1), out=z[:, 0])
+
+
 @pytest.mark.parametrize(
     ("what", "words", "left_out"),
     [
@@ -131,6 +141,8 @@ def saturated(z: np.ndarray, u: np.ndarray) -> None:
             r"z1 is at \S+, an end of the range, in 60 rows, the first of them row \d+",
             60,
         ),
+        (stuck_at_a_round_number, r"z2 is frozen \(\d+\.\d\) in 15 rows, from row 102 on", 15),
+        (saturated_at_a_round_number, r"z1 is at 0\.6, an end of the range, in 50 rows", 50),
     ],
 )
 def test_rows_that_are_not_the_plants_are_told_and_left_out(
