@@ -296,7 +296,7 @@ def identify_data(
     delays = study_delays(found.trajectories, used)
     if input_delay is None:
         used = delays.best
-    if input_delay is not None or delays.alike:
+    if input_delay is not None or delays.alike or delays.at_end:
         better = delays.text(found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     return _identified(

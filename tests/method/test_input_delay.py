@@ -31,12 +31,14 @@ def logged(
     held: int = 1,
     seed: int = 0,
     steps: int = 200,
+    drawn: float = 10.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     rng, z, a = np.random.default_rng(seed), np.zeros((steps + 1, 4)), np.zeros((steps, 2))
+    excitation = np.zeros(2)
     for k in range(steps):
-        drawn = 10.0 * rng.normal(size=2)
-        a[k] = drawn if k % held == 0 else a[k - 1]
-        a[k] += feedback * K @ z[k]
+        again = drawn * rng.normal(size=2)
+        excitation = again if k % held == 0 else excitation
+        a[k] = excitation + feedback * K @ z[k]
         acting = [a[k - n, j] if k >= n else 0.0 for j, n in enumerate(delays)]
         z[k + 1] = A @ z[k] + B @ acting + process * rng.normal(size=4)
     return z + noise * rng.normal(size=z.shape), a
@@ -49,6 +51,38 @@ def test_the_delay_of_each_input_is_found(delays: tuple[int, int], case: dict[st
     assert study_delays([(z, a)]).best == delays
     # The same with each input logged a row late.
     assert study_delays([(z[1:-1], a[:-2])]).best == tuple(n - 1 for n in delays)
+
+
+@pytest.mark.parametrize("late", [(1, 1), (2, 2), (3, 3), (6, 6), (0, 2), (2, 0), (1, 3)])
+@pytest.mark.parametrize("held", [1, 5, 10])
+def test_inputs_logged_some_rows_late_are_not_taken_for_feedback(
+    late: tuple[int, int], held: int
+) -> None:
+    z, a = logged((0, 0), held=held, steps=400)
+    written = np.stack(
+        [a[np.maximum(np.arange(400) - n, 0), j] for j, n in enumerate(late)], axis=1
+    )
+    assert study_delays([(z, written)]).best == tuple(-n for n in late)
+
+
+@pytest.mark.parametrize("dither", [0.1, 1.0])
+@pytest.mark.parametrize("held", [1, 10])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_law_with_weak_excitation_is_not_logged_late(dither: float, held: int, seed: int) -> None:
+    """The states say more of each input than the inputs do of them."""
+    for noise in (0.0, 0.02):
+        known = logged(
+            (0, 0), drawn=dither, process=0.3, feedback=1.0, noise=noise, held=held, seed=seed
+        )
+        assert study_delays([known]).best == (0, 0)
+
+
+def test_a_dead_time_beyond_the_range_is_looked_for_further_on_or_said_to_be_unclear() -> None:
+    assert study_delays([logged((12, 12), held=5, steps=400)]).best == (12, 12)
+    found = study_delays([logged((12, 12), held=5, steps=85)])
+    assert found.best == found.at_end * 2 == (10, 10)
+    text = found.text()
+    assert "at least 10 rows later" in text and "how many rows is not clear" in text
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -12,9 +12,10 @@ channel i on the other parts. Of N steps, another n than 0 has a log-likelihood 
 (N / 2) sum_i log(E_i(0) / E_i(n)), the error variances being those of the held-out parts. The
 delay of each input on its own follows by a search along single inputs.
 
-Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only if measurements do not improve
-the prediction of inputs from their own past (Granger). And another delay counts only if the inputs with
-the delay in use add nothing to it.
+Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only for an input a_k whose prediction
+from its own past z_{k+n} does not improve (Granger), while the change to z_{k+n+1} does: the effect of
+an input that is logged late is in the states before its row, but not in those before it acted. And
+another delay counts only if the inputs with the delay in use add nothing to it.
 
 References
 ----------
@@ -25,7 +26,7 @@ Econometrica 37(3), 1969.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,8 +38,8 @@ from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
 from pdeloop.method.reduce.reduced_model import Trajectory, repeated
 from pdeloop.process.one_thread import one_thread
 
-EARLIEST, LATEST = -2, 10
-"""Delays that are tried."""
+EARLIEST, LATEST = -10, 10
+"""Delays that are tried, and twice as many while the best is the first or the last of them."""
 MODES = 8
 """Leading modes of larger states that are predicted."""
 FOLDS = 4
@@ -58,6 +59,7 @@ ROUNDED = 1e-13
 _RIDGE = 1e-13
 
 Delays = tuple[int, ...]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,15 @@ class DelayStudy:
 
     best: 0 of each where no other one is better beyond chance; error: of single steps with `best`,
     relative to that with the delays in use, the root of the mean square over channels; alike: other
-    delays that the data do not tell apart from `best`, each with a likelihood within EVIDENCE of it.
+    delays that the data do not tell apart from `best`, each with a likelihood within EVIDENCE of it;
+    at_end: those of `best` beyond which none was tried.
     """
 
     best: Delays
     used: Delays
     gain: float = 1.0
     alike: tuple[Delays, ...] = ()
+    at_end: Delays = ()
 
     def text(self, channels: Channels = NUMBERED, sample_time: float | None = None) -> str:
         """One sentence on what is better than the delays in use; empty if nothing is."""
@@ -85,7 +89,8 @@ class DelayStudy:
             names = listed([channels.input(j) for j in own]) if len(moves) > 1 else "the inputs"
             if move:
                 way = "earlier" if move < 0 else "later"
-                parts.append(f"{names} {_rows(abs(move))} {way}")
+                least = "at least " if any(self.best[j] in self.at_end for j in own) else ""
+                parts.append(f"{names} {least}{_rows(abs(move))} {way}")
         why = []
         if max(self.best) > 0:
             times = "" if sample_time is None else f" of {max(self.best) * sample_time:.3g} s"
@@ -93,11 +98,16 @@ class DelayStudy:
         if min(self.best) < 0:
             why.append("a row has the input that led to its state, logged late")
         fit = f"the data fit {self.gain:.3g} times better with {' and '.join(parts)}, so "
-        if self.alike:
+        if self.alike or self.at_end:
             others = " or ".join(map(_value, self.alike[:3]))
+            unclear = (
+                f"the data do not tell {_value(self.best)} and {others} apart: log more steps or less "
+                "noise"
+                if self.alike
+                else "more are not tried in a log of this length: log more steps"
+            )
             return (
-                f"{fit}{' and '.join(why)}; how many rows is not clear, as the data do not tell "
-                f"{_value(self.best)} and {others} apart: log more steps or less noise, or give the "
+                f"{fit}{' and '.join(why)}; how many rows is not clear, as {unclear}, or give the "
                 f"number that is known, as --input-delay={_value(self.best)}"
             )
         return f"{fit}{' and '.join(why)}: give --input-delay={_value(self.best)}"
@@ -159,33 +169,47 @@ def study_delays(
     n_a = known[0][1].shape[1]
     used = used or (0,) * n_a
     longest = max(len(a) for _, a in known)
-    latest = max(min(LATEST, longest // 8), *used)
-    lags = range(min(EARLIEST, *used), latest + 1)
+    most = longest // 8
+    ends = min(max(EARLIEST, -most), *used), max(min(LATEST, most), *used)
+    found = DelayStudy(used, used)
     with one_thread():
-        data = _Regression.of(known, lags)
-        if data is None:
-            return DelayStudy(used, used)
-        low = min(0, *used) if data.fed_back else lags[0]
-        tried = range(low, lags[-1] + 1)
-        best = used
-        while True:
-            others: list[Delays] = [(n,) * n_a for n in tried]
-            if 1 < n_a <= MOST_INPUTS:
-                others += [(*best[:j], n, *best[j + 1 :]) for j in range(n_a) for n in tried]
-            better = max(others, key=data.likelihood)
-            if not data.is_better(better, best):
+        while data := _Regression.of(known, range(ends[0], ends[1] + 1)):
+            found = _best(data, used)
+            wider = (
+                min(ends[0], max(2 * ends[0], -most)) if ends[0] in found.best else ends[0],
+                max(ends[1], min(2 * ends[1], most)) if ends[1] in found.best else ends[1],
+            )
+            if wider == ends:
                 break
-            best = better
-        # Both steps together, of which each was.
-        if not data.is_better(best, used) or data.acts_as_well(used, best):
-            best = used
-        near = data.likelihood(best) - EVIDENCE
-        alike = (
-            ()
-            if best == used
-            else tuple(other for other in others if other != best and data.likelihood(other) > near)
-        )
-        return DelayStudy(best, used, data.gain(best, used), alike)
+            ends = wider
+    at_end = tuple(n for n in set(found.best) - set(used) if n in ends)
+    return replace(found, at_end=at_end)
+
+
+def _best(data: _Regression, used: Delays) -> DelayStudy:
+    """The best delays among the lags of a regression."""
+    n_a, free = data.n_a, {n: data.free(n) for n in data.lags if n < min(0, *used)}
+    common = [n for n in data.lags if n not in free or (free[n][0].all() and free[n][1].any())]
+    best = used
+    while True:
+        others: list[Delays] = [(n,) * n_a for n in common]
+        if 1 < n_a <= MOST_INPUTS:
+            others += [
+                (*best[:j], n, *best[j + 1 :])
+                for j in range(n_a)
+                for n in data.lags
+                if n not in free or (free[n][0][j] and free[n][1][j])
+            ]
+        better = max(others, key=data.likelihood)
+        if not data.is_better(better, best):
+            break
+        best = better
+    # All steps together, of which each was.
+    if best == used or not data.is_better(best, used) or data.acts_as_well(used, best):
+        return DelayStudy(used, used)
+    near = data.likelihood(best) - EVIDENCE
+    alike = tuple(other for other in others if other != best and data.likelihood(other) > near)
+    return DelayStudy(best, used, data.gain(best, used), alike)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +317,10 @@ class _Regression:
         of what moves the others, and may predict better than the one that acts.
         """
         columns = [*range(1 + 2 * self.n), *self._inputs(later, range(self.n_a))]
-        moved = [j for j in range(self.n_a) if later[j] > used[j]]
-        columns += self._inputs([used[j] for j in moved], moved)
+        for j in range(self.n_a):
+            late = range(later[j] + 1, used[j] + 1)
+            others = [used[j]] if later[j] > used[j] else late
+            columns += self._inputs(others, [j] * len(others))
         both = self._log(self._held_out(columns, self.of_xy, self.of_yy)) - self.likelihood(later)
         return both > max(EVIDENCE, ADDED * (self.likelihood(later) - self.likelihood(used)))
 
@@ -303,28 +329,26 @@ class _Regression:
         own, other = (self.errors(one).sum(axis=0) for one in (delays, than))
         return float(np.sqrt(np.mean(other / own)))
 
-    @cached_property
-    def fed_back(self) -> bool:
-        """Whether inputs seem to follow the measurements, so that a_{k+1} would tell z_{k+1}.
+    def free(self, n: int) -> tuple[Flags, Flags]:
+        """Of each input: whether z_{k+n}, from which a_k acts with a delay n < 0, tells nothing of it.
 
-        If z_{k-1} improves the prediction of a_k from a_{k-1}, a_{k-2}, ...; or if it does not improve
-        that from z_k, of which a late input has caused the change since z_{k-1}.
+        That is, does not improve its prediction from a_{k-1}, a_{k-2}, ... And whether it improves that
+        from z_{k+n+1}: such an input has caused the change between the two.
         """
-        n, inputs = self.n, range(self.n_a)
-        now = self._inputs([0] * self.n_a, inputs)
+        inputs, at = range(self.n_a), n + 1
+        now = self._inputs([at] * self.n_a, inputs)
         past = [
             column
-            for lag in range(1, min(OWN_PAST, self.lags[-1]) + 1)
+            for lag in range(at + 1, min(at + OWN_PAST, self.lags[-1]) + 1)
             for column in self._inputs([lag] * self.n_a, inputs)
         ]
         of_y, of_yy = self.of_x[:, :, now], np.stack([self.of_x[:, j, j] for j in now], axis=1)
+        enough = max(EVIDENCE / (0.5 * float(self.counts.sum())), -float(np.log(LOWER)))
 
-        def improves(known: list[int]) -> bool:
-            """Whether z_{k-1} does, for one input at least."""
-            columns = [0, *known, *range(1 + n, 1 + 2 * n)]
+        def improves(known: list[int]) -> Flags:
+            columns = [0, *known, *range(1 + self.n, 1 + 2 * self.n)]
             without = self._held_out([0, *known], of_y, of_yy).sum(axis=0)
-            gained = float(np.log(without / self._held_out(columns, of_y, of_yy).sum(axis=0)).max())
-            enough = EVIDENCE / (0.5 * float(self.counts.sum()))
-            return gained > max(enough, -float(np.log(LOWER)))
+            with_it = self._held_out(columns, of_y, of_yy).sum(axis=0)
+            return np.asarray(np.log(without / with_it) > enough)
 
-        return improves(past) or not improves([*range(1, 1 + n)])
+        return ~improves(past), improves([*range(1, 1 + self.n)])
