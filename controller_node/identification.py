@@ -220,6 +220,7 @@ def designed(
     further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
     *,
     or_no_control: bool = False,
+    constant: bool | None = None,
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -238,6 +239,8 @@ def designed(
         are those of none.
     or_no_control : bool
         Gains of 0 where there are no stabilising ones.
+    constant : bool, optional
+        Whether regression and subspace models have a constant term; None: as `needs_constant` says.
 
     Raises
     ------
@@ -259,6 +262,7 @@ def designed(
             channels,
             shifted(further, delays) if further else (),
             or_no_control=or_no_control,
+            constant=constant,
         )
         if max(delays) <= 0:
             return inner
@@ -280,7 +284,9 @@ def designed(
             every,
             order=settings.reduced_order,
             channels=channels,
-            constant=regression.needs_constant(every, target.size),
+            constant=regression.needs_constant(every, target.size)
+            if constant is None
+            else constant,
         )
         return Designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
@@ -299,6 +305,7 @@ def designed(
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
         settings=settings.method,
+        constant=constant,
     )
     if settings.action_set.zero_mean:
         model = replace(model, B=model.B @ free.T)

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import linalg
 
 from controller_node.identification import DesignSettings, designed, examined, identify
 from pdeloop.data_file import Measurements
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""
+ASIDE = 0.05
+"""Distance from a target of 0 at which a law comes to rest, relative to the variation, that is told."""
 UNLIKE = 1e3
 """Ratio of the variations of two states of which one has no say in the cost."""
 DEAD = 1e-12
@@ -112,10 +115,13 @@ class Identified:
                 "alike"
             )
         if isinstance(self.model, ModelRows) and d is not None and not self.model.s_r.any():
-            found.append(
-                "the model has a constant term, but with a target of 0 the law a = K_a s + K_b s_r has "
-                "none: give the states relative to another point"
-            )
+            A, B, K = self.model.A, self.model.B, self.model.K_a
+            rest = linalg.norm(linalg.lstsq(np.eye(len(A)) - A - B @ K, d)[0])
+            if rest > ASIDE * linalg.norm(spread):
+                found.append(
+                    "the model has a constant term, but with a target of 0 the law a = K_a s + K_b s_r "
+                    "has none: give the states relative to another point"
+                )
         return found
 
     def summary(self) -> dict[str, Any]:
@@ -172,7 +178,7 @@ class Identified:
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
         if self.model.d is not None and self.model.d.any():
             lines.append(
-                "  constant term d: the data are not deviations from rest, and the law knows of it"
+                "  constant term d, as the zero of a log need not be a rest: the law knows of it"
             )
         if any(self.input_delay):
             told = " and ".join(map(str, dict.fromkeys(self.input_delay)))
@@ -309,6 +315,7 @@ def identify_data(
         remarks=found.remarks,
         delays=used,
         validation=validation,
+        constant=regression.has_offset(shifted(found.trajectories, used)),
     )
 
 
@@ -367,6 +374,7 @@ def _identified(
     remarks: tuple[str, ...] = (),
     delays: Delays = (),
     validation: Mapping[str, Measurements] = MappingProxyType({}),
+    constant: bool | None = None,
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
     known = {**recorded, **given}
@@ -394,7 +402,9 @@ def _identified(
         fitted_by = None
         if known.get("identification") == "dmdc":
             fitted_by = partial(_truncated, int(known.get("dmdc_rank", 0)))
-        study = study_orders(trajectories, channels=channels, fitted_by=fitted_by)
+        study = study_orders(
+            trajectories, channels=channels, fitted_by=fitted_by, constant=constant
+        )
     except NotIdentifiableError:  # whatever the order
         raise
     except ValueError as error:  # too few steps; the model itself may still be had
@@ -432,6 +442,7 @@ def _identified(
             settings,
             channels,
             or_no_control=target is None,
+            constant=constant,
         )
         model, field, innovations = found.rows, found.field, found.innovations
     else:
@@ -442,6 +453,7 @@ def _identified(
             n_s=min(order, n_z),
             p=p if truncated else 0,
             channels=channels,
+            constant=constant,
         )
     late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
     aligned = shifted(logged, early) if delays else trajectories

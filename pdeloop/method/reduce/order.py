@@ -123,6 +123,7 @@ def study_orders(
     channels: Channels = NUMBERED,
     settings: IdentificationSettings = DEFAULTS,
     fitted_by: Callable[[Steps, Array], ReducedModel] | None = None,
+    constant: bool | None = None,
 ) -> OrderStudy:
     """Try orders of a reduced model on held-out parts of trajectories of one plant.
 
@@ -140,6 +141,8 @@ def study_orders(
         `order_pieces`, `order_folds` and `order_share`.
     fitted_by : callable, optional
         The model of steps on modes U (n_z, n), in place of the regression.
+    constant : bool, optional
+        Whether the models of the regression have a constant term; None: as `needs_constant` says.
 
     Returns
     -------
@@ -180,7 +183,8 @@ def study_orders(
         singular_values: Array = linalg.svdvals(everything.after)
         if len(everything.inputs) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
-        constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
+        if constant is None:
+            constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
         by = fitted_by or (lambda data, U: fit(data, U, constant))
         for fitted, held in turns(pieces(known, _ORDER_PIECES), settings.order_folds):
             data = steps_of(fitted)

@@ -6,8 +6,9 @@ Y = [a_0 .. a_{N-1}] (one column per step),
 
     [A B d] = argmin || U^T Z' - A U^T Z - B Y - d 1^T ||_F^2,
 
-with d = 0 unless a constant term predicts all held-out parts of the data better: logs hold degrees and
-per cent, not deviations from rest.
+with d = 0 unless a constant term predicts all held-out parts of the data better. The zero of a log in
+degrees and per cent is not the plant's rest, so it has one (`has_offset`) whatever the data say:
+without it a pole that they hardly tell from 1 is at 1.
 
 Data that do not determine it are refused (`pdeloop.method.reduce.identifiability`). States are
 projected and inputs are kept whole, so that there is no second rank to choose and nothing depends on
@@ -56,6 +57,8 @@ FOLDS = 4
 """Parts of the data that are held out one after the other."""
 ROUNDED = 1e-24
 """Squared error, relative to the squared states, that is rounding."""
+NEGLIGIBLE = 1e-20
+"""Squared constant term, relative to the mean square of the states, that is rounding."""
 LOWER = 0.995
 """Squared error with a constant term, relative to that without, below which it is needed."""
 
@@ -156,6 +159,17 @@ def needs_constant(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], n_s: int
         if not (with_it < LOWER * without and without > rounding):
             return False
     return True
+
+
+def has_offset(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> bool:
+    """False if the constant term of all steps together is rounding, or they leave no room for one."""
+    data = steps_of(trajectories)
+    steps, n_a = data.inputs.shape
+    with one_thread():
+        U, values, _ = linalg.svd(data.after.T, full_matrices=False)
+        n = min(numerical_rank(values, *data.after.shape), steps - n_a - 1)
+        d = fit(data, U[:, : max(n, 1)], constant=True).d
+    return bool(n > 0 and steps * d @ d > NEGLIGIBLE * np.sum(data.after**2))
 
 
 def _missed(model: ReducedModel, data: Steps) -> Array:
