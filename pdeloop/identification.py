@@ -29,7 +29,11 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED, CostColumn
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels
-from pdeloop.method.reduce.identifiability import Identifiability, NotIdentifiableError
+from pdeloop.method.reduce.identifiability import (
+    Identifiability,
+    NotIdentifiableError,
+    require_effects,
+)
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
 from pdeloop.method.reduce.order import OrderStudy, study_orders
 from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
@@ -300,6 +304,7 @@ def identify_data(
         )
     used = (input_delay or (0,)) * (1 if len(input_delay or ()) > 1 else n_a)
     delays = study_delays(found.trajectories, used)
+    require_effects(shifted(found.trajectories, delays.best), found.channels)
     if input_delay is None:
         used = delays.best
     if input_delay is not None or delays.alike or delays.at_end:

@@ -11,6 +11,7 @@ import pytest
 
 from pdeloop.data_file import read_measurements
 from pdeloop.identification import Identified, identify_data
+from pdeloop.method.reduce.identifiability import NotIdentifiableError, require_effects
 
 A = np.diag([0.86, 0.74, 0.74, 0.86]) + 0.12 * (np.eye(4, k=1) + np.eye(4, k=-1))
 B = np.zeros((4, 2))
@@ -85,3 +86,43 @@ def test_data_without_noise_about_their_rest_need_no_constant_term(tmp_path: Pat
     model = identify_data(read_measurements(path), {}).model
     rest = np.linalg.solve(np.eye(4) - model.A, model.d)
     np.testing.assert_allclose(model.U @ rest, 20.0, rtol=1e-6)
+
+
+def test_an_input_that_hardly_moved_is_refused_by_name_and_the_rest_is_known(
+    tmp_path: Path,
+) -> None:
+    """A valve at 50 % but for its position's noise of 0.01 %: 0.0002 K a row, beside 0.02 K."""
+    u = steps()
+    u[:, 1] = 50.0 + 0.01 * np.random.default_rng(5).standard_normal(ROWS)
+    z = rod(u, REST) + 293.15
+    told = r"no effect of a2, which moved by 0\.0\d* about 50: move it more, .* out of --inputs$"
+    with pytest.raises(NotIdentifiableError, match=told):
+        identified(tmp_path, z, u)
+    found = identify_data(read_measurements(tmp_path / "own.csv", inputs="a1"), {})
+    assert found.pole[0] == pytest.approx(POLE, abs=0.002)
+    np.testing.assert_allclose(found.model.U @ found.model.B, B[:, :1], atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_slow_effect_in_noise_is_one_and_an_idle_input_has_none(seed: int) -> None:
+    """A row of the slow log changes the states by a hundredth of their noise at most."""
+    slow, rng = np.eye(4) + (A - np.eye(4)) / 30.0, np.random.default_rng(seed)
+    u = np.full((1500, 3), 50.0)
+    u[300:700, 0] = u[800:1200, 1] = 70.0
+    u[:, 2] = np.repeat(rng.uniform(0.0, 100.0, 300), 5)
+    z = np.tile(REST, (1501, 1))
+    for k in range(1500):
+        z[k + 1] = slow @ z[k] + B @ u[k, :2] / 30.0
+    z += 293.15 + rng.standard_normal(z.shape)
+    require_effects([(z, u[:, :2])])
+    with pytest.raises(NotIdentifiableError, match=r"no effect of a3, which moved by \d\d about"):
+        require_effects([(z, u)])
+
+
+def test_an_input_that_acts_later_than_looked_for_is_no_effect(tmp_path: Path) -> None:
+    u = np.random.default_rng(1).uniform(0.0, 100.0, (ROWS, 2))
+    late = np.vstack([np.tile(u[:1], (15, 1)), u[:-15]])
+    with pytest.raises(
+        NotIdentifiableError, match=r"no effect of a1 and a2, .* an --input-delay of more than ten"
+    ):
+        identified(tmp_path, rod(late, REST), u)

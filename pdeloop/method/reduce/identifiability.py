@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg
+from scipy import linalg, special
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce import channels as words
@@ -55,6 +55,12 @@ RESOLVED = 1e-7
 """Relative size of a singular value that the square of a matrix still resolves."""
 ROUNDED = 0.35
 """Root mean square of what rounding leaves, in steps: 0.29 for one that is uniform in a step."""
+ROUNDING = 1e-10
+"""Size of a residual, relative to the states, that is rounding."""
+BY_CHANCE = 1e-3
+"""Probability with which an input without effect is taken for one that has some."""
+COARSER = 4
+"""Rows of which the mean is taken, again and again, to see slow effects."""
 LEVELS = 10
 """Different values from which on an input counts as rounded; below it is switched."""
 
@@ -171,6 +177,63 @@ def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Ident
             f"{smallest:.1g} of the largest): take a lower order, or a longer log"
         )
     return Identifiability(unknowns, rank, smallest, independence, tuple(faults), tuple(remarks))
+
+
+def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> None:
+    """NotIdentifiableError for inputs that changed the states by no more than chance does.
+
+    From one row to the next, and from one mean of 4, 16, ... rows to the next, where a slow effect in
+    noise shows.
+    """
+    y = steps_of(trajectories).inputs
+    none, coarse = set(range(y.shape[1])), list(trajectories)
+    with one_thread():
+        while coarse and none:
+            none &= _without_effect(steps_of(coarse))
+            coarse = [_means(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
+    if none:
+        own = sorted(none)
+        names = [channels.input(j) for j in own]
+        moves, means = y.std(axis=0)[own].tolist(), y.mean(axis=0)[own].tolist()
+        raise NotIdentifiableError(words.no_effect(names, moves, means))
+
+
+def _means(z: Array, a: Array) -> Trajectory:
+    """Means of `COARSER` rows, and of the inputs from the middle of one to that of the next."""
+    count, n, half = len(z) // COARSER, COARSER, COARSER // 2
+    of_inputs = a[half : half + n * (count - 1)].reshape(count - 1, n, -1)
+    return z[: n * count].reshape(count, n, -1).mean(axis=1), of_inputs.mean(axis=1)
+
+
+def _without_effect(data: Steps) -> set[int]:
+    """Inputs of which z_{k+1} tells no more than columns of noise would, all else being known.
+
+    This is Hotelling's test of a column of B. Not those that cannot be told apart.
+    """
+    before, after, y = (
+        scaled(part - part.mean(axis=0))[0] for part in (data.before, data.after, data.inputs)
+    )
+    steps, n_a = y.shape
+    _, values, modes = linalg.svd(after, full_matrices=False)
+    n = min(numerical_rank(values, *after.shape), (steps - n_a - 1) // 4)
+    if n < 1:
+        return set(range(n_a))
+    s, next_, none = before @ modes[:n].T, after @ modes[:n].T, set[int]()
+    for j in range(n_a):
+        known = np.hstack([s, np.delete(y, j, axis=1)])
+        left = np.column_stack([y[:, j], next_])
+        left -= known @ linalg.lstsq(known, left)[0]
+        size = float(linalg.norm(left[:, 0]))
+        columns, sizes, _ = linalg.svd(left[:, 1:], full_matrices=False)
+        columns = columns[:, sizes > ROUNDING * values[0]]
+        told, rank = (
+            float(linalg.norm(columns.T @ left[:, 0])) / max(size, DEPENDENT),
+            columns.shape[1],
+        )
+        chance = special.betaincinv(rank / 2, (steps - 1 - n - n_a - rank) / 2, 1.0 - BY_CHANCE)
+        if size >= DEPENDENT and not (rank and told**2 > chance):
+            none.add(j)
+    return none
 
 
 def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]]:
