@@ -168,14 +168,15 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     if int(first.sum()) > most:
         raise ValueError(f"expected at most {most} trajectories, got {int(first.sum())}")
     step = _median_step(times, first) if log.step is None else log.step
-    found = findings(values, first, rows, log.channels, step or 1.0)
+    after_gap = np.zeros(len(first), dtype=bool)
+    if step is not None and timed:
+        after_gap[1:] = np.diff(times) > GAP * step
+    found = findings(values, first | after_gap, rows, log.channels, step or 1.0)
     spoilt = _missing(values, first, n_z)
     if remedies.cut:
         for one in found:
             spoilt = spoilt | one.spoilt
-        if step is not None and timed:
-            first = first | np.r_[False, np.diff(times) > GAP * step]
-        first = first | np.r_[False, spoilt[:-1]]
+        first = first | after_gap | np.r_[False, spoilt[:-1]]
         if spoilt.any():
             k, count = int(np.argmax(spoilt)), int(spoilt.sum())
             remarks.append(f"left out {count} rows, the first of them row {rows[k]}")

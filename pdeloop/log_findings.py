@@ -14,9 +14,11 @@ from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import SHOWN, Channels, listed
+from pdeloop.method.reduce.input_delay import LATEST
 
 __all__ = ["Finding", "findings", "sentinels"]
 
@@ -35,6 +37,8 @@ SATURATED = 10
 SATURATED_SHARE = 0.02
 SPIKE = 5.0
 """Size of a jump and of the one back, relative to the 98th percentile of all."""
+EXPLAINED = 0.02
+"""Part of usual steps that a regression misses of them at least."""
 OFFSET = 20.0
 """Standard deviations between 0 and the mean of a channel with a large offset."""
 ONE = 1e-7
@@ -206,6 +210,12 @@ def findings(
             if spoilt.any():
                 place = int(np.argmax(spoilt)), int(spoilt.sum())
                 found.setdefault((kind, *place), ([], spoilt))[0].append(i)
+    others = np.any(
+        [np.zeros(len(values), dtype=bool), *(own for _, own in found.values())], axis=0
+    )
+    others[1:] |= others[:-1].copy()
+    if (spoilt := _jumps(states, inputs, first) & ~others).any():
+        found["jump", 0, 0] = [*range(n_z)], spoilt
     result = [
         Finding(_sentence(kind, own, spoilt, states, rows, channels), spoilt)
         for (kind, _, _), (own, spoilt) in found.items()
@@ -243,11 +253,16 @@ def _sentence(
     k, count = int(np.argmax(spoilt)), int(spoilt.sum())
     names, value = listed([channels.state(i) for i in own]), states[k, own[0]]
     are = "is" if len(own) == 1 else "are"
+    more = f" (and in {count - 1} more rows)" if count > 1 else ""
     if kind == "spike":
-        more = f" (and in {count - 1} more rows)" if count > 1 else ""
         return (
             f"{names} {'jumps' if len(own) == 1 else 'jump'} to {value:.6g} for one row, row "
             f"{rows[k]}{more}: leave it out with --cut"
+        )
+    if kind == "jump":
+        return (
+            f"the states jump in row {rows[k]}{more}, and not by an input, as where another experiment "
+            "begins: begin its times anew there, or leave the row out with --cut"
         )
     if kind == "saturated":
         return (
@@ -287,6 +302,32 @@ def _spikes(x: Array, inputs: Array, first: Flags) -> Flags:
     pulse[1:-1] = (moved[:-1] * moved[1:] < 0.0).any(axis=1)
     pulse[1:] |= pulse[:-1].copy()
     return found & ~pulse
+
+
+def _jumps(states: Array, inputs: Array, first: Flags) -> Flags:
+    """Rows to which most channels jump, and stay, as neither the states nor the inputs explain.
+
+    Steps are explained by a linear regression, on inputs with dead times as well.
+    """
+    found = np.zeros(len(states), dtype=bool)
+    rows = np.flatnonzero(~first[1:])
+    parts = states[:, np.ptp(states, axis=0) > 0.0], inputs
+    if not (np.isfinite(states).all() and np.isfinite(inputs).all() and parts[0].size):
+        return found
+    z, u = ((x - x.mean(axis=0)) / np.where(np.ptp(x, axis=0), x.std(axis=0), 1.0) for x in parts)
+    modes = linalg.svd(z, full_matrices=False)[2][: max(len(z) // LEAST, 1)]
+    lags = range(-1, min(LATEST, len(z) // (LEAST * u.shape[1])) + 1)
+    near = [u[np.maximum(rows - lag, 0)] for lag in lags]
+    known = np.hstack([np.ones((len(rows), 1)), z[rows] @ modes.T, *near])
+    step = z[rows + 1] - z[rows]
+    missed = np.abs(step - known @ linalg.lstsq(known, step)[0])
+    least = EXPLAINED * np.quantile(np.abs(step), 0.98, axis=0)
+    usual = np.maximum(np.quantile(missed, 0.98, axis=0), least)
+    size = np.zeros(len(states))
+    size[rows + 1] = np.quantile(missed / usual, 0.5, axis=1, method="lower")
+    near_by = np.maximum(np.r_[0.0, size[:-1]], np.r_[size[1:], 0.0])
+    found[:] = (size > SPIKE) & (size > SPIKE * near_by)
+    return found
 
 
 def _frozen(x: Array, runs: _Runs, held: Flags) -> Flags:

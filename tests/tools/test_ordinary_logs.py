@@ -126,3 +126,30 @@ def test_an_input_that_acts_later_than_looked_for_is_no_effect(tmp_path: Path) -
         NotIdentifiableError, match=r"no effect of a1 and a2, .* an --input-delay of more than ten"
     ):
         identified(tmp_path, rod(late, REST), u)
+
+
+def test_an_experiment_that_is_appended_with_t_in_equal_steps_is_told_and_cut_off(
+    tmp_path: Path,
+) -> None:
+    other = rod(steps(9), np.array([20.0, 5.0, 0.0, 0.0]), seed=9)
+    z, u = np.vstack([rod(steps(), REST), other]) + 293.15, np.vstack([steps(), steps(9)])
+    for cut in (False, True):
+        found = identified(tmp_path, z, u, cut=cut)
+        assert found.pole[0] == pytest.approx(POLE, abs=1e-3)
+        assert len(found.sources) == 1 + cut
+        told = any(text.startswith("the states jump in row 603, and not") for text in found.remarks)
+        assert told != cut
+
+
+def test_steps_of_inputs_are_no_other_experiments(tmp_path: Path) -> None:
+    """Of a plant that answers at once, and whose dead time is eight rows."""
+    u = np.full((ROWS, 2), 50.0)
+    u[100:300, 0] = u[350:500, 1] = 60.0
+    late = np.vstack([u[:8], u[:-8]])
+    z = late @ np.array([[0.1, 0.3, 0.2, 0.1], [0.3, 0.1, 0.2, 0.2]])
+    z += 0.02 * np.random.default_rng(0).standard_normal(z.shape)
+    names = "t,z1,z2,z3,z4,a1,a2"
+    table = np.column_stack([np.arange(ROWS), z, u])
+    np.savetxt(tmp_path / "own.csv", table, delimiter=",", header=names, comments="")
+    remarks = read_measurements(tmp_path / "own.csv").remarks
+    assert not any("jump" in text for text in remarks)

@@ -186,7 +186,8 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
     noise shows.
     """
     y = steps_of(trajectories).inputs
-    none, coarse = set(range(y.shape[1])), list(trajectories)
+    coarse = list(trajectories)
+    none = set(range(y.shape[1]) if len(y) > y.shape[1] + LEFT else ())
     with one_thread():
         while coarse and none:
             none &= _without_effect(steps_of(coarse))
