@@ -119,6 +119,19 @@ def test_a_slow_effect_in_noise_is_one_and_an_idle_input_has_none(seed: int) -> 
         require_effects([(z, u)])
 
 
+def test_local_effects_in_a_short_log_of_a_long_field_are_seen() -> None:
+    """Three heaters of six of 128 cells in 60 rows, whose effects are identified to 10 %."""
+    rng, heat = np.random.default_rng(0), np.zeros((128, 3))
+    for j in range(3):
+        heat[10 + 50 * j : 16 + 50 * j, j] = 0.05
+    step = 0.49 * np.eye(128) + 0.25 * (np.eye(128, k=1) + np.eye(128, k=-1))
+    u = np.repeat(rng.uniform(0.0, 4.0, (12, 3)), 5, 0)
+    z = np.tile(np.linalg.solve(np.eye(128) - step, heat @ np.full(3, 2.0)), (61, 1))
+    for k in range(60):
+        z[k + 1] = step @ z[k] + heat @ u[k]
+    require_effects([(z + 0.05 * rng.standard_normal(z.shape), u)])
+
+
 def test_an_input_that_acts_later_than_looked_for_is_no_effect(tmp_path: Path) -> None:
     u = np.random.default_rng(1).uniform(0.0, 100.0, (ROWS, 2))
     late = np.vstack([np.tile(u[:1], (15, 1)), u[:-15]])

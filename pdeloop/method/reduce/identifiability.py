@@ -23,7 +23,7 @@ regressors).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,8 +57,8 @@ ROUNDED = 0.35
 """Root mean square of what rounding leaves, in steps: 0.29 for one that is uniform in a step."""
 ROUNDING = 1e-10
 """Size of a residual, relative to the states, that is rounding."""
-BY_CHANCE = 1e-3
-"""Probability with which an input without effect is taken for one that has some."""
+BY_CHANCE = 1e-4
+"""Probability with which one test takes an input without effect for one that has some."""
 COARSER = 4
 """Rows of which the mean is taken, again and again, to see slow effects."""
 LEVELS = 10
@@ -183,14 +183,16 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
     """NotIdentifiableError for inputs that changed the states by no more than chance does.
 
     From one row to the next, and from one mean of 4, 16, ... rows to the next, where a slow effect in
-    noise shows.
+    noise shows. Inputs that cannot be told apart are left to others.
     """
-    y = steps_of(trajectories).inputs
-    coarse = list(trajectories)
-    none = set(range(y.shape[1]) if len(y) > y.shape[1] + LEFT else ())
+    data, coarse = steps_of(trajectories), list(trajectories)
+    y = data.inputs
     with one_thread():
+        if examine_steps(data, linalg.svd(data.after, full_matrices=False)[2][:1].T).faults:
+            return
+        none = {*range(y.shape[1] if len(y) > y.shape[1] + LEFT else 0)}
         while coarse and none:
-            none &= _without_effect(steps_of(coarse))
+            none -= _with_effect(steps_of(coarse), none)
             coarse = [_means(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
     if none:
         own = sorted(none)
@@ -206,35 +208,30 @@ def _means(z: Array, a: Array) -> Trajectory:
     return z[: n * count].reshape(count, n, -1).mean(axis=1), of_inputs.mean(axis=1)
 
 
-def _without_effect(data: Steps) -> set[int]:
-    """Inputs of which z_{k+1} tells no more than columns of noise would, all else being known.
+def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
+    """Inputs of which z_{k+1} tells more than as many columns of noise would, all else being known.
 
-    This is Hotelling's test of a column of B. Not those that cannot be told apart.
+    This is Hotelling's test of a column of B, on the leading 4, 8, 16, ... modes: many are noise, and
+    few may miss an effect.
     """
-    before, after, y = (
-        scaled(part - part.mean(axis=0))[0] for part in (data.before, data.after, data.inputs)
-    )
+    before, after, y = (part - part.mean(axis=0) for part in (data.before, data.after, data.inputs))
+    y = scaled(y)[0]
     steps, n_a = y.shape
     _, values, modes = linalg.svd(after, full_matrices=False)
-    n = min(numerical_rank(values, *after.shape), (steps - n_a - 1) // 4)
-    if n < 1:
-        return set(range(n_a))
-    s, next_, none = before @ modes[:n].T, after @ modes[:n].T, set[int]()
-    for j in range(n_a):
-        known = np.hstack([s, np.delete(y, j, axis=1)])
-        left = np.column_stack([y[:, j], next_])
-        left -= known @ linalg.lstsq(known, left)[0]
-        size = float(linalg.norm(left[:, 0]))
-        columns, sizes, _ = linalg.svd(left[:, 1:], full_matrices=False)
-        columns = columns[:, sizes > ROUNDING * values[0]]
-        told, rank = (
-            float(linalg.norm(columns.T @ left[:, 0])) / max(size, DEPENDENT),
-            columns.shape[1],
-        )
-        chance = special.betaincinv(rank / 2, (steps - 1 - n - n_a - rank) / 2, 1.0 - BY_CHANCE)
-        if size >= DEPENDENT and not (rank and told**2 > chance):
-            none.add(j)
-    return none
+    most = min(numerical_rank(values, *after.shape), (steps - n_a - 1) // 4)
+    found = set[int]()
+    for n in sorted({min(2**i, most) for i in range(2, 2 + max(most, 0).bit_length())}):
+        for j in {*asked} - found if n > 0 else ():
+            known = np.hstack([before @ modes[:n].T, np.delete(y, j, axis=1)])
+            left = np.column_stack([y[:, j], after @ modes[:n].T])
+            left -= known @ linalg.lstsq(known, left)[0]
+            columns, sizes, _ = linalg.svd(left[:, 1:], full_matrices=False)
+            columns = columns[:, sizes > ROUNDING * values[0]]
+            told, r = float(linalg.norm(columns.T @ left[:, 0])) ** 2, columns.shape[1]
+            chance = special.betaincinv(r / 2, (steps - 1 - n - n_a - r) / 2, 1.0 - BY_CHANCE)
+            if r and told > chance * float(linalg.norm(left[:, 0])) ** 2:
+                found.add(j)
+    return found
 
 
 def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]]:
