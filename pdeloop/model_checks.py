@@ -89,8 +89,8 @@ class Residuals:
             inputs = "not correlated with" if self.driven else "too few for a test against"
             return f"{share}, white, and {inputs} earlier inputs"
         return (
-            f"{share}, correlated {' and '.join(found)}, as with noise on the measurements, missing "
-            "states or nonlinearity"
+            f"{share}, correlated {' and '.join(found)}, as with noise on the measurements, a "
+            "disturbance that is not in the log, missing states or nonlinearity"
         )
 
 
