@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, special
+from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce import channels as words
@@ -214,6 +214,8 @@ def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
     This is Hotelling's test of a column of B, on the leading 4, 8, 16, ... modes: many are noise, and
     few may miss an effect.
     """
+    from scipy import special  # here, as no training needs it
+
     before, after, y = (part - part.mean(axis=0) for part in (data.before, data.after, data.inputs))
     y = scaled(y)[0]
     steps, n_a = y.shape
