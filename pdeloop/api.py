@@ -392,11 +392,13 @@ def train(
             given["model"] = str(model) if isinstance(model, str | Path) else model
         folder, values = begin(source, given, where, transport)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
+        advice = f"continue with: {continuing(folder, values, transport)}"
+        if out is None:
+            advice = "give out=FOLDER, in which a training is kept that can be continued"
         try:
-            carry_out(folder, values, transport, display, lambda: None)
+            carry_out(folder, values, transport, display, lambda: None, advice)
         except Interruption as reason:
-            again = continuing(folder, values, transport)
-            raise RuntimeError(f"stopped by {reason}; continue with: {again}") from None
+            raise RuntimeError(f"stopped by {reason}; {advice}") from None
         finally:
             display.close()
         run = load_run(folder)

@@ -228,13 +228,11 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     """
     stream = sys.stderr if as_json else sys.stdout
     display = Display(values["seed"], values["seeds"], stream)
-    started = time.monotonic()
+    started, again = time.monotonic(), continuing(folder, values, transport)
     try:
         # Over topics every node that was started must be known, and every bag finished.
-        with interruptible(
-            continuing(folder, values, transport), at_once=transport.in_process
-        ) as check:
-            carry_out(folder, values, transport, display, check)
+        with interruptible(again, at_once=transport.in_process) as check:
+            carry_out(folder, values, transport, display, check, f"continue with: {again}")
     except Interruption:
         if not (folder / "result.json").exists():  # which is written last
             raise
@@ -258,18 +256,26 @@ def carry_out(
     transport: Transport,
     display: Display,
     check: Callable[[], None],
+    advice: str,
 ) -> None:
-    """Train in `folder` to the end; `check`, called now and then, may raise to stop it."""
+    """Train in `folder` to the end; `check`, called now and then, may raise to stop it.
+
+    advice: how to go on after a failure.
+    """
     for remark in remarks_on(values):
         display.warn(remark)
     if transport.in_process:
-        _train_here(folder, values, display, check)
+        _train_here(folder, values, display, check, advice)
     else:
         _train_over_topics(folder, display, transport, check)
 
 
 def _train_here(
-    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
+    folder: Path,
+    values: dict[str, Any],
+    display: Display,
+    check: Callable[[], None],
+    advice: str,
 ) -> None:
     with RunFolder(folder).locked():
         training = build_training(values)
@@ -288,15 +294,12 @@ def _train_here(
             writer.fail(str(error))
             raise
         except OwnCodeError as error:
-            raise OwnCodeError(
-                f"{error} (continue with: {continuing(folder, values, Transport(True))})"
-            ) from error
+            raise OwnCodeError(f"{error} ({advice})") from error
         try:
             writer.finish({"transport": "in-process", "controller": built_in(training)})
         except OSError as error:
             raise RunFolderError(
-                f"cannot write the results to {folder}: {error.strerror}; make room and "
-                f"continue with: {continuing(folder, values, Transport(True))}"
+                f"cannot write the results to {folder}: {error.strerror}; make room and {advice}"
             ) from error
 
 

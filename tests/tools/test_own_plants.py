@@ -333,6 +333,27 @@ def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
     assert (run / "parameters.yaml").exists()
 
 
+class Breaking(pdeloop.Dynamics):
+    n_z, n_a, horizon = 2, 1, 10
+
+    def initial_state(self, rng: np.random.Generator) -> Any:
+        return rng.normal(size=2)
+
+    def step(self, z: Any, a: Any) -> Any:
+        if a.any():
+            raise RuntimeError("no licence")
+        return 0.9 * z
+
+
+def test_a_failure_of_a_training_that_is_not_kept_is_not_to_be_continued(tmp_path: Path) -> None:
+    with pytest.raises(OwnCodeError, match=r"no licence \(give out=FOLDER, in which") as told:
+        pdeloop.train(plant=Breaking())
+    assert "resume" not in str(told.value)
+    out = tmp_path / "run"
+    with pytest.raises(OwnCodeError, match=rf"\(continue with: .* --resume {out} --in-process"):
+        pdeloop.train(plant=Breaking(), out=out)
+
+
 class Ageing(pdeloop.Dynamics):
     """Answers otherwise from rollout to rollout."""
 
