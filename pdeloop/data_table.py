@@ -13,7 +13,6 @@ import re
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from math import isfinite, nan
@@ -21,7 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdeloop.log import Log, in_seconds
+from pdeloop.instants import looks_like_instant, seconds_of
+from pdeloop.log import SECONDS, Log, in_seconds
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import Channels, listed
 
@@ -79,12 +79,18 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: s
     channels = Channels([head[i] for i in places.states], [head[i] for i in places.inputs])
     target: Array | None = None
     values, rows, numbers = array("d"), array("q"), _Numbers(head, separator)
+    stamps: list[str] = []
+    times, unit = array("d"), ""
     for row, line in numbered:
         if any(cell.strip() for cell in line[width:]) or len(line) < width:
             raise ValueError(
                 f"expected {width} values in row {row}, as in the line of names, got {len(line)}"
             )
         stamp = line[places.time].strip() if places.time >= 0 else ""
+        others = [line[i].strip() for i in (*places.states, *places.inputs)]
+        if not rows and target is None and _are_units(stamp, others):
+            unit = stamp.strip("[]() ")
+            continue
         if stamp.lower() == TARGET:
             if target is not None:
                 raise ValueError(
@@ -96,17 +102,37 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: s
                 raise ValueError(f"the target of {lost} is missing, in row {row}")
             continue
         rows.append(row)
-        if places.time >= 0:
-            values.append(numbers.time(stamp, row))
+        if places.time >= 0 and (stamps or (len(rows) == 1 and looks_like_instant(stamp))):
+            stamps.append(stamp)
+        elif places.time >= 0:
+            times.append(numbers.time(stamp, row))
         values.extend(numbers.read(line, i, row) for i in (*places.states, *places.inputs))
-    count = (places.time >= 0) + len(places.states) + len(places.inputs)
-    table = np.array(values).reshape(-1, count)
-    times = table[:, 0] if places.time >= 0 else np.arange(len(table), dtype=np.float64)
-    remarks: list[str] = []
-    if places.time >= 0 and not numbers.instants:
-        times, remarks = in_seconds(head[places.time], times, time_unit)
-    own, step = table[:, places.time >= 0 :], None if places.time >= 0 else 1.0
-    return Log(channels, own, times, np.array(rows), target, step, remarks)
+    own = np.array(values).reshape(-1, len(places.states) + len(places.inputs))
+    if places.time < 0:
+        numbers_of_rows = np.arange(len(own), dtype=np.float64)
+        return Log(channels, own, numbers_of_rows, np.array(rows), target, 1.0)
+    if stamps:
+        return Log(channels, own, seconds_of(stamps, rows), np.array(rows), target)
+    name = head[places.time] + (unit and f" [{unit}]")
+    seconds, remarks = in_seconds(name, np.array(times), time_unit)
+    return Log(channels, own, seconds, np.array(rows), target, None, remarks)
+
+
+def _are_units(time: str, others: Sequence[str]) -> bool:
+    """Whether the first row below the names has units: one of time, or no numbers at all."""
+    if time.strip("[]() ").lower() in SECONDS:
+        return True
+    known = time.lower() == TARGET or looks_like_instant(time)
+    words = [text for text in others if text.lower() not in MISSING]
+    return not known and bool(words) and not any(map(_is_number, (time, *words)))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _text(raw: bytes) -> str:
@@ -239,40 +265,21 @@ class _Numbers:
         self._head = head
         self._separator = separator
         self._mark = ""
-        self._since: datetime | None = None
-
-    @property
-    def instants(self) -> bool:
-        """Whether times were instants like 2026-01-31 12:00, which have no unit."""
-        return self._since is not None
 
     def read(self, line: Sequence[str], i: int, row: int) -> float:
         """The number in a cell; NaN where it is missing."""
         return self._number(line[i].strip(), self._head[i], row)
 
     def time(self, text: str, row: int) -> float:
-        """Seconds: a number, or an instant like 2026-01-31 12:00:00.5 since the first one."""
-        instant = self._instant(text)
-        if instant is None:
-            value = nan if self._since else self._number(text, "t", row)
-            if not isfinite(value):
-                raise ValueError(f"expected a time t in row {row}, got '{text[:40]}'")
-            return value
-        self._since = self._since or instant
-        if bool(instant.tzinfo) != bool(self._since.tzinfo):
+        """A time as a number."""
+        numeric = re.fullmatch(r"[\d.,+\-eE]+", text) is not None
+        value = self._number(text, "t", row) if numeric else nan
+        if not isfinite(value):
             raise ValueError(
-                f"expected a time zone in all rows or in none, got '{text[:40]}' in {row}"
+                f"expected a time t in row {row}, got '{text[:40]}'; times are numbers, h:m:s, or "
+                "dates such as 2026-01-31 12:00:00"
             )
-        return (instant - self._since).total_seconds()
-
-    @staticmethod
-    def _instant(text: str) -> datetime | None:
-        if "-" not in text[1:] and ":" not in text:  # a number
-            return None
-        try:
-            return datetime.fromisoformat(text)
-        except ValueError:
-            return None
+        return value
 
     def _number(self, text: str, name: str, row: int) -> float:
         """The number in a text; NaN where it is missing."""
