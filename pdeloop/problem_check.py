@@ -16,21 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from controller_node.identification import DesignSettings, designed
+from controller_node.identification import DesignSettings, design_each
 from controller_node.law_batch import LawBatch
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
 from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
 from pdeloop.episode import EpisodeRecord, Law, rollout
+from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.model_rows import ModelRows
+from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.messages.parameters import INSTRUMENTS
+from pdeloop.method.adapt import Trajectory
 from pdeloop.method.laws.registry import law_kind, laws_of
 from pdeloop.method.reduce.order import study_orders
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
 from tuner_node.build import build_training, few_sensors, remarks_on
 from tuner_node.optimizer_parameters import kind_of
+from tuner_node.result_checks import check_excitation
 
 __all__ = ["Finding", "check", "field_plant"]
 
@@ -287,9 +290,6 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings on exploration variance, order and law, from the plant as it is measured."""
     plant = build_plant(values)
     explored = _explore(plant, values)
-    count = min(build_training({**values, "seeds": 1}).settings.explorations, DRAWN)
-    # Of drawn fields, as in a training.
-    first, *further = [(explored.states[:, i], explored.actions[:, i]) for i in range(1, count + 1)]
     yield Finding(
         "exploration",
         True,
@@ -298,19 +298,37 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"{plant.divergence_bound:g})",
     )
     settings = DesignSettings.of(values)
+    training = build_training({**values, "seeds": 1, "model": ""})
+    batch = training.next_batch()
+    assert batch is not None
+    first = LocalPair(values, plant).roll_out(batch)
+    if (lost := int(first.costs.diverged_step.max())) >= 0:
+        told = f"that of a training diverges at step {lost}, which then explores again, more weakly"
+        yield Finding("exploration", True, told, note=True)
+        return
+    episode = Trajectory(first.states[:, 0], first.actions[:, 0])
+    remembers = training.settings.law.filtered or bool(values["sensors"])
+    try:
+        remarks = check_excitation(episode, 0, settings.action_set, remembers)
+    except ValueError as error:
+        yield Finding("exploration", False, str(error))
+        return
+    yield from (Finding("exploration", True, row["remark"], note=True) for row in remarks)
     if settings.identification == "subspace":
         orders = [settings.reduced_order, 0]
         told = f"reduced_order {settings.reduced_order}; 0: the best one for held-out readings"
     else:
         try:
-            suggested = study_orders([first], settings=settings.method).suggested
+            suggested = study_orders(
+                [(episode.states, episode.actions)], settings=settings.method
+            ).suggested
         except ValueError as error:
             yield Finding("order", False, str(error))
             return
-        orders = [settings.reduced_order or suggested, suggested]
+        orders = [settings.reduced_order, suggested]
         told = (
-            f"reduced_order {orders[0]}; one episode suggests {suggested}, and for dmdc a rank of "
-            f"{suggested + plant.n_a} or more"
+            f"reduced_order {settings.reduced_order or suggested}; one episode suggests {suggested}, "
+            f"and for dmdc a rank of {suggested + plant.n_a} or more"
         )
     yield Finding("order", True, told)
     share: float | None = None
@@ -318,7 +336,9 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     for order in dict.fromkeys(orders):
         try:
             own = replace(settings, reduced_order=order)
-            rows = designed([first], plant.target, own, further=further, or_no_control=True).rows
+            models = [0] * len(batch.rows)
+            packed = design_each(first.states, first.actions, models, plant.target, own)[0]
+            rows = unpack(packed, plant.n_a, training.settings.law.filtered)
         except ValueError as error:
             yield Finding("first law", False, f"of order {order}: {error}")
             return

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import pdeloop
+from pdeloop.problem_check import Finding, check
 from tests.method.test_input_delay import A, B
 
 DELAY, HORIZON, R = 3, 60, 0.01
@@ -88,3 +89,22 @@ def test_the_affine_law_is_told_of_the_dead_time() -> None:
         pdeloop.train(plant=Late(), reduced_order=4, rollouts=6, evaluation_fields=2, progress=told)
     assert "the actions act 3 steps late" in told.getvalue()
     assert "train with --law observer" in told.getvalue()
+
+
+def test_the_check_of_a_problem_tells_what_a_training_would() -> None:
+    found = {}
+    for law in ("affine", "observer"):
+        values = pdeloop.problem(plant=Late(), law=law, reduced_order=4).values
+        found[law] = [*check(values)]
+    late = [f.text for f in found["affine"] if "act 3 steps late" in f.text]
+    assert late and "--law observer" in late[0]
+    assert not any("steps late" in f.text for f in found["observer"])
+    costs = {law: first_law(findings) for law, findings in found.items()}
+    fields = pdeloop.rollout(Late(), optimum(0.0), range(5))
+    assert costs["observer"] < 1.02 * float(np.mean(fields.costs.mean)) < 0.9 * costs["affine"]
+
+
+def first_law(findings: list[Finding]) -> float:
+    text = next(f.text for f in findings if f.name == "first law")
+    cost = text.partition("no control, ")[2].split()[0]
+    return np.inf if cost == "diverges" else float(cost)
