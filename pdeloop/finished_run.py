@@ -19,7 +19,7 @@ from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
 from pdeloop.episode import Law as ActingLaw
 from pdeloop.messages.action_set import ActionSet
-from pdeloop.messages.arrays import Array
+from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import noisy
 from pdeloop.messages.spec import ParameterError
@@ -169,12 +169,14 @@ class FinishedRun:
         -------
         function of (k, states)
             The actions (M, n_a), saturated at the action limit, for the step k and what is measured of
-            M plants, (M, n_z). A law with a memory needs the steps in order; step 0 begins an episode.
+            M plants, (M, n_z); (n_a,) for (n_z,) of one plant. A law with a memory needs the steps in
+            order; step 0 begins an episode.
 
         Raises
         ------
         ValueError
-            There is no such law or seed, or the law is code that is not allowed.
+            There is no such law or seed, or the law is code that is not allowed. The function raises
+            it for states of another shape.
 
         Examples
         --------
@@ -188,9 +190,19 @@ class FinishedRun:
         law, model = self.laws[m], self.models[m]
         batch = LawBatch([law], self._target(model), ActionSet.of(self.values))
         plants, forgets = 0, law.has_gains(theta.ravel()) or not batch.remembers
+        n_z = len(model.U)
 
         def act(k: int, states: Array) -> Array:
             nonlocal plants
+            states = float_array("states", states)
+            if states.shape == (n_z,):
+                one: Array = act(k, states[None])[0]
+                return one
+            if states.ndim != 2 or states.shape[1] != n_z or not len(states):
+                raise ValueError(
+                    f"states are an array of shape {states.shape}; expected what is measured of M "
+                    f"plants, (M, {n_z}), or of one, ({n_z},)"
+                )
             if k == 0 or (len(states) != plants and forgets):
                 plants = len(states)
                 batch.set(np.repeat(theta[None], len(states), axis=0))

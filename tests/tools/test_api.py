@@ -87,6 +87,12 @@ def test_a_law_of_a_run_acts_as_in_its_evaluation(source: str, given: dict[str, 
     else:
         with pytest.raises(MemoryUnknownError, match="before step 3 are unknown"):
             begun(3, z)
+    alone, together = run.law("lqt"), run.law("lqt")
+    for k, seen in enumerate(episode.states[:3, 0]):  # of one plant, as of a batch of one
+        assert same_bits(alone(k, seen), together(k, seen[None])[0])
+    for wrong in (z[:, 1:], z[0, 1:], z[None], z[:0], 1.0):
+        with pytest.raises(ValueError, match=rf"of M plants, \(M, {z.shape[1]}\), or of one, \("):
+            run.law()(0, wrong)
     # A machine that was trained with the parameters of a problem may have another target.
     model = replace(run.models[0], s_r=run.models[0].s_r + 1.0)
     machine = replace(run, result={**run.result, "plant": 7}, models=[model])
