@@ -243,7 +243,10 @@ def places_of(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
 def _matching(head: Sequence[str], patterns: str, flag: str, *, needed: bool = True) -> list[int]:
     """The columns that the patterns name, in their order and each once."""
     found: dict[int, None] = {}
-    for pattern in (part.strip() for part in patterns.split(",")):
+    asked = [part.strip() for part in patterns.split(",")]
+    if twice := [pattern for pattern in dict.fromkeys(asked) if asked.count(pattern) > 1]:
+        raise ValueError(f"{flag} names {listed(twice)} more than once: leave out what is repeated")
+    for pattern in asked:
         # A name may hold what is special in a pattern, like T [K].
         own = [i for i, name in enumerate(head) if name == pattern] or [
             i for i, name in enumerate(head) if name and fnmatchcase(name, pattern)

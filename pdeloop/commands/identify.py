@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from functools import partial
-from math import isfinite
+from math import inf, isfinite, nan
 
 from pdeloop.commands.common import (
     Commands,
@@ -84,7 +84,7 @@ def add(commands: Commands) -> None:
     )
     add(
         "--resample",
-        type=float,
+        type=_step,
         nargs="?",
         const=0.0,
         metavar="S",
@@ -222,6 +222,19 @@ def _numbers(text: str, finite: bool = True) -> list[float]:
             f"expected {'finite ' * finite}numbers with commas between, got '{text}'"
         )
     return numbers
+
+
+def _step(text: str) -> float:
+    """Seconds above 0, for argparse; 0 is the option without a number."""
+    try:
+        step = float(text)
+    except ValueError:
+        step = nan
+    if not 0.0 < step < inf:
+        raise argparse.ArgumentTypeError(
+            f"expected seconds above 0, got '{text}'; without a number it is the log's own step"
+        )
+    return step
 
 
 def _delays(text: str) -> tuple[int, ...] | str:

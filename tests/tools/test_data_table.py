@@ -351,3 +351,17 @@ def test_a_target_that_is_not_numbers_is_refused(
     with pytest.raises(SystemExit):
         main(["identify", "--data", "own.csv", "--target", numbers])
     assert "expected finite numbers with commas between" in capsys.readouterr().err
+
+
+def test_a_column_that_is_named_twice_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refused(tmp_path, text(PLAIN), "--states names z1 more than once", states="z1, z2,z1")
+    read(tmp_path, text(PLAIN), states="z2,z*")  # an order
+    for step in ("0", "-1", "nan", "x"):
+        with pytest.raises(SystemExit):
+            main(["identify", "--data", str(tmp_path / "own.csv"), f"--resample={step}"])
+        told = (
+            f"--resample: expected seconds above 0, got '{step}'; without a number it is the log's"
+        )
+        assert told in capsys.readouterr().err
