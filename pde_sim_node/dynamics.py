@@ -72,7 +72,8 @@ class Dynamics(ABC):
     terminal_weight : number, diagonal or matrix
         Weight of the state after the last step.
     action_low, action_high : number or (n_a,)
-        Bounds of the actions. An action outside is replaced by the nearest admissible one.
+        Bounds of the actions; None: there are none. An action outside is replaced by the nearest
+        admissible one.
     action_rate : number or (n_a,)
         Largest change of an action from one step to the next. Before the first step it is the middle
         between two bounds, else 0 or the point nearest to it (`pdeloop.messages.action_set`).

@@ -56,13 +56,13 @@ class ActionSet:
     n_a : int
         Actuators; 0: any number of them, with bounds in common.
     low, high : number or (n_a,)
-        Bounds; infinite where there are none.
+        Bounds; infinite, or None, where there are none.
     zero_mean : bool
         Whether the actions of a step have mean zero.
     limit : float
         Magnitude at which all actions saturate besides; 0 for none.
     rate : number or (n_a,)
-        Largest change of an action from one step to the next; infinite where there is none.
+        Largest change of an action from one step to the next; infinite, or None, where there is none.
     exploration_mean : (n_a,) array, optional
         m, the operating point; in place of the one above.
 
@@ -95,12 +95,12 @@ class ActionSet:
     def __init__(
         self,
         n_a: int = 0,
-        low: ArrayLike = -np.inf,
-        high: ArrayLike = np.inf,
+        low: ArrayLike | None = -np.inf,
+        high: ArrayLike | None = np.inf,
         zero_mean: bool = False,
         *,
         limit: float = 0.0,
-        rate: ArrayLike = np.inf,
+        rate: ArrayLike | None = np.inf,
         exploration_mean: ArrayLike = (),
     ) -> None:
         own = [_bound(name, values, n_a) for name, values in (("low", low), ("high", high))]
@@ -382,7 +382,8 @@ class ActionSet:
         return float((a[free].sum() + held[~free].sum()) / np.count_nonzero(free))
 
 
-def _bound(side: str, values: ArrayLike, n_a: int) -> Array:
+def _bound(side: str, given: ArrayLike | None, n_a: int) -> Array:
+    values = given if given is not None else -np.inf if side == "low" else np.inf
     bound = float_array(f"action_{side}", values)
     if bound.shape not in ((), (n_a,)) or np.isnan(bound).any():
         raise ValueError(f"action_{side} must be a number or {n_a} numbers, got {values!r}")

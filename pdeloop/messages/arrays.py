@@ -26,6 +26,7 @@ def float_array(name: str, values: ArrayLike) -> Array:
         what = str(array.dtype)
     except ValueError:  # NumPy's word for rows of different lengths
         array, what = np.asarray(None), "rows of different lengths"
+    what = "None" if values is None else what
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be an array of real numbers, got {what}")
     return array.astype(np.float64, copy=False)

@@ -252,6 +252,16 @@ def test_actions_are_moved_to_the_nearest_ones_that_are_allowed_and_cost_what_ac
     np.testing.assert_array_equal(plant.actions, taken)
 
 
+def test_no_bound_may_be_none() -> None:
+    servo, asked = Servo(), np.array([[30.0, -10.0]])
+    vars(servo).update(action_low=None, action_high=None, action_rate=None)
+    plant, free = DynamicsPlant(servo), DynamicsPlant(Servo())
+    assert plant.action_set == free.action_set and not plant.action_set.bounded
+    assert np.array_equal(servo.actuated(asked[0]), asked[0])
+    vars(servo).update(action_high=1.0)
+    assert np.array_equal(servo.actuated(asked[0]), [1.0, -10.0])
+
+
 def test_the_projection_to_mean_zero_and_bounds_is_the_nearest_point() -> None:
     rng = np.random.default_rng(4)
     low, high = -np.array([0.5, 1.0, 0.2, 3.0]), np.array([0.7, 0.1, 2.0, 1.0])

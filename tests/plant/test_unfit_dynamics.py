@@ -122,6 +122,7 @@ class Unfit(Linear):
         ({"divergence_bound": "1"}, "Unfit: divergence_bound must be positive and finite"),
         ({"action_low": "1"}, "Unfit: action_low must be"),
         ({"target": [1.0, 2.0]}, "Unfit: .*shape"),
+        ({"target": None}, "Unfit: target must be an array of real numbers, got None"),
         ({"target": np.nan}, "Unfit: target must be finite"),
         ({"grid": pdeloop.Grid.vector(4)}, "Unfit: n_z is 3, but its grid has 4 numbers"),
         ({"supports": np.ones((3, 1))}, r"Unfit: supports must have shape \(3, 2\), got \(3, 1\)"),
