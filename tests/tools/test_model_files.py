@@ -90,14 +90,14 @@ def test_the_fmu_of_a_law_is_the_law_step_by_step(run: FinishedRun, tmp_path: Pa
         found = []
         for k, y in enumerate(ys[first:end], first):
             law.setReal(list(range(n_y)), y.tolist())
-            law.doStep(k * sample, sample / 2)
+            law.doStep(begin + k * sample, sample / 2)
             law.setReal([0], [0.0])  # between samples the action is held
-            law.doStep(k * sample + sample / 2, sample / 2)
+            law.doStep(begin + k * sample + sample / 2, sample / 2)
             found.append(law.getReal(list(range(n_y, n_y + run.values["n_a"]))))
         return np.array(found)
 
-    for _ in range(2):
-        law.setupExperiment(startTime=0.0)
+    for begin in (0.0, 1000.0 * sample):  # wherever the clock of the simulation begins
+        law.setupExperiment(startTime=begin)
         law.enterInitializationMode()
         law.exitInitializationMode()
         found = steps(0, 5)
@@ -108,6 +108,16 @@ def test_the_fmu_of_a_law_is_the_law_step_by_step(run: FinishedRun, tmp_path: Pa
         assert np.array_equal(steps(5, len(ys)), rest)
         law.freeFMUState(kept)
         law.reset()
+    # A longer step of the simulation has as many of the law, for the inputs that it holds.
+    law.setupExperiment(startTime=0.0)
+    law.enterInitializationMode()
+    law.exitInitializationMode()
+    law.setReal(list(range(n_y)), ys[0].tolist())
+    law.doStep(0.0, 3 * sample)
+    act = run.law()
+    held = [act(k, ys[:1])[0] for k in range(3)]
+    found = law.getReal(list(range(n_y, n_y + run.values["n_a"])))
+    np.testing.assert_allclose(found, held[-1], rtol=1e-9, atol=1e-12)
     law.freeInstance()
 
 
