@@ -92,11 +92,11 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
         applied = episode.applied[:, environment]
         limits = action_range([applied], plant.action_set)
         picture: Any = held_actions(below, times, applied, plant.action_set, limits)
-        name_actions(below, plant.n_a)
         if picture is not None:
             figure.colorbar(picture, ax=below, label="$a_j(t)$", pad=0.01)
         if text := share_text(applied, plant.action_set):
             below.set_title(text, loc="right", fontsize=8, color="0.4", pad=2)
+        name_actions(below, plant.n_a)
         below.set_xlabel("t (s)")
     return figure
 

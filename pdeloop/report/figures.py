@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
-from pdeloop.messages.grid import Part
+from pdeloop.messages.grid import Axis, Part
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.order import OrderStudy
 from pdeloop.report import planes
@@ -89,6 +89,8 @@ def _maps(
         drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
         ax.set_xlabel("t (s)")
     axes[0].set_ylabel(axis.label)
+    if _numbered(axis):
+        axes[0].yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     if moving is None:
         beside(axes[-1], target, (low, high), axis.length)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
@@ -107,7 +109,14 @@ def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes]) -> Non
         ax.plot(axis.points, last, color=COLOURS[b.controller], label="final field")
         ax.set_xlim(0, axis.length)
         ax.set_xlabel(axis.label)
+    if _numbered(axis):
+        axes[0].xaxis.set_major_locator(MaxNLocator(3, integer=True, min_n_ticks=1))
     axes[0].set_ylabel(f"{name}(x, T)")
+
+
+def _numbered(axis: Axis) -> bool:
+    """Whether its points are the numbers of a vector, which have none in between."""
+    return not (axis.points % 1.0).any()
 
 
 def gains(problem: ProblemData) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.transforms import ScaledTranslation
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
@@ -72,15 +73,20 @@ def held_actions(
 
 
 def name_actions(ax: Axes, n_a: int) -> None:
-    """The label of an axis on which actions are drawn, with a legend of the curves."""
+    """The label of an axis on which actions are drawn, with a legend of the curves.
+
+    The legend is above the text at the right, which has to be there before.
+    """
     if n_a > FEW:
         ax.set_ylabel("actuator j")
         return
     ax.set_ylabel("actions $a_j$")
     if n_a > 1:
+        above = ScaledTranslation(0.0, 11.0 / 72.0, ax.figure.dpi_scale_trans)
         ax.legend(
             loc="lower left",
             bbox_to_anchor=(0.0, 0.97),
+            bbox_transform=ax.transAxes + above if ax.get_title("right") else ax.transAxes,
             ncols=n_a,
             fontsize=7,
             handlelength=0.8,

@@ -7,10 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 import pdeloop
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.report.data import of_run
+from pdeloop.report.figures import behaviour
 from pdeloop.report.held_actions import FEW, saturated, share_text
+from pdeloop.report.style import STYLE
 
 
 class Row(pdeloop.Dynamics):
@@ -54,6 +62,26 @@ def images(figure: object) -> list[str]:
     return [ax.get_ylabel() for ax in axes if ax.get_label() == "<colorbar>"]
 
 
+def apart(figure: Figure, ax: Axes) -> bool:
+    """Whether the legend of actions lies beside the text about their bounds."""
+    FigureCanvasAgg(figure).draw()
+    text = next(t for t in ax.get_children() if isinstance(t, Text) and "bound" in t.get_text())
+    return not ax.get_legend().get_window_extent().overlaps(text.get_window_extent())
+
+
+def test_the_behaviour_in_a_report_has_its_legends_apart_and_numbers_of_a_vector(
+    tmp_path: Path,
+) -> None:
+    run = pdeloop.train(plant=Row(FEW), rollouts=6, evaluation_fields=2, out=tmp_path / "run")
+    with rc_context(STYLE):
+        figure = behaviour(of_run(run))
+        FigureCanvasAgg(figure).draw()
+    assert apart(figure, next(ax for ax in figure.axes if ax.get_legend()))
+    for ax in figure.axes:
+        for axis, label in ((ax.xaxis, ax.get_xlabel()), (ax.yaxis, ax.get_ylabel())):
+            assert label != "number" or not (axis.get_majorticklocs() % 1.0).any()
+
+
 @pytest.mark.parametrize("heaters", [3, FEW, 12])
 def test_figures_show_bounds_the_moving_target_and_many_actions_as_a_picture(heaters: int) -> None:
     plant = pdeloop.problem(plant=Row(heaters)).plant()
@@ -64,6 +92,7 @@ def test_figures_show_bounds_the_moving_target_and_many_actions_as_a_picture(hea
     few = heaters <= FEW
     dotted = [line.get_ydata()[0] for line in below.lines if line.get_linestyle() == ":"]
     assert dotted == ([0.0, 1.0] if few else [])
+    assert not few or apart(figure, below)
     assert len({line.get_color() for line in below.lines if line.get_linestyle() == "-"}) == (
         heaters if few else 0
     )
