@@ -32,6 +32,8 @@ TLS = {
     "--tls-key": ("tls_client_key", "its private key"),
 }
 """Flags for an encrypted scheduler: the name in `distributed.Security`, and what the file is."""
+WORKER_DEATHS = 20
+"""Default of --worker-deaths."""
 
 if TYPE_CHECKING:
     from pdeloop.study import Study
@@ -82,9 +84,9 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
     add(
         "--worker-deaths",
         type=int,
-        default=20,
+        default=WORKER_DEATHS,
         metavar="N",
-        help="workers that one training may lose before it counts as failed [20]",
+        help=f"workers that one training may lose before it counts as failed [{WORKER_DEATHS}]",
     )
     add(
         "--run-folders",
@@ -152,7 +154,7 @@ def carry_out(
     else:
         executor = partial(local_workers, options.processes)
     try:
-        with interruptible(shlex.join(["pdeloop", name, "--out", str(folder)])):
+        with interruptible(_continuing(name, folder, options)):
             failures = run(
                 study,
                 folder,
@@ -182,6 +184,18 @@ def carry_out(
         console.print(f"failed: {failure.training}: {failure.reason}", markup=False)
     console.print(f"results in {folder}", markup=False)
     return int(bool(failures))
+
+
+def _continuing(name: str, folder: Path, options: argparse.Namespace) -> str:
+    """The command that continues what was begun with these options, where and with the code it was."""
+    words = ["pdeloop", name, "--out", str(folder)]
+    flags = *("--equation", "--plant", "--optimizer", "--law"), "--processes", "--scheduler", *TLS
+    for flag in flags:
+        value = getattr(options, flag[2:].replace("-", "_"), None)
+        words += [] if value is None else [flag, str(value)]
+    if options.worker_deaths != WORKER_DEATHS:
+        words += ["--worker-deaths", str(options.worker_deaths)]
+    return shlex.join([*words, *["--any-environment"] * options.any_environment])
 
 
 def _study(options: argparse.Namespace) -> int:

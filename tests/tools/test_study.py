@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -276,10 +277,11 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
     file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 9, "settings": endless}))
     words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    named = ["--plant", "own.py:Own", "--processes", "2"]  # code has to be named again
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     process = subprocess.Popen(
-        [*words, "--processes", "2"],
+        [*words, *named],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -294,7 +296,8 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
         told, _ = process.communicate(timeout=LIMIT)
     finally:
         process.kill()
-    assert process.returncode == 130 and f"continue with: pdeloop study --out {out}" in told
+    again = shlex.join(["pdeloop", "study", "--out", str(out), *named])
+    assert process.returncode == 130 and f"continue with: {again}\n" in told
     assert "Traceback" not in told, told
     assert not list(out.rglob("result.json"))
     assert not [*temporary.iterdir()]
