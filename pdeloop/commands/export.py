@@ -7,7 +7,14 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from pdeloop.commands.common import Commands, a_path, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_own_code,
+    allow_own_code,
+    command,
+    refuse_other_code,
+)
 from pdeloop.messages.spec import ParameterError
 
 if TYPE_CHECKING:
@@ -57,7 +64,6 @@ def add(commands: Commands) -> None:
     add_argument(
         "--controller", choices=LAWS, help="the adapted law, or the first one (lqt) [adapted]"
     )
-    add_argument("--law", choices=LAWS, help=argparse.SUPPRESS)  # its name before
     add_argument("--seed", type=int, metavar="S", help="training seed of the law [the first]")
     add_argument(
         "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
@@ -76,6 +82,7 @@ def add(commands: Commands) -> None:
         metavar="DIR",
         help="write the curves and the optimiser's other numbers to this new folder",
     )
+    add_own_code(export, ("equation", "plant", "optimizer", "law"))
 
 
 def _export(options: argparse.Namespace) -> int:
@@ -94,9 +101,10 @@ def _export(options: argparse.Namespace) -> int:
             "expected --out FILE or another form for the law, --curve FILE or --tensorboard DIR for "
             "the curve, --minari NAME or --parquet FILE for the rollouts"
         )
-    if options.law is not None:
+    which = options.controller
+    if options.law in LAWS:  # as --controller was called
         print("WARNING: --law of export is now called --controller", file=sys.stderr)
-    which = options.controller or options.law
+        which, options.law = which or options.law, None
     if all(path is None for path in of_laws) and not (which is None and options.seed is None):
         options.refuse("--controller and --seed choose a law: give --out FILE, or leave them out")
     for flag, (path, suffixes) in files.items():
@@ -104,7 +112,9 @@ def _export(options: argparse.Namespace) -> int:
             raise ParameterError(
                 f"{flag} is {path}; expected a file that ends in {' or '.join(suffixes)}"
             )
+    allow_own_code(options)
     run = load_run(options.folder)
+    refuse_other_code(options, run.values)
     contents = {}
     if options.ros2 is not None:
         from pdeloop.ros2_package import write_package

@@ -13,6 +13,7 @@ import pytest
 
 import pdeloop
 import pdeloop.environments
+from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import main
 from pdeloop.data_sets import DataEpisode, data_episodes
 from pdeloop.finished_run import FinishedRun
@@ -94,6 +95,27 @@ def test_a_parquet_file_has_every_row_and_identifies_a_model(
     read = pdeloop.read_measurements(file, time="t", states="u*", inputs="a?")
     for (z, a), each in zip(read.trajectories, own, strict=True):
         assert np.array_equal(z, each.y) and np.array_equal(a, each.a)
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pyarrow") is None, reason="pyarrow is not installed: extra logs"
+)
+def test_a_plant_of_ones_own_is_named_to_repeat_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = tmp_path / "own.py", tmp_path / "run"
+    file.write_text(
+        "import pdeloop\n\n\nclass Own(pdeloop.Dynamics):\n    n_z, n_a, horizon = 2, 1, 12\n\n"
+        "    def initial_state(self, rng):\n        return rng.normal(size=2)\n\n"
+        "    def step(self, z, a):\n        return 0.9 * z + a\n"
+    )
+    monkeypatch.setenv(OWN_PLANTS.variable, "")
+    pdeloop.train(plant=f"{file}:Own", rollouts=6, evaluation_fields=2, out=out)
+    monkeypatch.setenv(OWN_PLANTS.variable, "")
+    words = ["export", str(out), "--parquet", str(tmp_path / "rollouts.parquet")]
+    assert main(words) == 1
+    assert f"name it yourself: --plant {file}:Own" in capsys.readouterr().err
+    assert main([*words, "--plant", f"{file}:Own"]) == 0
 
 
 @pytest.mark.skipif(

@@ -125,8 +125,17 @@ def interrupt_after(folder: Path, values: dict, batches: int) -> None:
 
 
 def test_evaluate_report_and_export_know_it(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    for named, parts in ([], 0), (["--law", OWN], 2):  # code that is not named is not run
+        file = tmp_path / f"{parts}.npz"
+        assert main(["export", str(finished), "--out", str(file), *named]) == 0
+        with np.load(file) as arrays:
+            assert len([name for name in arrays if name.startswith("theta.")]) == parts
+        monkeypatch.setenv(OWN_LAWS.variable, "")
     assert main(["evaluate", str(finished), "--fields", "2"]) == 1
     assert "is code, which is not run merely because a file names it" in capsys.readouterr().err
     assert main(["evaluate", str(finished), "--fields", "2", "--law", OWN]) == 0
