@@ -173,13 +173,13 @@ def carry_out(
     table = rows(study, folder)
     content = json.dumps({"rows": table, "versions": versions()}, indent=1)
     write_atomically(folder / "table.json", content.encode())
+    if table and importlib.util.find_spec("matplotlib"):
+        write_atomically(folder / "costs.png", plot(table))
     if options.json:
         told = [failure._asdict() for failure in failures]
         print_json({"folder": str(folder), "rows": table, "failures": told})
     elif table:
         console.print("\n".join([text(table), *remarks(table)]), markup=False)
-        if importlib.util.find_spec("matplotlib"):
-            write_atomically(folder / "costs.png", plot(table))
     for failure in failures:
         console.print(f"failed: {failure.training}: {failure.reason}", markup=False)
     console.print(f"results in {folder}", markup=False)

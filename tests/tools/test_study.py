@@ -213,6 +213,7 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert {(tmp_path / name).read_text() for name in ("table.json", "costs.png")} == {
         "of somebody else"
     }
+    assert (out / "costs.png").stat().st_size > 1000  # not that of an earlier table
     file.write_text(json.dumps(CONTENT))
     assert main(["study", str(file), "--out", str(out)]) == 1
     assert "holds another study" in capsys.readouterr().err
