@@ -279,7 +279,9 @@ def designed(
                 f"the identification 'subspace' designs a filter, which the law '{settings.law}' "
                 "does not use; take the law 'extended_kalman' or 'observer'"
             )
-        every = [*trajectories, *further]
+        every, free = [*trajectories, *further], settings.action_set.free(settings.n_a)
+        if settings.action_set.zero_mean:  # only their differences show an effect
+            every = [(states, actions @ free) for states, actions in every]
         found_model = subspace_model(
             every,
             order=settings.reduced_order,
@@ -288,6 +290,8 @@ def designed(
             if constant is None
             else constant,
         )
+        if settings.action_set.zero_mean:
+            found_model = replace(found_model, B=found_model.B @ free.T)
         return Designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
             innovations=found_model,

@@ -20,6 +20,7 @@ from scipy import linalg
 from controller_node.identification import DesignSettings, designed, examined, identify
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.files import write_atomically
@@ -402,25 +403,28 @@ def _identified(
             f"{flags} are weights of a law, which needs a target: give --target as well"
         )
     values = known
+    defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
+    n_a = trajectories[0][1].shape[1]
+    allowed, seen = ActionSet.of({**defaults, **values, "n_a": n_a}), trajectories
+    if allowed.zero_mean:  # only differences of the actions show an effect
+        seen = [(states, actions @ allowed.free(n_a)) for states, actions in trajectories]
+        channels = replace(channels, inputs=())
     study, none = None, ""
     try:
         fitted_by = None
         if known.get("identification") == "dmdc":
             fitted_by = partial(_truncated, int(known.get("dmdc_rank", 0)))
-        study = study_orders(
-            trajectories, channels=channels, fitted_by=fitted_by, constant=constant
-        )
+        study = study_orders(seen, channels=channels, fitted_by=fitted_by, constant=constant)
     except NotIdentifiableError:  # whatever the order
         raise
     except ValueError as error:  # too few steps; the model itself may still be had
         none = str(error)
-    defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
     suggested = None if of_past else study and study.suggested
     order = model_order({**defaults, **values}) or suggested
     if not order and not of_past:
         raise ParameterError(f"no order can be suggested: {none}; or give one with --order")
     own = {
-        "n_a": trajectories[0][1].shape[1],
+        "n_a": n_a,
         "reduced_order": order or 0,
         "dmdc_order": order or 0,
     }
@@ -467,7 +471,7 @@ def _identified(
         sources,
         len(steps_of(trajectories).inputs),
         study,
-        examined(trajectories, model, method=method, p=p, channels=channels),
+        examined(seen, model, method=method, p=p, channels=channels),
         max(aligned, key=lambda trajectory: len(trajectory[1])),
         target,
         values.get("sample_time"),
@@ -475,9 +479,7 @@ def _identified(
         remarks,
         field,
         delays,
-        largest_pole(
-            model.A, trajectories, partial(_refitted, model, method, p, sum(late), innovations)
-        ),
+        largest_pole(model.A, seen, partial(_refitted, model, method, p, sum(late), innovations)),
         residuals(model, aligned),
         innovations,
         tuple(
