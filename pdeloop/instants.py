@@ -1,8 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Dates and times of day of a column, as loggers and spreadsheets write them, in seconds.
 
-All texts of a column have one form: ISO 8601, day.month.year, year/month/day, a time of day alone, or
-a date of which only the whole column tells whether it begins with the day or with the month.
+All texts of a column have one form: ISO 8601, day.month.year, 31-Jan-2026, year/month/day, a time of
+day alone, or a date of which only the whole column tells whether it begins with the day or with the
+month.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ __all__ = ["looks_like_instant", "seconds_of"]
 DAY = 86400.0
 GAP = 1.5
 """Median steps up to which one time follows another without a gap."""
+MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 FORM = re.compile(
-    r"""(?:(?P<first>\d{1,2}|\d{4})(?P<mark>[./-])(?P<second>\d{1,2})(?P=mark)(?P<third>\d{4}|\d{1,2})
+    r"""(?:(?P<first>\d{1,2}|\d{4})(?P<mark>[./-])(?P<second>\d{1,2}|[A-Za-z]{3})(?P=mark)(?P<third>\d{4}|\d{1,2})
     (?:[\ T]+|$))?
     (?:(?P<hour>\d{1,4}):(?P<minute>\d{2})(?::(?P<rest>\d{2}(?:[.,]\d+)?))?
     \s*(?P<half>[AaPp])?(?(half)\.?[Mm]\.?))?""",
@@ -88,6 +90,8 @@ def _of_iso(texts: Sequence[str], rows: Sequence[int]) -> Array:
 def _form(text: str) -> str:
     """The mark between the numbers of a date, "year" where that is first, ":" without a date; or "".
 
+    It is a dot, too, where the name of the month tells the day from it.
+
     Hours and minutes without a date may as well be minutes and seconds, and years of two digits days.
     """
     match = FORM.fullmatch(text)
@@ -97,8 +101,11 @@ def _form(text: str) -> str:
         return ":" if match["rest"] or match["half"] else ""
     if len(match["first"]) == 4:
         return "year" if len(match["third"]) <= 2 else ""
-    digits = (2, 4) if match["mark"] == "." else (4,)
-    return match["mark"] if len(match["third"]) in digits else ""
+    named = match["second"].isalpha()
+    if named and match["second"].lower() not in MONTHS:
+        return ""
+    mark = "." if named else match["mark"]
+    return mark if len(match["third"]) in ((2, 4) if mark == "." else (4,)) else ""
 
 
 def _year_month_day(first: str, second: str, third: str) -> tuple[int, int, int]:
@@ -106,7 +113,8 @@ def _year_month_day(first: str, second: str, third: str) -> tuple[int, int, int]
 
 
 def _day_month_year(first: str, second: str, third: str) -> tuple[int, int, int]:
-    return int(third) + 2000 * (len(third) == 2), int(second), int(first)
+    month = MONTHS.index(second.lower()) + 1 if second.isalpha() else int(second)
+    return int(third) + 2000 * (len(third) == 2), month, int(first)
 
 
 def _month_day_year(first: str, second: str, third: str) -> tuple[int, int, int]:

@@ -36,6 +36,10 @@ LARGE_STEP = 50.0
 """A step from which on one without a unit may well be of ms, if it is whole and not one of minutes."""
 SINCE_1970 = 1e11
 """A time as large counts since 1970 in a unit below the second."""
+DATES = ((25569.0, 73051.0), (719529.0, 767011.0))
+"""Days of the years 1970 to 2099, as numbers of spreadsheets and of MATLAB."""
+REPEATED = 0.1
+"""Share of steps of t that are 0 from which on its clock is too coarse for the log."""
 
 
 @dataclass(frozen=True)
@@ -131,10 +135,22 @@ def in_seconds(name: str, times: Array, given: str = "") -> tuple[Array, list[st
         ]
     steps = np.diff(times)
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    if any(
+        times.size and first <= times.min() and times.max() < last for first, last in DATES
+    ) and (_is_short(86400.0 * step) and not _is_short(step)):
+        return in_seconds(name, times, "d")[0], [
+            f"{name} has dates as numbers of days, by their size, and was read as such: otherwise give "
+            "--time-unit"
+        ]
     whole = step >= LARGE_STEP and step == round(step) and step % 60.0 != 0.0
     if whole:
         return times, [f"the steps of {name} are {step:g}, taken as s: {remedy}"]
     return times, []
+
+
+def _is_short(step: float) -> bool:
+    """Whether a step has three digits, but for the rounding of times."""
+    return step > 0.0 and abs(float(f"{step:.3g}") - step) <= 0.1 * JITTER * step
 
 
 def _unit_of(name: str) -> str:
@@ -167,6 +183,12 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     first = np.r_[True, ~(np.diff(times) > 0.0)][: len(times)]
     if int(first.sum()) > most:
         raise ValueError(f"expected at most {most} trajectories, got {int(first.sum())}")
+    if (same := np.diff(times) == 0.0).sum() > REPEATED * len(times):
+        raise ValueError(
+            f"t is the same in rows {rows[int(np.argmax(same))]} and {rows[int(np.argmax(same)) + 1]}, "
+            f"and {int(same.sum()) - 1} times more: its clock is too coarse for the steps of this log; "
+            "write t to fractions of seconds, or take it out of the file and give --sample-time"
+        )
     step = _median_step(times, first) if log.step is None else log.step
     after_gap = np.zeros(len(first), dtype=bool)
     if step is not None and timed:

@@ -34,6 +34,7 @@ def read(texts: list[str]) -> np.ndarray:
         "%d-%m-%Y %H:%M:%S",
         "%Y/%m/%d %H:%M:%S.000",
         "%Y-%m-%d %H:%M:%S",
+        "%d-%b-%Y %H:%M:%S",
     ],
 )
 def test_dates_and_times_are_seconds_since_the_first(form: str) -> None:
@@ -82,7 +83,7 @@ def table(tmp_path: Path, times: list[str], *below: str) -> Path:
 def test_a_log_of_a_spreadsheet_is_read(tmp_path: Path) -> None:
     found = read_measurements(table(tmp_path, written("%d.%m.%Y %H:%M:%S")))
     assert found.sample_time == 10.0
-    for text in ("27. Okt 2024 00:30", "00:30", "yesterday"):
+    for text in ("27. Okt 2024 00:30", "27-Okt-2024 00:30", "00:30", "yesterday"):
         with pytest.raises(
             ValueError, match=r"row 2, got '.*'; times are numbers, h:m:s, or dates"
         ):
@@ -113,3 +114,18 @@ def test_a_row_of_units_stands_above_dates_too(tmp_path: Path) -> None:
 def test_words_in_the_first_row_of_numbers_are_no_units(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected a number, got 'Bad' in row 2"):
         read_measurements(table(tmp_path, ["0", "1"], "0;Bad;Bad"))
+
+
+def test_a_clock_that_shows_no_seconds_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="rows 2 and 3, and 5 times more: its clock is too coarse"):
+        read_measurements(table(tmp_path, written("%m/%d/%Y %H:%M")))
+
+
+def test_dates_as_numbers_are_days(tmp_path: Path) -> None:
+    for begin in (45592.020833333336, 739552.020833333336):  # of Excel, and of MATLAB
+        found = read_measurements(table(tmp_path, [f"{begin + t / 86400.0:.9f}" for t in STEPS]))
+        assert found.sample_time == pytest.approx(10.0, rel=1e-4)
+        assert "dates as numbers of days, by their size" in " ".join(found.remarks)
+    for step in (0.1, 10.0, 0.25):  # seconds of a day, and since a start
+        found = read_measurements(table(tmp_path, [f"{36000.0 + step * k:.9g}" for k in range(8)]))
+        assert found.sample_time == pytest.approx(step) and not found.remarks
