@@ -9,9 +9,8 @@ Actions are made to have mean zero and then divided by max(1, max|a| / bound), a
 `rayleigh-v0`. The conducting state u = 0, T = 1/2 - y must be held; above Ra = 2585 it is unstable. An
 episode begins with the convection that develops without control.
 
-Staggered grid: T in the centres of n x n cells, u and v in the middle of their left and lower faces.
-Explicit Euler with central differences in conservative form, then a projection with cosine transforms
-for its Poisson equation: first order in time, second in space.
+The scheme is that of `buoyant_flow` on n x n cells with Euler's time steps: first order in time, second
+in space.
 
 References
 ----------
@@ -28,7 +27,7 @@ import numpy as np
 
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.dynamics import Dynamics, arguments_of
-from pdeloop.jit.cache import cached_njit
+from pde_sim_node.plants.buoyant_flow import Cells, flow
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Axis, Grid
 
@@ -91,12 +90,7 @@ class Convection(Dynamics):
         self.refinement = whole("refinement", refinement, 1)
         limit = _STABLE / (4 * n**2 * max(self.kappa, self.nu))
         self.substeps = math.ceil(self.sample_time / limit) * self.refinement
-        wave = np.arange(n)
-        self._cosines = np.cos(np.pi * wave[:, None] * (wave + 0.5) / n) * math.sqrt(2.0 / n)
-        self._cosines[0] = math.sqrt(1.0 / n)
-        symbol = 2.0 * n**2 * (np.cos(np.pi * wave / n) - 1.0)
-        self._inverse = np.zeros((n, n))
-        self._inverse.ravel()[1:] = 1.0 / np.add.outer(symbol, symbol).ravel()[1:]
+        self._cells = Cells.of(np.full(n, 1.0 / n), n, 1.0 / n, periodic=False)
         y = self.grid.axes[0].points
         rest = np.zeros((3, n, n))
         rest[0] = 0.5 - y[:, None]
@@ -135,12 +129,8 @@ class Convection(Dynamics):
         below = np.repeat(0.5 + a, self.grid.shape[1] // self.n_a, axis=1)
         dt = self.sample_time / self.substeps
         for m in range(len(z)):
-            flow(fields[m], below[m], self.kappa, self.nu, dt, self.substeps, *self._solver)
+            flow(fields[m], below[m], self.kappa, self.nu, dt, self.substeps, 0.0, *self._cells)
         return fields.reshape(len(z), -1)
-
-    @property
-    def _solver(self) -> tuple[Array, Array]:
-        return self._cosines, self._inverse
 
     def nusselt(self, z: Array) -> Array:
         """Nu of states (..., n_z): the heat through the lower wall, 1 where it is only conducted."""
@@ -151,70 +141,3 @@ class Convection(Dynamics):
     def refined(self) -> Convection:
         """With half the internal time step."""
         return type(self)(**{**arguments_of(self), "refinement": 2 * self.refinement})
-
-
-@cached_njit()
-def flow(
-    fields: Array,
-    below: Array,
-    kappa: float,
-    nu: float,
-    dt: float,
-    steps: int,
-    cosines: Array,
-    inverse: Array,
-) -> None:
-    """Advance T, u, v (3, n, n), in place; below (n,): temperatures of the lower wall."""
-    T, u, v = fields[0], fields[1], fields[2]
-    n = len(T)
-    h, d2 = dt * n, n * n
-    waves = np.ascontiguousarray(cosines.T)
-    new, moved_u, moved_v = np.empty_like(T), np.zeros_like(u), np.zeros_like(v)
-    source = np.empty((n, n))
-    for _ in range(steps):
-        for j in range(n):
-            for i in range(n):
-                here = T[j, i]
-                west = T[j, i - 1] if i > 0 else here
-                east = T[j, i + 1] if i < n - 1 else here
-                south = T[j - 1, i] if j > 0 else 2.0 * below[i] - here
-                north = T[j + 1, i] if j < n - 1 else -1.0 - here
-                out = u[j, i + 1] * (here + east) if i < n - 1 else 0.0
-                out -= u[j, i] * (here + west)
-                out += v[j + 1, i] * (here + north) if j < n - 1 else 0.0
-                out -= v[j, i] * (here + south)
-                spread = d2 * (west + east + south + north - 4.0 * here)
-                new[j, i] = here + dt * kappa * spread - 0.5 * h * out
-                if i > 0:
-                    c = u[j, i]
-                    w, e = u[j, i - 1], (u[j, i + 1] if i < n - 1 else 0.0)
-                    s = u[j - 1, i] if j > 0 else -c
-                    t = u[j + 1, i] if j < n - 1 else -c
-                    up = 0.25 * (v[j + 1, i - 1] + v[j + 1, i]) * (c + t) if j < n - 1 else 0.0
-                    down = 0.25 * (v[j, i - 1] + v[j, i]) * (c + s)
-                    out = 0.25 * ((c + e) ** 2 - (c + w) ** 2) + up - down
-                    moved_u[j, i] = c + dt * nu * d2 * (w + e + s + t - 4.0 * c) - h * out
-                if j > 0:
-                    c = v[j, i]
-                    s, t = v[j - 1, i], (v[j + 1, i] if j < n - 1 else 0.0)
-                    w = v[j, i - 1] if i > 0 else -c
-                    e = v[j, i + 1] if i < n - 1 else -c
-                    right = 0.25 * (u[j - 1, i + 1] + u[j, i + 1]) * (c + e) if i < n - 1 else 0.0
-                    left = 0.25 * (u[j - 1, i] + u[j, i]) * (c + w)
-                    out = 0.25 * ((c + t) ** 2 - (c + s) ** 2) + right - left
-                    lifted = 0.5 * (T[j - 1, i] + T[j, i])
-                    spread = d2 * (w + e + s + t - 4.0 * c)
-                    moved_v[j, i] = c + dt * (nu * spread + lifted) - h * out
-        for j in range(n):
-            for i in range(n):
-                out = (moved_u[j, i + 1] if i < n - 1 else 0.0) - moved_u[j, i]
-                out += (moved_v[j + 1, i] if j < n - 1 else 0.0) - moved_v[j, i]
-                source[j, i] = n * out
-        p = np.dot(waves, np.dot(np.dot(cosines, np.dot(source, waves)) * inverse, cosines))
-        for j in range(n):
-            for i in range(n):
-                T[j, i] = new[j, i]
-                if i > 0:
-                    u[j, i] = moved_u[j, i] - n * (p[j, i] - p[j, i - 1])
-                if j > 0:
-                    v[j, i] = moved_v[j, i] - n * (p[j, i] - p[j - 1, i])

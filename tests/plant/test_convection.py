@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pde_sim_node.plants import DynamicsPlant
-from pde_sim_node.plants.convection import Convection, flow
+from pde_sim_node.plants.buoyant_flow import flow
+from pde_sim_node.plants.convection import Convection
 
 NONE = np.zeros((1, 10))
 
@@ -79,6 +80,6 @@ def test_an_even_temperature_of_the_wall_is_that_of_the_wall() -> None:
     plant = Convection(10)
     z = np.zeros((3, 10, 10))
     z[0] = -0.5
-    flow(z, np.full(10, -0.5), plant.kappa, plant.nu, 0.1, 20, *plant._solver)
+    flow(z, np.full(10, -0.5), plant.kappa, plant.nu, 0.1, 20, 0.0, *plant._cells)
     np.testing.assert_allclose(z[0], -0.5, atol=1e-13)
     assert np.abs(z[1:]).max() < 1e-13
