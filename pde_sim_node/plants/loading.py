@@ -21,6 +21,7 @@ from pde_sim_node.plants import fmu, process
 from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
+from pde_sim_node.plants.convection_layer import ConvectionLayer
 from pde_sim_node.plants.falling_film import FallingFilm
 from pde_sim_node.plants.interval import Interval
 from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
@@ -43,6 +44,7 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
         "interval": Interval,
         "cavity": Cavity,
         "convection": Convection,
+        "convection-layer": ConvectionLayer,
         "kolmogorov": Kolmogorov,
         "transport": Transport,
         "reaction-diffusion": ReactionDiffusionBoundary,
