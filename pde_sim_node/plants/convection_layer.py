@@ -201,7 +201,7 @@ class ConvectionLayer(Dynamics):
         above = np.zeros_like(v)
         above[..., :-1, :] = v[..., 1:, :]
         centred = np.stack([T, 0.5 * (u + np.roll(u, -1, axis=-1)), 0.5 * (v + above)], axis=-3)
-        columns = centred.reshape(*centred.shape[:-1], _SENSORS * self.n_a, -1).mean(axis=-1)
+        columns = centred[..., :: self.grid.shape[1] // (_SENSORS * self.n_a)]
         found: Array = self._at_sensors @ columns
         return found
 

@@ -12,6 +12,7 @@ from benchmarks.__main__ import parser
 from benchmarks.backstepping import source_reaction_gain, source_transport_gain
 from benchmarks.published import TASKS, Name, run, text
 from benchmarks.tasks import boundary
+from benchmarks.tasks import convection_layer as layer
 from benchmarks.tasks import kuramoto_sivashinsky_sensors as sensors
 from benchmarks.tasks.common import first_law
 
@@ -65,6 +66,29 @@ def test_before_the_first_reading_the_plant_is_left_alone_for_a_quarter_of_an_ep
     assert drawn.shape == (20, 3, 64)
     apart, size = np.std(drawn - drawn[:, :1], axis=(0, 2))[1:], np.std(drawn)
     assert 0.9 < size < 1.4 and (apart < 2.0 * size).all() and (apart > 0.05 * size).all()
+
+
+def test_copies_of_readings_are_readings_of_copies() -> None:
+    plant = layer.ConvectionLayer(48, 12, steps=3)
+    measured = layer.explored(plant, 0)
+    found = layer.copies(layer.read(plant, measured))
+    for (seen, a), copy in zip(found, layer.copies(measured, staggered=True), strict=True):
+        assert np.allclose(seen, layer.read(plant, copy)[0], atol=1e-12) and np.array_equal(
+            a, copy[1]
+        )
+        for before, after, action in zip(*(copy[0][:-1], copy[0][1:], a), strict=True):
+            z = plant.step((before.ravel() + plant.target)[None], action[None])[0]
+            assert np.allclose(z - plant.target, after.ravel(), atol=1e-12)
+
+
+def test_a_law_of_one_exploration_and_its_copies_transfers_less_heat_than_none() -> None:
+    """By a twentieth on 12 rows, with half an exploration in half an episode."""
+    plant = layer.ConvectionLayer(48, 12, steps=100)
+    seen = list(layer.copies(layer.read(plant, layer.explored(plant, 1))))
+    law = layer.of_states(plant, layer.linear(layer.identified(seen[::2], 60), 1e-4))
+    start = plant.developed(layer.STARTS[0])[None]
+    none = layer.followed(plant, lambda z: np.zeros((1, 12)), start)
+    assert layer.followed(plant, law, start) < 0.95 * none
 
 
 def test_tasks_are_listed_with_their_sources_and_unknown_ones_are_refused(
