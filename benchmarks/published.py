@@ -58,7 +58,7 @@ TASKS: dict[str, Task] = {
     "kuramoto-sivashinsky-four": Task(kuramoto_sivashinsky_four.rows, "Werner and Peitz", 30),
     "film": Task(falling_film.rows, "beacon, shkadov-v0", 2),
     "convection": Task(convection.rows, "beacon, rayleigh-v0", 12),
-    "rbc2d": Task(convection_layer.rows, "FluidGym, RBC2D-easy-v0", 30),
+    "rbc2d": Task(convection_layer.rows, "FluidGym, RBC2D-easy-v0", 15),
     "tokamak": Task(tokamak.rows, "Gym-TORAX, IterHybrid-v0", 40),
 }
 

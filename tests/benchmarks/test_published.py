@@ -76,7 +76,7 @@ def test_copies_of_readings_are_readings_of_copies() -> None:
         assert np.allclose(seen, layer.read(plant, copy)[0], atol=1e-12) and np.array_equal(
             a, copy[1]
         )
-        for before, after, action in zip(*(copy[0][:-1], copy[0][1:], a), strict=True):
+        for before, after, action in zip(copy[0][:-1], copy[0][1:], a, strict=True):
             z = plant.step((before.ravel() + plant.target)[None], action[None])[0]
             assert np.allclose(z - plant.target, after.ravel(), atol=1e-12)
 
