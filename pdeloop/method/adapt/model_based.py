@@ -63,6 +63,9 @@ from pdeloop.method.adapt.trajectories import Records, cleaned
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
+    LAST,
+    NAMES,
+    NO_OTHER,
     NONE,
     beats_no_control,
     cheaper_law,
@@ -70,7 +73,7 @@ from pdeloop.method.adapt.verdict import (
     evidence_of,
     evidence_of_rollouts,
     measured_change,
-    of_the_last,
+    size_of,
 )
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
@@ -564,10 +567,16 @@ class ModelBased(Optimizer):
             return
         law, saved = found
         name = FIRST if np.array_equal(law, self._first) else ADAPTED
-        size = f"{-saved.value:.4g} (standard error {saved.error:.2g})"
-        other = "the first law" if name == FIRST else "an earlier adapted law"
-        dropped = of_the_last(str(row["reason"]))
-        row["reason"] = f"{dropped}; {other} costs {size} less and is returned"
+        chosen = str(row["chosen"])
+        other = NAMES[FIRST] if name == FIRST else "an earlier adapted law"
+        reason = (
+            f"{size_of(other, saved, LAST if chosen == ADAPTED else NAMES[chosen])} and is returned"
+        )
+        if chosen != ADAPTED:
+            missed = str(row["reason"]).removeprefix(f"{NO_OTHER}: ")
+            within = " (within chance)" if missed != row["reason"] else ""
+            reason = f"{missed}{within}; {reason}"
+        row["reason"] = reason
         change = measured_change(known, law, laws[base])
         if change is None:
             change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))

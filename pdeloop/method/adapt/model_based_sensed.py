@@ -75,6 +75,26 @@ class ModelBasedReadings(ModelBased):
             return super()._fields()
         return self._progress.belief.loop(self._context).beginnings(self._data())
 
+    def _renew(self, row: Row) -> None:
+        """Where laws run too far away to be fitted, rollouts without control come next."""
+        super()._renew(row)
+        if self._progress.stage != RENEWING or not self._none_tells():
+            return
+        fitted = to_be_fitted(self._context, self._measurements())[1]
+        if not any(own.policy.any() for own in fitted):
+            self._progress.policy = self._none.copy()
+            for name in OF_A_LAW:
+                row.pop(name, None)
+            row["reason"] = "every law runs away: no control is rolled out next"
+
+    def _none_tells(self) -> bool:
+        """True if rollouts without control would say something new."""
+        return not self._of(self._none)
+
+    def _of(self, law: Array) -> list[Record]:
+        """The rollouts of a law in the order of its fields."""
+        return [own for own in self._records.all() if np.array_equal(own.policy, law)]
+
     def _replay(self, model: Belief | None, row: Row, final: bool, why: str = "") -> None:
         """More rollouts may determine a model."""
         row["reason"] = f"{why or self._unpredicted}; the law is kept"
@@ -138,24 +158,11 @@ class ModelBasedSensed(ModelBasedReadings):
             return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last
 
-    def _renew(self, row: Row) -> None:
-        """Where laws run too far away to be fitted, rollouts without control show the equation."""
-        super()._renew(row)
-        if (
-            self._progress.stage != RENEWING
-            or self._sensed is not None
-            or not self._attempts_left(self._records.count + self._settings.judging)
-        ):
-            return
-        if not any(
-            own.policy.any() for own in to_be_fitted(self._context, self._measurements())[1]
-        ):
-            self._progress.policy = self._none.copy()
-            for name in OF_A_LAW:
-                row.pop(name, None)
-            row["reason"] = (
-                "no equation was found, and the law diverges: no control is rolled out next"
-            )
+    def _none_tells(self) -> bool:
+        """Until an equation is found, as long as one is looked for."""
+        return self._sensed is None and self._attempts_left(
+            self._records.count + self._settings.judging
+        )
 
     def _attempts_left(self, own: int) -> bool:
         """True if an equation is looked for after so many own rollouts."""
@@ -250,10 +257,6 @@ class ModelBasedSensed(ModelBasedReadings):
     def _base(self) -> tuple[str, Array]:
         """The law to stay with on the model."""
         return (FIRST, self._first) if self._progress.safe else (NONE, self._none)
-
-    def _of(self, law: Array) -> list[Record]:
-        """The rollouts of a law in the order of its fields."""
-        return [own for own in self._records.all() if np.array_equal(own.policy, law)]
 
     def _begin_judging(self) -> None:
         super()._begin_judging()

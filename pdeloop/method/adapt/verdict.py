@@ -45,6 +45,8 @@ NAMES = {
     NONE: "no control",
     PREDICTIVE: "the law that plans",
 }
+LAST = "the last law"
+"""The adapted law where it is not the one that is returned, so that another is."""
 NO_OTHER = "no other law is better by more than chance"
 ALL_AGREE = "which may be chance, but every estimate agrees"
 
@@ -98,7 +100,7 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
             continue
         if np.isinf(own.excess).any():
             if name in (ADAPTED, PREDICTIVE):
-                stays = Verdict(base, 0.0, 0.0, f"a rollout of {NAMES[name]} diverged")
+                stays = Verdict(base, 0.0, 0.0, f"a rollout of {_other(name)} diverged")
             continue
         change = own.change + _correction(own) - of_base
         size = change.value, change.error
@@ -106,35 +108,31 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
             known = own.change.value, own.change.error
             found.append(Verdict(name, *known, f"a rollout of {NAMES[base]} diverged"))
         elif change.is_negative(confidence):
-            found.append(Verdict(name, *size, size_of(name, base, *size)))
+            found.append(Verdict(name, *size, size_of(NAMES[name], change, NAMES[base])))
         else:
-            missed.append(size_of(name, base, *size))
+            missed.append(size_of(_other(name), change, NAMES[base]))
             if base == NONE and own.also and all(e.value < 0.0 for e in (change, *own.also)):
-                likely.append(Verdict(name, *size, f"{missed[-1]}, {ALL_AGREE}"))
+                why = size_of(NAMES[name], change, NAMES[base])
+                likely.append(Verdict(name, *size, f"{why}, {ALL_AGREE}"))
     if missed and stays.reason == NO_OTHER:
         stays = replace(stays, reason=f"{NO_OTHER}: {', '.join(missed)}")
-    stays = replace(stays, reason=of_the_last(stays.reason))
     return min(found or likely, key=lambda verdict: verdict.change, default=stays)
 
 
-def of_the_last(reason: str) -> str:
-    """A reason for which the adapted law is not the one that is returned, so that another is.
-
-    >>> of_the_last("the adapted law costs 3 (standard error 1) more than no control")
-    'the last law costs 3 (standard error 1) more than no control'
-    """
-    return reason.replace(NAMES[ADAPTED], "the last law")
+def _other(name: str) -> str:
+    """A law that is not returned."""
+    return LAST if name == ADAPTED else NAMES[name]
 
 
-def size_of(name: str, base: str, change: float, deviation: float) -> str:
+def size_of(law: str, change: Estimate, other: str) -> str:
     """A difference with its standard error, in words.
 
-    >>> size_of(ADAPTED, FIRST, -4.116, 1.179)
+    >>> size_of("the adapted law", Estimate(-4.116, 1.179), "the first law")
     'the adapted law costs 4.116 (standard error 1.2) less than the first law'
     """
-    law, other = (NAMES[own] for own in (name, base))
-    more = "less" if change < 0.0 else "more"
-    return f"{law} costs {abs(change):.4g} (standard error {deviation:.2g}) {more} than {other}"
+    more = "less" if change.value < 0.0 else "more"
+    size = f"{abs(change.value):.4g} (standard error {change.error:.2g})"
+    return f"{law} costs {size} {more} than {other}"
 
 
 def is_cheaper(own: Array, other: Array) -> bool:
