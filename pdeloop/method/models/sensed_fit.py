@@ -218,6 +218,9 @@ short parts would be taken too literally; and the coefficient of the third deriv
 leads from waves that run one way to waves that run the other."""
 _HOPELESS = 0.1
 """Error over any part of the rollouts at which a fit is abandoned."""
+_TOLD, _ENOUGH, _BEHIND = 0.25, 30, 0.8
+"""Share of the steps, and their number, from which a fit is abandoned whose error is not so much below
+another one's."""
 _CHANCE = 4.0
 """Error, in standard deviations of the noise in it, that chance explains."""
 _TERM = 4.0
@@ -292,31 +295,36 @@ def fit_sensed(
     )
     if start is not None:
         own = np.flatnonzero(start[0][:EQUATION]).tolist()
-        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted()
+        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted(parts=data.two_lengths)
         if fit.error(data.steps) <= SENSED_REPRODUCED:
             return fit.found
-    best = _of_first_terms(data)
+    first, best = _of_first_terms(data)
     for library, unequal, least in _LIBRARIES[1:]:
         error = best.error(data.steps)
         if error <= max(least, data.unexplained):
             continue
         most = 0.5 * (error + data.unresolved) - data.unresolved
         if best.lost or best.promised(library, unequal) < most:
-            fit = _Fit(data, library, unequal).fitted()
+            fit = _Fit(data, library, unequal).fitted(first)
             if fit.error(data.steps) < most:
                 best = fit
     return best.found
 
 
-def _of_first_terms(data: _Data) -> _Fit:
-    """The likeliest of fits from nothing, which are made until one is not lost."""
+def _of_first_terms(data: _Data) -> tuple[_Fit, _Fit]:
+    """Of fits from nothing, until one is not lost, that which others are compared with, and the best.
+
+    The former is the first one, or the best where that was abandoned.
+    """
     fits = list[_Fit]()
     for loose, dispersion in _STARTS:
-        fits.append(_Fit(data, *_LIBRARIES[0][:2], loose=loose))
-        fits[-1].shared[TERMS.index((1, 3))] = dispersion
-        if not fits[-1].fitted().lost:
-            return fits[-1]
-    return min(fits, key=lambda fit: fit.value(data.steps))
+        fit = _Fit(data, *_LIBRARIES[0][:2], loose=loose)
+        fit.shared[TERMS.index((1, 3))] = dispersion
+        fits.append(fit.fitted(fits[0] if fits else None))
+        if not fit.lost:
+            return fit, fit
+    best = min(fits, key=lambda fit: fit.error(data.steps))
+    return fits[0] if data.steps in fits[0].errors else best, best
 
 
 def initial_field(
@@ -335,7 +343,7 @@ def initial_field(
     exact = replace(settings, sensed_unresolved=0.0)  # the model's noise has that in it
     data = _Data(y, a, model.actuators, model.noise, target, d, exact)
     fit = _Fit(data, (), False, model.shared, model.spread, known=True)
-    for m in (data.lengths[:_EARLY][-1], data.steps):
+    for m in data.two_lengths:
         fit.descend(m)
     field: Array = field_of(fit.fields, data.n)[0]
     return field, fit.error(data.steps)
@@ -390,6 +398,11 @@ class _Data:
         return [*found, self.steps]
 
     @property
+    def two_lengths(self) -> tuple[int, int]:
+        """The same where the equation is known."""
+        return self.lengths[:_EARLY][-1], self.steps
+
+    @property
     def unexplained(self) -> float:
         """The least error that is due neither to the grid nor to chance in the noise."""
         share = (self.noise / self.size) ** 2
@@ -415,6 +428,8 @@ class _Fit:
         known: bool = False,
     ) -> None:
         self.data, self.fields, size = data, data.interpolated, data.size
+        self.errors = dict[int, float]()
+        """Over the parts that it was fitted to."""
         count = unknowns(data.actions.shape[2])
         self.shared = np.zeros(count) if shared is None else shared.copy()
         self.sigma = data.sigma if known else max(data.sigma, loose * size)
@@ -434,12 +449,15 @@ class _Fit:
             elif own >= SHARED:
                 self.deviations[i] = _UNEQUAL
 
-    def fitted(self) -> _Fit:
-        """This one, over longer and longer parts."""
+    def fitted(self, other: _Fit | None = None, parts: Sequence[int] = ()) -> _Fit:
+        """This one, over longer and longer parts, as long as it is better there than another one."""
         data = self.data
-        for m in data.lengths:
+        for m in parts or data.lengths:
             self.descend(m)
-            if self.error(m) > _HOPELESS:
+            self.errors[m], most = self.error(m), _HOPELESS
+            if other is not None and m >= max(_TOLD * data.steps, _ENOUGH):
+                most = min(most, _BEHIND * other.errors.get(m, np.inf))
+            if self.errors[m] > most:
                 return self
         self.sigma = data.sigma
         self.descend(data.steps)
@@ -480,11 +498,6 @@ class _Fit:
         gain = 0.5 * float(rest @ np.linalg.solve(H, rest) + np.sum(gz * X[..., -1]))
         share = 2.0 * gain / data.readings.size * (self.sigma / data.size) ** 2
         return self.error(data.steps) - share
-
-    def value(self, m: int) -> float:
-        """J over m steps."""
-        with np.errstate(all="ignore"):
-            return self._value(self.shared, self.fields, m)
 
     def error(self, m: int) -> float:
         """Mean square of the errors of the first m readings, less the noise, relative to their size."""
