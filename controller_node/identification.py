@@ -384,7 +384,9 @@ def design_each(
         late = tuple(max(n, 0) for n in study_delays(every).best)
         settings = replace(settings, input_delay=late if any(late) else ())
     whole, found = settings, dict[int, NDArray[np.float64]]()
-    measured = settings.identification != "subspace"  # whose order is that of a state behind readings
+    measured = (
+        settings.identification != "subspace"
+    )  # whose order is that of a state behind readings
     if measured and target.size <= SMALL and not model_order(asdict(settings)):
         whole = replace(settings, reduced_order=target.size)
     for number in numbers:
