@@ -325,7 +325,8 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         except ValueError as error:
             yield Finding("order", False, str(error))
             return
-        orders = [settings.reduced_order, suggested]
+        # A law on a model of the field hardly depends on the order, and takes longer.
+        orders = [settings.reduced_order, suggested][: 1 + (settings.identification != "field")]
         told = (
             f"reduced_order {settings.reduced_order or suggested}; one episode suggests {suggested}, "
             f"and for dmdc a rank of {suggested + plant.n_a} or more"

@@ -39,9 +39,9 @@ def test_a_model_in_innovation_form_knows_their_differences(explored: Any) -> No
     values = pdeloop.problem(plant=Pumps(), law="observer", identification="subspace").values
     rows = designed(explored, Pumps.target, DesignSettings.of(values)).rows
     np.testing.assert_allclose(rows.B.sum(axis=1), 0.0, atol=1e-9 * np.abs(rows.B).max())
-    with pytest.warns(pdeloop.TrainingWarning):
-        run = pdeloop.train(plant=Pumps(), sensors=3, rollouts=12, evaluation_fields=4)
-    assert run.costs["lqt"].mean() < 0.8 * run.costs["none"].mean()
+    run = pdeloop.train(plant=Pumps(), sensors=3, rollouts=12, evaluation_fields=4)
+    costs = {name: own.mean() for name, own in run.costs.items()}
+    assert costs["adapted"] < 0.95 * costs["lqt"] < 0.9 * costs["none"]
 
 
 def test_a_recorded_run_is_identified(explored: Any) -> None:

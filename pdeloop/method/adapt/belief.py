@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -172,16 +172,16 @@ def _reads(context: Context) -> bool:
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:
     """The belief in a model in innovation form, with as many states as the law's filter has."""
-    rollouts = []
+    rollouts, free = [], context.action_set.free(context.exploration.actions.shape[1])
     for record in records:
         steps = min(len(record.actions), len(record.states) - 1)
         if steps > 1 and np.isfinite(record.states).all():
-            rollouts.append((record.states[: steps + 1], record.actions[:steps]))
+            rollouts.append((record.states[: steps + 1], record.actions[:steps] @ free))
     try:
         model, error = fit_readings(rollouts, context.target, context.U.shape[1])
     except ValueError:
         return None
-    return Belief(model, error, 1)
+    return Belief(replace(model, B=model.B @ free.T), error, 1)
 
 
 def _measured(context: Context, record: Record) -> Measured:
