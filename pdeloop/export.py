@@ -21,6 +21,7 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws import Law
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
@@ -65,7 +66,7 @@ class Parameters:
         )
 
     def c(self) -> bytes:
-        """One function in C99 for the laws `feedforward` and `observer`, and for one that acts as that.
+        """One function in C99 for the laws `feedforward`, `observer` and `neural`.
 
         Any other law is refused with a ParameterError.
         """
@@ -76,6 +77,12 @@ class Parameters:
             own = law.parts(theta)
             K, b = _rows(own["K"]), _rows(own["b"])
             return _filled("feedforward", self, self.model, K=K, b=b, steps=str(len(own["b"])))
+        if isinstance(law, Neural):
+            known = {**law.matrices(theta)}
+            c, w = (_numbers(known.pop(name)) for name in ("c", "w"))
+            rows = {name: _rows(matrix) for name, matrix in known.items()}
+            n_h = str(len(known["W"]))
+            return _filled("neural", self, self.model, **rows, c=c, w=w, n_h=n_h)
         if other or type(law) not in (Observer, ExtendedKalman):
             raise ParameterError(
                 f"the law '{self.kind}' cannot be written in C; write its parameters as .npz{other}"

@@ -172,14 +172,14 @@ class Gradients:
         law : Law
             As `FinishedRun.laws` gives it, or made from a model.
         theta : (size,)
-            Its parameters.
+            Its parameters; more if the law `extends`.
         fields : (M,) int, or (M, n_z)
             Initial fields.
 
         Returns
         -------
         CostGradient
-            J, dJ/dtheta (size,) and dJ/dz_0 (M, n_z).
+            J, dJ/dtheta, of the shape of theta, and dJ/dz_0 (M, n_z).
 
         Raises
         ------
@@ -191,7 +191,8 @@ class Gradients:
                 f"the law '{law.name}' has no derivatives, which exact gradients need: it has no "
                 "pull_back(theta, z, memory, k, y), or none of its memory"
             )
-        given = finite_array("theta", theta, (law.size,))
+        size = max(np.size(theta), law.size) if law.extends else law.size
+        given = finite_array("theta", theta, (size,))
         parts, memories = law.parts(given), []
         rows = [law.memory_start() for _ in range(len(np.atleast_1d(fields)))]
 

@@ -3,6 +3,7 @@
 
     affine:    a = P(K s + constant),       s = U^T y
     observer:  a = P(K p + D s + b),        p <- F p + G s + B a + c,    p = s at first
+    neural:    a = P(K s + c + D tanh(W s + w))
 
 with the nearest admissible action P(a), which rate limits make one near the action before.
 """
@@ -20,6 +21,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 
 
@@ -30,7 +32,7 @@ class LawForm:
     Attributes
     ----------
     kind : str
-        affine or observer.
+        affine, observer or neural.
     arrays : mapping
         By the names above.
     action_set : ActionSet
@@ -49,6 +51,13 @@ class LawForm:
     sample_time: float
     name: str
     spectral_radius: float
+
+    def require_matrices(self) -> None:
+        """ParameterError for a law with a network."""
+        if self.kind == "neural":
+            raise ParameterError(
+                "a law with a network has no such form; write it as C, an FMU or an ONNX model"
+            )
 
     @property
     def n_y(self) -> int:
@@ -79,6 +88,11 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
         kind, arrays = "observer", {"U": model.U, "B": model.B, **own}
         B, K, D = model.B, own["K"], own["D"]
         loop = np.block([[model.A + B @ D, B @ K], [own["G"] + B @ D, own["F"] + B @ K]])
+    elif isinstance(law, Neural):
+        own = law.matrices(theta)
+        kind, arrays = "neural", {"U": model.U, **own}
+        slope = own["D"] * (1.0 - np.tanh(own["W"] @ model.s_r + own["w"]) ** 2) @ own["W"]
+        loop = model.A + model.B @ (own["K"] + slope)  # at the target
     else:
         raise ParameterError(
             f"the law '{law.name}' has no such form; train with --law affine or observer, or write its "

@@ -47,7 +47,7 @@ def fmu(law: LawForm, source: bytes) -> bytes:
     """
     call = "pdeloop_law(&law->memory, law->y, law->a)"
     memory = "pdeloop_memory memory;"
-    if law.kind == "affine":
+    if law.kind != "observer":
         call, memory = "pdeloop_law(law->y, law->a)", ""
     start = "memcpy(law->a, pdeloop_start, sizeof law->a);" if law.action_set.rated else ""
     wrapper = Template(_TEMPLATE.read_text()).substitute(
@@ -153,6 +153,10 @@ def onnx(law: LawForm) -> bytes:
             nodes.append(node(side, [f"{near}_near", far], [near]))
     if law.kind == "affine":
         computed("requested", ("K", "s"), constant="constant")
+    elif law.kind == "neural":
+        computed("into", ("W", "s"), constant="w")
+        nodes.append(node("Tanh", ["into"], ["hidden"]))
+        computed("requested", ("K", "s"), ("D", "hidden"), constant="c")
     else:
         outputs += [vector("p_next", n_s)]
         nodes.append(node("Where", ["started", "p", "s"], ["prediction"]))
@@ -186,6 +190,7 @@ def matlab(law: LawForm) -> bytes:
     """
     from scipy.io import savemat
 
+    law.require_matrices()
     own, Ut = law.arrays, law.arrays["U"].T
     if law.kind == "affine":
         known: dict[str, Any] = {"K": own["K"] @ Ut, "constant": own["constant"][:, None]}

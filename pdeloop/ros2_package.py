@@ -95,6 +95,7 @@ def write_package(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ParameterError(f"{folder} exists; give a new folder for the package")
     law = law_form(run, which, seed)
+    law.require_matrices()
     limits = {"rate": np.full(law.n_a, np.inf), "start": np.zeros(law.n_a)}
     limits |= law.action_set.limits(law.n_a)
     words = {

@@ -21,6 +21,7 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
 from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
 from pdeloop.method.laws import Affine, Law
+from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
@@ -127,8 +128,13 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
         )
     if law.needs_model and law.name not in kind.also_improves:
         raise ParameterError(
-            f"the parameters of the law '{law.name}' include a model of the plant, which the "
+            f"the parameters of the law '{law.name}' come from a model of the plant, which the "
             f"optimizer '{values['optimizer']}' does not support; choose model_based, or another law"
+        )
+    if issubclass(law, Neural) and few_sensors(values):
+        raise ParameterError(
+            f"the law '{law.name}' acts on the whole state, but {few_sensors(values)} sensors measure "
+            "the plant; give --law predictive_kalman or extended_kalman"
         )
     if issubclass(law, Predictive):
         sensors, estimates = few_sensors(values), issubclass(law, PredictiveKalman)

@@ -11,7 +11,7 @@ import scipy  # whose special functions, a tenth of a start, load when they are 
 from numpy.typing import NDArray
 
 from pdeloop.messages.topics import COMPLETED
-from pdeloop.method.laws import Affine, Predictive
+from pdeloop.method.laws import Affine, Neural, Predictive
 from tuner_node.batch import stacked
 from tuner_node.budget import PURPOSES
 from tuner_node.readings import found_noise, seeming_noise
@@ -130,17 +130,17 @@ def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:
 def acting(training: Training) -> list[dict[str, Any]]:
     """The law that acts of each seed, and the times (s) of its first step and of others, in the median.
 
-    Of laws that may plan; else none.
+    Of laws that may plan or have a network; else none.
     """
-    if not issubclass(training.settings.law, Predictive) or training.models is None:
+    if not issubclass(training.settings.law, Neural | Predictive) or training.models is None:
         return []
     found = []
     for law, policy, known in zip(
         training.laws(), training.policies(), training.explorations, strict=True
     ):
-        assert isinstance(law, Predictive) and known is not None
+        assert isinstance(law, Neural | Predictive) and known is not None
         first, others = law.step_times(policy, known.states[0])
-        name = Predictive.name if law.plans(policy) else law.base.name
+        name = law.acting(policy)
         found.append({"law": name, "first_step": first, "step": others})
     return found
 

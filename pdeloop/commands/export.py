@@ -42,10 +42,10 @@ def add(commands: Commands) -> None:
         "TensorBoard",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: "
         "as .npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` also reads, or "
-        "as a C99 function; the laws `feedforward` and `observer` as a C99 function of the step, "
-        "or with a memory; any other law's parameters as .npz; those in C also as a ROS 2 package of "
-        "rclpy and NumPy; and the cost after each step of the training as .csv or as event files of "
-        "TensorBoard.",
+        "as a C99 function; the laws `feedforward`, `observer` and `neural` as a C99 function of the "
+        "step, with a memory, or with a network; any other law's parameters as .npz; affine laws and "
+        "observers also as a ROS 2 package of rclpy and NumPy; and the cost after each step of the "
+        "training as .csv or as event files of TensorBoard.",
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )
     add_argument = export.add_argument
@@ -165,5 +165,6 @@ def _model_file(name: str, run: FinishedRun, which: str, seed: int | None) -> by
         return model_files.fmu(law, law_of(run, which, seed).c())
     if name == "onnx":
         return model_files.onnx(law)
+    law.require_matrices()
     print(f"spectral radius of the closed loop on the identified model: {law.spectral_radius:.4g}")
     return model_files.matlab(law)

@@ -18,10 +18,11 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.neural import Layers, Neural
 from pdeloop.method.laws.observer import Observer
 from tests.tools.test_compare_and_export import DOUBLES, compiled
 
-N_Z, N_S, N_A, T = 6, 3, 4, 12
+N_Z, N_S, N_A, N_H, T = 6, 3, 4, 5, 12
 RNG = np.random.default_rng(0)
 SETS = {
     "one side": ActionSet(N_A, 0.0, np.inf),
@@ -60,13 +61,18 @@ def acting(law: Law, allowed: ActionSet) -> np.ndarray:
     """Its actions in the loop along given states."""
     target = np.linalg.pinv(law.model.U.T) @ law.model.s_r
     batch = LawBatch([law], target, allowed)
-    batch.set(theta_of(law).reshape(1, *law.shape))
+    theta = theta_of(law)
+    batch.set(theta[None] if law.extends else theta.reshape(1, *law.shape))
     return np.stack([batch.actions(k, z[None])[0] for k, z in enumerate(STATES)])
 
 
 def theta_of(law: Law) -> np.ndarray:
     theta = law.theta_start.copy()
-    theta += 0.1 * np.random.default_rng(1).standard_normal(theta.shape)
+    rng = np.random.default_rng(1)
+    theta += 0.1 * rng.standard_normal(theta.shape)
+    if isinstance(law, Neural):
+        shapes = (N_H, N_S), (N_H,), (N_A, N_H), (N_A,)
+        theta = law.theta_of(theta, Layers(*(rng.standard_normal(shape) for shape in shapes)))
     return theta
 
 
@@ -78,7 +84,7 @@ def pointer(array: np.ndarray) -> Any:
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
+@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer, Neural])
 def test_c_acts_as_the_loop_at_every_bound(tmp_path: Path, kind: type[Law]) -> None:
     law = kind(model(kind.filtered), T)
     theta = theta_of(law)
@@ -94,7 +100,7 @@ def test_c_acts_as_the_loop_at_every_bound(tmp_path: Path, kind: type[Law]) -> N
         function, a = compiled(source), np.broadcast_to(allowed.start, N_A).copy()
         memory = ctypes.create_string_buffer(8 * (1 + N_S))
         for k, z in enumerate(STATES):
-            first: Any = {Affine: (), FeedForward: (k,)}.get(kind, (memory,))
+            first: Any = {Affine: (), Neural: (), FeedForward: (k,)}.get(kind, (memory,))
             function(*first, pointer(z), pointer(a))
             np.testing.assert_allclose(a, expected[k], rtol=1e-9, atol=1e-11, err_msg=name)
         with np.load(io.BytesIO(exported.npz())) as kept:
@@ -104,7 +110,7 @@ def test_c_acts_as_the_loop_at_every_bound(tmp_path: Path, kind: type[Law]) -> N
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
+@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer, Neural])
 def test_what_is_not_finite_neither_passes_nor_stays(tmp_path: Path, kind: type[Law]) -> None:
     law = kind(model(kind.filtered), T)
     allowed = SETS["each its own"]
@@ -115,7 +121,7 @@ def test_what_is_not_finite_neither_passes_nor_stays(tmp_path: Path, kind: type[
     source.write_bytes(exported.c())
     function, a = compiled(source), np.empty(N_A)
     memory = ctypes.create_string_buffer(8 * (1 + N_S))
-    first: Any = {Affine: (), FeedForward: (0,)}.get(kind, (memory,))
+    first: Any = {Affine: (), Neural: (), FeedForward: (0,)}.get(kind, (memory,))
     for bad in (np.nan, np.inf, -np.inf):
         for z in (STATES[0], np.where(np.arange(N_Z) == 2, bad, STATES[1]), STATES[2]):
             function(*first, pointer(np.ascontiguousarray(z)), pointer(a))

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The law that plans on a model where that pays, over topics: the bits of one process."""
+"""Laws that plan on a model or have a network, over topics: the bits of one process."""
 
 from __future__ import annotations
 
@@ -21,25 +21,26 @@ PARAMETERS = {
     "reduced_order": 8,
     "rollouts": 15,
     "evaluation_fields": 2,
-    "law": "auto",
 }
-SETTINGS = {
-    "law_settings": {"first_iterations": 20, "starts": 2},
+LAWS = {
+    "auto": {"first_iterations": 20, "starts": 2},
+    "neural": {"neurons": 16, "iterations": 150},
 }
 
 
+@pytest.mark.parametrize("law", LAWS)
 def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_from_a_bag(
-    loop: Processes, tmp_path: Path
+    loop: Processes, tmp_path: Path, law: str
 ) -> None:
     out = tmp_path / "run"
-    words = [f"{name}={value}" for name, value in PARAMETERS.items()]
-    words += [f"{of}.{name}={value}" for of, own in SETTINGS.items() for name, value in own.items()]
+    words = [f"{name}={value}" for name, value in {**PARAMETERS, "law": law}.items()]
+    words += [f"law_settings.{name}={value}" for name, value in LAWS[law].items()]
     flags = [word for setting in words for word in ("--set", setting)]
     problem = "kuramoto-sivashinsky-22"
     loop.wait(loop.pdeloop("train", problem, *flags, "--record", "--out", str(out)), LIMIT)
-    here = pdeloop.train(problem, **PARAMETERS, **SETTINGS)
+    here = pdeloop.train(problem, **PARAMETERS, law=law, law_settings=LAWS[law])
     assert here.result["history"][-1]["role"] == "judging"
-    assert here.laws[0].plans(here.policies[0])
+    assert here.result["acting"][0]["law"] in ("predictive", "neural")
     assert same_bits(policies(out), here.policies)
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
     assert "no difference, to the bit" in verified

@@ -76,6 +76,7 @@ from pdeloop.method.adapt.verdict import (
     size_of,
 )
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.seeds import field_seed
@@ -124,6 +125,7 @@ class ModelBased(Optimizer):
         "feedforward",
         "predictive",
         "auto",
+        "neural",
         "predictive_kalman",
         "auto_kalman",
     )
@@ -165,14 +167,17 @@ class ModelBased(Optimizer):
 
     @classmethod
     def for_context(cls, context: Context) -> type[Optimizer]:
-        """Another one for a law that plans, or estimates the state from few readings."""
+        """Another one for a law that plans, has a network, or estimates the state from few readings."""
         # Not at the top: they know this class.
+        from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
         from pdeloop.method.adapt.model_based_predictive import (
             ModelBasedPredictive,
             ModelBasedPredictiveSensed,
         )
         from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
 
+        if isinstance(context.law, Neural):
+            return ModelBasedNeural
         if isinstance(context.law, Predictive):
             few = isinstance(context.law, PredictiveKalman)
             return ModelBasedPredictiveSensed if few else ModelBasedPredictive

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -104,6 +105,8 @@ class ModelBasedPredictive(Optimizer):
     name = "model_based"
     Settings = ModelBasedSettings
     needs_trajectories = True
+    candidate: ClassVar[str] = PREDICTIVE
+    """Name in a verdict of the law that the last rollouts are of."""
 
     def __init__(
         self,
@@ -250,7 +253,7 @@ class ModelBasedPredictive(Optimizer):
         elif self._share <= self._law.worth:
             why = f"on the model another law saves at most {100 * self._share:.2g} % more"
         elif not self._left:
-            why = "too few rollouts are left to judge one that plans"
+            why = "too few rollouts are left to judge another"
         else:
             made = self._made(belief, row)
             if isinstance(made, Candidate):
@@ -338,6 +341,14 @@ class ModelBasedPredictive(Optimizer):
         most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
         return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
 
+    def _check(self, theta: Array) -> None:
+        """ValueError if a theta is that of no law that plans."""
+        self._law.planner(self._law.parts(theta))
+
+    def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
+        """Costs of the law that plans from initial fields on the model."""
+        return simulated(self._law.planner(self._law.parts(theta)), fields)
+
     def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
         """Costs of plans from initial fields on the model."""
         return simulated(planner, fields)
@@ -352,7 +363,7 @@ class ModelBasedPredictive(Optimizer):
             base,
             self._settings.confidence,
         )
-        if verdict.chosen == PREDICTIVE:
+        if verdict.chosen == self.candidate:
             self._chosen = candidate.theta
         row["chosen"], row["reason"] = verdict.chosen, verdict.reason
         row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
@@ -375,12 +386,11 @@ class ModelBasedPredictive(Optimizer):
         """Of the law that plans and the one to stay with, from their rollouts."""
         loop, policy = belief.loop(self._context), self._affine.policy
         theta = loop.theta(policy)
-        planner = self._law.planner(self._law.parts(candidate.theta))
         excess, costs, before = list[float](), [candidate.costs], [candidate.before]
         usable = [r for r in results if r.usable and r.trajectory is not None]
         if usable:
             fields = np.stack([r.trajectory.states[0] for r in usable if r.trajectory is not None])
-            own = simulated(planner, fields)
+            own = self._costs_of(candidate.theta, belief, fields)
             costs.append(own)
             before.append(loop.costs(theta, fields))
             row["predicted"] = float(np.mean(own))
@@ -394,7 +404,7 @@ class ModelBasedPredictive(Optimizer):
         change = mean_change(np.concatenate(costs), np.concatenate(before))
         return {
             base: Evidence(ZERO, np.array([e for e in of_base if not np.isnan(e)])),
-            PREDICTIVE: Evidence(change, np.array(excess), (change,)),
+            self.candidate: Evidence(change, np.array(excess), (change,)),
         }
 
     def _matrix(self, record: Record) -> Record:
@@ -430,7 +440,7 @@ class ModelBasedPredictive(Optimizer):
         self._count = int(checked_array(state, "count", "i", ()))
         if "theta" in state:
             theta = checked_array(state, "theta", "f", (None,)).copy()
-            self._law.planner(self._law.parts(theta))  # ValueError for none
+            self._check(theta)
             costs, before = checked_array(state, "costs", "f", (2, None), finite=False)
             self._candidate = Candidate(theta, costs.copy(), before.copy())
         plans = bool(checked_array(state, "plans", "b", ()))

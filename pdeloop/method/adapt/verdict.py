@@ -38,12 +38,14 @@ from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
 
-FIRST, ADAPTED, NONE, PREDICTIVE = "first", "adapted", "none", "predictive"
+FIRST, ADAPTED, NONE = "first", "adapted", "none"
+PREDICTIVE, NEURAL = "predictive", "neural"
 NAMES = {
     FIRST: "the first law",
     ADAPTED: "the adapted law",
     NONE: "no control",
     PREDICTIVE: "the law that plans",
+    NEURAL: "the law with a network",
 }
 LAST = "the last law"
 """The adapted law where it is not the one that is returned, so that another is."""
@@ -99,7 +101,7 @@ def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Ve
         if name == base or not np.isfinite(own.change.value):
             continue
         if np.isinf(own.excess).any():
-            if name in (ADAPTED, PREDICTIVE):
+            if name in (ADAPTED, PREDICTIVE, NEURAL):
                 stays = Verdict(base, 0.0, 0.0, f"a rollout of {_other(name)} diverged")
             continue
         change = own.change + _correction(own) - of_base

@@ -5,5 +5,6 @@ from pdeloop.method.laws.affine import Affine as Affine
 from pdeloop.method.laws.base import Law as Law
 from pdeloop.method.laws.extended_kalman import ExtendedKalman as ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward as FeedForward
+from pdeloop.method.laws.neural import Neural as Neural
 from pdeloop.method.laws.observer import Observer as Observer
 from pdeloop.method.laws.predictive import Predictive as Predictive

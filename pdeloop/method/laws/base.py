@@ -87,8 +87,8 @@ class Law(ABC):
     from_readings: ClassVar[str] = ""
     """Its preferred `identification` of a plant with few sensors; that of the optimiser if empty."""
     needs_model: ClassVar[bool] = False
-    """True if its theta has a model of the plant, so that only an optimiser that knows it can adapt it
-    (`Optimizer.also_improves`)."""
+    """True if its theta has a model of the plant, or is trained on one, so that only an optimiser that
+    knows it can adapt it (`Optimizer.also_improves`)."""
     extends: ClassVar[bool] = False
     """True if its theta may be longer than `size`, by what an optimiser identified. Zeros at the end
     mean nothing, so that thetas of several lengths can stand in one array."""

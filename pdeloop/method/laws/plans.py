@@ -190,7 +190,7 @@ class Planner:
         states, actions = self._rolled(z, v)
         with np.errstate(all="ignore"):
             J, _, _ = self.cost.along(states[:, :-1], actions, k)
-            J = J + self._at_end(states[:, -1], k + v.shape[1])[0]
+            J = J + self.at_end(states[:, -1], k + v.shape[1])[0]
         return np.where(np.isfinite(J), J, np.inf)
 
     def gradient(self, v: Array, z: Array, k: int) -> tuple[Array, Array, Array]:
@@ -207,7 +207,7 @@ class Planner:
             with np.errstate(all="ignore"):
                 states, requested, actions = sweep.roll(z[rows], v[rows], K, b)
                 costs, on_states, on_actions = self.cost.along(states[:, :-1], actions, k)
-                of_end, eta = self._at_end(states[:, -1], k + v.shape[1])
+                of_end, eta = self.at_end(states[:, -1], k + v.shape[1])
                 J[rows] = costs + of_end
                 kept[rows] = v[rows] + (actions - requested)
                 close = np.abs(requested - actions) <= _CLOSE * (1.0 + np.abs(actions))
@@ -386,7 +386,7 @@ class Planner:
         found: Array = linalg.inv(0.5 * (R + R.T))
         return found
 
-    def _at_end(self, z: Array, k: int) -> tuple[Array, Array]:
+    def at_end(self, z: Array, k: int) -> tuple[Array, Array]:
         """V (M,) of states (M, n_z) at step k, and dV/dz."""
         if k == self.cost.horizon:
             return self.cost.at_end(z)

@@ -147,6 +147,10 @@ class Predictive(Law):
         """Whether this theta has a model to plan on."""
         return bool(theta[self.without_plans.size :].any())
 
+    def acting(self, theta: Array) -> str:
+        """The name of the law that a theta is one of."""
+        return Predictive.name if self.plans(theta) else self.base.name
+
     def has_gains(self, theta: Array) -> bool:
         """Without a model it is the law that it began as, to the bit."""
         size = self.without_plans.size

@@ -26,6 +26,7 @@ from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Auto, AutoKalman, Predictive, PredictiveKalman
 from pdeloop.method.settings import settings_from
@@ -44,6 +45,7 @@ OWN_LAWS = OwnCode(
                 ExtendedKalman,
                 Predictive,
                 Auto,
+                Neural,
                 PredictiveKalman,
                 AutoKalman,
             )

@@ -1,0 +1,111 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`model_based` for the law `neural`: first the affine law, then a network beside it, and rollouts.
+
+The plans that the law `predictive` would use on the same model are what the network imitates first
+(`network`). The last rollouts are of the law with the network, from fresh fields, and replace the
+affine law only if it is better by more than chance (`verdict`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import Context, Row
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.improve import curvature_of
+from pdeloop.method.adapt.model_based_predictive import Candidate, ModelBasedPredictive, share_saved
+from pdeloop.method.adapt.network import HELD_OUT, Network, NetworkTraining, rolled_out
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.verdict import NEURAL
+from pdeloop.method.laws.neural import Neural
+from pdeloop.method.laws.predictive import Predictive
+
+_STREAM = 0x4E4554  # "NET"
+
+
+class ModelBasedNeural(ModelBasedPredictive):
+    """`ModelBased`, and then the law `neural` on its model; parameters as there."""
+
+    candidate = NEURAL
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: ModelBasedSettings | None = None,
+        context: Context | None = None,
+    ) -> None:
+        if context is None or not isinstance(context.law, Neural):
+            raise ValueError("this optimiser needs a context with the law neural")
+        self._neural = context.law
+        plans = Predictive(self._neural.model, self._neural.horizon)
+        plans.cost = self._neural.cost
+        super().__init__(
+            policy0,
+            seed=seed,
+            rollouts=rollouts,
+            settings=settings,
+            context=replace(context, law=plans),
+        )
+
+    def _made(self, belief: Belief, row: Row) -> Candidate | str:
+        """The law with the network of this model; or why there is none."""
+        policy, context, own = self._affine.policy, self._context, self._neural
+        n_s = context.U.shape[1]
+        fields, _ = self._simulated(belief, policy)
+        planner, _ = self._planner(belief, policy, fields)
+        K, b = self._feedback(policy)
+
+        def affine(z: Array) -> Array:
+            return np.asarray(z @ K.T + b)
+
+        costs, states = rolled_out(planner, affine, self._affine.fields)
+        known = np.isfinite(costs)
+        if not (known.any() and costs[known].any()):
+            return "the affine law does not stay finite on the model, or costs nothing"
+        network = Network.of(
+            context.U,
+            policy[:, :n_s],
+            b,
+            states[known].reshape(-1, states.shape[2]),
+            curvature_of(belief.loop(context)),
+            float(costs[known].mean()),
+            own.settings.neurons,
+        )
+        training = NetworkTraining(
+            network,
+            planner,
+            self._affine.fields,
+            [self._seed, _STREAM, self._count],
+            belief.components,
+            periodic=context.periodic,
+        )
+        numbers = training.trained(own.settings.iterations)
+        every = np.concatenate([self._affine.fields, training.drawn(HELD_OUT)])
+        before, after = (
+            rolled_out(planner, acts, every)[0] for acts in (affine, network.acts(numbers))
+        )
+        row["network_saves"] = share_saved(after, before)
+        if not np.sum(after) < np.sum(before):
+            return "on the model no network is better"
+        K_a, layers = network.folded(numbers)
+        return Candidate(own.theta_of(np.hstack([K_a, policy[:, n_s:]]), layers), after, before)
+
+    def _check(self, theta: Array) -> None:
+        self._neural.layers(self._neural.parts(theta)["network"])
+
+    def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
+        own = self._neural
+        planner = self._plain(belief, self._affine.policy, self._affine.fields)
+        parts = own.parts(theta)
+
+        def acts(z: Array) -> Array:
+            return np.stack([own.action(parts, row, np.zeros(0), 0) for row in z])
+
+        return rolled_out(planner, acts, fields)[0]

@@ -1,0 +1,255 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The law with a network: what its theta holds, its derivatives, its training, and its exports."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdeloop
+from controller_node.law_batch import LawBatch
+from pdeloop.evaluation import evaluate
+from pdeloop.export import law_of
+from pdeloop.law_form import law_form
+from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt.base import Context, RolloutResult, Trajectory
+from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
+from pdeloop.method.adapt.network import Network, NetworkTraining, rolled_out
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.laws import Affine, Neural
+from pdeloop.method.laws.neural import Layers, NeuralSettings
+from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.registry import action
+from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.model_files import matlab, onnx
+from tests.method.test_plans import N_A, N_Z, T, spectral
+from tests.method.test_predictive import (
+    GAINS,
+    ROWS,
+    STATES,
+    U,
+    actions_of,
+    explored_trajectory,
+    spectral_step,
+    start,
+)
+from tests.tools.test_law_gradients import SEEDS, Cubic
+from tests.tools.test_law_gradients import law_of as law_of_cubic
+from tuner_node.narration import closing_lines
+
+H = 4
+RNG = np.random.default_rng(3)
+
+
+def with_network(law: Neural, scale: float = 0.3) -> np.ndarray:
+    rng, n_a, n_s = np.random.default_rng(5), law.n_a, len(law.model.s_r)
+    shapes = (H, n_s), (H,), (n_a, H), (n_a,)
+    layers = Layers(*(scale * rng.standard_normal(shape) for shape in shapes))
+    return law.theta_of(law.theta_start, layers)
+
+
+def test_without_a_network_it_is_the_affine_law() -> None:
+    own, affine = Neural(ROWS, T), Affine(ROWS, T)
+    assert own.has_gains(own.theta_start) and own.acting(own.theta_start) == "affine"
+    acted = actions_of(own, own.theta_start)
+    assert np.array_equal(acted, actions_of(affine, affine.theta_start.reshape(affine.shape)))
+
+
+def test_zeros_at_the_end_of_theta_mean_nothing() -> None:
+    own = Neural(ROWS, T)
+    whole = with_network(own)
+    acted = actions_of(own, whole)
+    assert own.acting(whole) == "neural" and not own.has_gains(whole)
+    assert np.array_equal(actions_of(own, np.append(whole, np.zeros(9))), acted)
+    m = own.matrices(whole)
+    s = STATES @ U
+    expected = s @ m["K"].T + m["c"] + np.tanh(s @ m["W"].T + m["w"]) @ m["D"].T
+    np.testing.assert_allclose(acted, expected, rtol=1e-12)
+    assert not np.allclose(acted, actions_of(own, own.theta_start))
+
+
+def test_numbers_that_are_no_network_are_refused() -> None:
+    own = Neural(ROWS, T)
+    whole = with_network(own)
+    for size, wrong in ((own.size + 9, whole[own.size]), (len(whole), 0.5), (len(whole), 1e9)):
+        broken = whole[:size].copy()
+        broken[own.size] = wrong
+        with pytest.raises(ValueError, match="its network has"):
+            own.layers(own.parts(broken)["network"])
+
+
+def test_its_derivatives_agree_with_finite_differences() -> None:
+    law = law_of_cubic(Neural)
+    assert isinstance(law, Neural)
+    theta, gradients = with_network(law), pdeloop.Gradients(Cubic())
+    fields, count = gradients.plant.reset(SEEDS).copy(), law.size
+    found = gradients.of_theta(law, theta, fields)
+    assert found.gradient[count] == 0.0
+    for _ in range(3):
+        d, e = RNG.standard_normal(len(theta)), RNG.standard_normal(fields.shape)
+        d[count] = 0.0  # the number of neurons
+        up, down = (gradients.of_theta(law, theta + h * d, fields).cost for h in (1e-5, -1e-5))
+        assert (up - down) / 2e-5 == pytest.approx(found.gradient @ d, rel=1e-6)
+        up, down = (gradients.of_theta(law, theta, fields + h * e).cost for h in (1e-5, -1e-5))
+        assert (up - down) / 2e-5 == pytest.approx((found.of_fields * e).sum(), rel=1e-6)
+
+
+def training(allowed: ActionSet) -> tuple[NetworkTraining, Network, Planner, np.ndarray]:
+    K, b = np.ascontiguousarray(ROWS.K_a @ U.T), ROWS.K_b @ ROWS.s_r
+    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=np.full(N_Z, 0.3))
+    planner = Planner(spectral(), cost, allowed, K, b, around=True, steps=6, terminal=True)
+    fields = np.stack([start(seed) for seed in range(6)])
+    states = rolled_out(planner, lambda z: z @ K.T + b, fields)[1].reshape(-1, N_Z)
+    curvature = np.array([[2.0, 0.3], [0.3, 1.0]])
+    network = Network.of(U, ROWS.K_a, b, states, curvature, 3.0, H)
+    made = NetworkTraining(network, planner, fields, [1, 2], 1, periodic=True)
+    return made, network, planner, fields
+
+
+@pytest.mark.parametrize(
+    "allowed",
+    [ANY_ACTION, ActionSet(N_A, -0.05, 0.04), ActionSet(N_A, -0.5, 0.5, rate=[0.02, np.inf])],
+    ids=["free", "bounded", "rated"],
+)
+@pytest.mark.parametrize("k", [0, 3])
+def test_the_gradient_through_the_model_agrees_with_finite_differences(
+    allowed: ActionSet, k: int
+) -> None:
+    made, network, _, fields = training(allowed)
+    made._part = T - k
+    first = network.first(RNG)
+    numbers = first + 0.02 * RNG.standard_normal(len(first))
+    _, found = made.gradient(numbers, fields, k)
+    for _ in range(3):
+        d = RNG.standard_normal(len(numbers))
+        up, down = (made.gradient(numbers + h * d, fields, k)[0] for h in (1e-6, -1e-6))
+        assert (up - down) / 2e-6 == pytest.approx(found @ d, rel=1e-5, abs=1e-7)
+
+
+def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_theta() -> None:
+    made, network, planner, _ = training(ANY_ACTION)
+    first = network.first(RNG)
+    numbers, others = made.trained(50), np.stack([start(seed) for seed in range(20, 40)])
+    before, after = (
+        rolled_out(planner, network.acts(own), others)[0].mean() for own in (first, numbers)
+    )
+    assert after < 0.97 * before
+    K, layers = network.folded(numbers)
+    own = Neural(ROWS, T)
+    theta = own.theta_of(np.hstack([K, ROWS.K_b]), layers)
+    np.testing.assert_allclose(actions_of(own, theta), network.acts(numbers)(STATES), atol=1e-10)
+
+
+def optimizer() -> ModelBasedNeural:
+    """Of a plant that is the spectral model, judged by rollouts of it."""
+    explored = [explored_trajectory(seed) for seed in range(2)]
+    settings = NeuralSettings(neurons=H, iterations=20)
+    context = Context(
+        U=U,
+        target=np.full(N_Z, 0.3),
+        state_weight=1.0,
+        action_weight=0.5,
+        horizon=T,
+        exploration=explored[0],
+        further=explored[1:],
+        field_models=FieldModelSettings(folds=2, largest_degree=2),
+        law=type("Short", (Neural,), {"settings": settings, "name": "neural"})(ROWS, T),
+    )
+    made = ModelBased.for_context(context)(
+        GAINS.ravel(),
+        seed=3,
+        rollouts=10,
+        settings=ModelBasedSettings(judging=2, iterations=10),
+        context=context,
+    )
+    assert isinstance(made, ModelBasedNeural)
+    return made
+
+
+def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
+    own, law, rows = optimizer(), Neural(ROWS, T), []
+    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
+    while not own.done:
+        results = []
+        for rollout in own.ask():
+            z, parts, total = (
+                start(rollout.field_seed),
+                law.parts(rollout.policy.ravel()),
+                np.zeros(1),
+            )
+            states, actions = [z], []
+            for k in range(T):
+                actions.append(action(law, parts, z, np.zeros(0), k))
+                cost.add(total, z[None], actions[-1][None], k)
+                z = spectral_step(z, actions[-1])
+                states.append(z)
+            known = Trajectory(np.array(states), np.array(actions))
+            results.append(RolloutResult(total[0] / T, False, known))
+        rows.append(own.tell(results))
+        other = optimizer()
+        other.restore(own.state())
+        assert np.array_equal(other.policy, own.policy) and other.done == own.done
+        assert all(
+            np.array_equal(a.policy, b.policy) for a, b in zip(own.ask(), other.ask(), strict=True)
+        )
+        own = other
+    assert rows[-1]["role"] == "judging" and rows[-1]["chosen"] in ("neural", "adapted")
+    assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
+
+
+TRAINED = {
+    "n_z": 32,
+    "horizon": 40,
+    "reduced_order": 8,
+    "rollouts": 15,
+    "evaluation_fields": 4,
+    "law_settings": {"neurons": 16, "iterations": 150},
+}
+
+
+def test_it_is_trained_evaluated_and_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, out = "kuramoto-sivashinsky-22", tmp_path / "run"
+    run = pdeloop.train(problem, **TRAINED, law="neural", out=out)
+    *_, before, last = run.result["history"]
+    assert last["chosen"] == "neural" and before["network_saves"] > 0.0
+    assert run.costs["adapted"].mean() < run.costs["lqt"].mean()
+    costs = evaluate(pdeloop.load_run(out), fields=4, seed=run.values["evaluation_seed"])
+    assert np.array_equal(costs["adapted"], run.costs["adapted"])
+    closing = "\n".join(closing_lines(problem, run.result, out))
+    assert "the law that acts is neural (the law with a network costs" in closing
+    states = RNG.standard_normal((5, 32))
+    expected = actions_in_loop(run.laws[0], run.policies[0], ANY_ACTION, states)
+    form = law_form(run)
+    with pytest.raises(ParameterError, match="write it as C, an FMU or an ONNX model"):
+        matlab(form)
+    if importlib.util.find_spec("onnx") and importlib.util.find_spec("onnxruntime"):
+        monkeypatch.setenv("TMPDIR", str(tmp_path))  # where its import leaves a file
+        import onnxruntime
+
+        session = onnxruntime.InferenceSession(onnx(form), providers=["CPUExecutionProvider"])
+        found = [session.run(None, {"y": z})[0] for z in states]
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    assert b"tanh" in law_of(run).c()
+
+
+def actions_in_loop(
+    law: Neural, theta: np.ndarray, allowed: ActionSet, states: np.ndarray
+) -> np.ndarray:
+    batch = LawBatch([law], np.ones(states.shape[1]), allowed)
+    batch.set(theta[None])
+    return np.stack([batch.actions(k, z[None])[0] for k, z in enumerate(states)])
+
+
+def test_what_it_does_not_support_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ParameterError, match="acts on the whole state, but 8 sensors"):
+        pdeloop.train("burgers", law="neural", sensors=8)
+    with pytest.raises(ParameterError, match="choose model_based, or another law"):
+        pdeloop.train("burgers", law="neural", optimizer="two_point")
