@@ -182,8 +182,8 @@ def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     adapted = (
-        "affine, observer, extended_kalman, feedforward, predictive, auto, predictive_kalman and "
-        "auto_kalman"
+        "affine, observer, extended_kalman, feedforward, predictive, auto, neural, predictive_kalman "
+        "and auto_kalman"
     )
     words = ["train", str(SMALL), "--law", OWN, "--optimizer", "model_based"]
     assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
