@@ -161,7 +161,11 @@ def identify(
         )
     if p and method != "dmdc":
         raise ValueError(f"p is the rank of 'dmdc', but method is {method!r}; leave it out")
-    n_s = n_s or study_orders(trajectories, channels=channels, settings=settings).suggested
+    n_s = n_s or (
+        study_orders(
+            trajectories, channels=channels, settings=settings, constant=constant
+        ).suggested
+    )
     if method == "regression":
         return regression.exact_regression(
             trajectories, n_s=n_s, channels=channels, constant=constant

@@ -261,9 +261,13 @@ def named(
 
 
 def identify(
-    *trajectories: tuple[ArrayLike, ArrayLike], n_s: int, method: str = "regression", p: int = 0
+    *trajectories: tuple[ArrayLike, ArrayLike],
+    n_s: int,
+    method: str = "regression",
+    p: int = 0,
+    constant: bool | None = None,
 ) -> ReducedModel:
-    """A reduced linear model s_{k+1} = A s_k + B a_k, s = U^T z, from trajectories of one plant.
+    """A reduced linear model s_{k+1} = A s_k + B a_k + d, s = U^T z, from trajectories of one plant.
 
     Parameters
     ----------
@@ -276,11 +280,14 @@ def identify(
         Proctor, Brunton and Kutz (2016).
     p
         Rank of dmdc; 0: n_s + n_a.
+    constant
+        Whether "regression" has the constant term d, as for logs about an operating point in degrees or
+        per cent; None: where it predicts each held-out part better, as in a training.
 
     Returns
     -------
     ReducedModel
-        A (n_s, n_s), B (n_s, n_a), U (n_z, n_s).
+        A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), d (n_s,).
 
     Raises
     ------
@@ -305,7 +312,9 @@ def identify(
         raise ValueError("identify needs one trajectory or more, each a tuple (states, actions)")
     _check_count("n_s", n_s, 0)
     _check_count("p", p, 0)
-    model = identification.identify(trajectories, method=method, n_s=n_s, p=p)
+    if constant and method == "dmdc":
+        raise ValueError("constant is of the method 'regression'; leave it out for 'dmdc'")
+    model = identification.identify(trajectories, method=method, n_s=n_s, p=p, constant=constant)
     for remark in identification.examined(trajectories, model, method=method, p=p).remarks:
         warnings.warn(remark, IdentifiabilityWarning, stacklevel=2)
     return model
