@@ -9,6 +9,7 @@ affine law only if it is better by more than chance (`verdict`).
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,6 @@ from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.improve import curvature_of
 from pdeloop.method.adapt.model_based_predictive import Candidate, ModelBasedPredictive, share_saved
 from pdeloop.method.adapt.network import HELD_OUT, Network, NetworkTraining, rolled_out
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import NEURAL
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive
@@ -33,26 +33,14 @@ class ModelBasedNeural(ModelBasedPredictive):
     candidate = NEURAL
 
     def __init__(
-        self,
-        policy0: ArrayLike,
-        *,
-        seed: int,
-        rollouts: int,
-        settings: ModelBasedSettings | None = None,
-        context: Context | None = None,
+        self, policy0: ArrayLike, *, context: Context | None = None, **others: Any
     ) -> None:
         if context is None or not isinstance(context.law, Neural):
             raise ValueError("this optimiser needs a context with the law neural")
         self._neural = context.law
         plans = Predictive(self._neural.model, self._neural.horizon)
         plans.cost = self._neural.cost
-        super().__init__(
-            policy0,
-            seed=seed,
-            rollouts=rollouts,
-            settings=settings,
-            context=replace(context, law=plans),
-        )
+        super().__init__(policy0, context=replace(context, law=plans), **others)
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law with the network of this model; or why there is none."""
