@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import StoredModel
 from pdeloop.method.reduce.reduced_model import Trajectory
-from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, likeliest_start, subspace_model
 
 KIND = "innovations"
 FOREMOST = 60
@@ -78,16 +77,9 @@ class ReadingsModel(StoredModel):
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""
         v = readings[: len(actions)] @ self.U
-        follow = self.A - self.G @ self.C
-        L = linalg.cholesky(self.innovations, lower=True)
-        x, moved = np.zeros(len(self.A)), np.eye(len(self.A))
-        rows, wanted = [np.eye(len(x))], [np.zeros(len(x))]  # x_0 ~ N(0, I), as states are scaled
-        for k in range(min(len(v), FOREMOST)):
-            rows.append(linalg.solve_triangular(L, self.C @ moved, lower=True))
-            wanted.append(linalg.solve_triangular(L, v[k] - self.C @ x, lower=True))
-            x = follow @ x + self.B @ actions[k] + self.G @ v[k]
-            moved = follow @ moved
-        first: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
+        first = likeliest_start(
+            self.A, self.B, self.C, self.G, self.innovations, v[:FOREMOST], actions
+        )
         x, e = first, np.empty_like(v)
         for k in range(len(v)):
             e[k] = v[k] - self.C @ x

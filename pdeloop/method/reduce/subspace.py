@@ -221,6 +221,22 @@ def _choose(
     return (*tried[best], errors.tolist())
 
 
+def likeliest_start(
+    A: Array, B: Array, C: Array, G: Array, innovations: Array, v: Array, actions: Array
+) -> Array:
+    """The likeliest x_0 ~ N(0, I), as states are scaled, of measurements v_k = U^T z_k (m, r)."""
+    L = linalg.cholesky(innovations, lower=True)
+    x, moved = np.zeros(len(A)), np.eye(len(A))
+    rows, wanted = [np.eye(len(A))], [np.zeros(len(A))]
+    for measured, a in zip(v, actions, strict=False):
+        rows.append(linalg.solve_triangular(L, C @ moved, lower=True))
+        wanted.append(linalg.solve_triangular(L, measured - C @ x, lower=True))
+        x = A @ x + B @ a + G @ (measured - C @ x)
+        moved = A @ moved - G @ (C @ moved)
+    found: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
+    return found
+
+
 def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
     """At least as many as there are folds, of one trajectory its quarters."""
     if len(known) >= FOLDS:
@@ -235,12 +251,15 @@ def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
 def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     """Sums of squares of the filter's one-step errors, and of the changes in a step.
 
-    The first steps, eight at most, are the filter's to find the state.
+    The first steps, eight at most, tell the state that it begins with: a filter of data without noise
+    may take far longer to forget a wrong one.
     """
     begin = min(max(PASTS), len(a) // 2)
     y = z @ model.U
     outside = z - y @ model.U.T
-    x = linalg.pinv(model.C) @ y[0]
+    x = likeliest_start(
+        model.A, model.B, model.C, model.G, model.innovations, y[: max(begin, 1)], a
+    )
     wrong = moved = 0.0
     for k in range(len(a)):
         x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x)
