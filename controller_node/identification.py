@@ -16,6 +16,7 @@ from controller_node.policy import ProjectedLaw
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.grid import axes_of
+from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import model_order
 from pdeloop.messages.signature import CONSTANTS
@@ -102,7 +103,7 @@ class DesignSettings:
         own = {"constants", "action_set", "input_delay"}
         names = {item.name for item in fields(DesignSettings)} - own
         return DesignSettings(
-            **{name: values[name] for name in names},
+            **{name: values[name] for name in names} | {"cost": measured_cost(values)},
             action_set=ActionSet.of(values),
             constants={name: value for name, value in values.items() if name.startswith(CONSTANTS)},
         )

@@ -20,6 +20,7 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.episode import Law as ActingLaw
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array, float_array
+from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import noisy
 from pdeloop.messages.spec import ParameterError
@@ -96,7 +97,7 @@ class FinishedRun:
             law_kind(self.values["law"], self.values),
             self.models,
             self.values["horizon"],
-            self.values.get("cost", ()),
+            measured_cost(self.values),
         )
 
     @property

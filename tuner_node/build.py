@@ -14,6 +14,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.actuators import indicators, placed_indicators
 from pdeloop.messages.array_files import read_arrays
 from pdeloop.messages.grid import Grid, axes_of
+from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import completed, unpack
 from pdeloop.messages.parameters import measured_size, model_order, noisy
 from pdeloop.messages.signature import design_digest
@@ -288,6 +289,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     centres, widths = declared_actuators(values)
     given |= {
         "law": law,
+        "cost": measured_cost(values),
         "action_set": action_set,
         "exploration_variance": max(
             values["exploration_variance"] or action_set.exploration_variance, variance

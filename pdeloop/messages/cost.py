@@ -130,6 +130,20 @@ class Cost:
             terminal_weight=self.terminal_weight,
         )
 
+    def through(self, matrix: Array) -> Cost:
+        """The same of x (n,) with z = matrix x."""
+        return Cost(
+            matrix.shape[1],
+            self.n_a,
+            self.horizon,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            target=self.target,
+            output=matrix if self.output is None else self.output @ matrix,
+            action_target=self.action_target,
+            terminal_weight=self.terminal_weight,
+        )
+
     def wanted(self, k: int) -> Array:
         """y_r,k (n_y,), for k = 0 .. T."""
         return self.target if self.target.ndim == 1 else self.target[min(k, len(self.target) - 1)]

@@ -422,6 +422,42 @@ class Grid:
         found: NDArray[np.int64] = (first[:, None] + self.equally_spaced(count)).ravel()
         return found
 
+    def between(self, count: int) -> Array:
+        """The state that readings of so many sensors suggest, as a matrix (n_z, components * count).
+
+        On one axis each component is linear from sensor to sensor; on several ones it is that of the
+        nearest sensor.
+
+        Parameters
+        ----------
+        count
+            Number of sensors.
+
+        Returns
+        -------
+        (n_z, components * count) array
+
+        Raises
+        ------
+        ValueError
+            As for `equally_spaced`.
+
+        Examples
+        --------
+        >>> Grid(numbers=3).between(1).ravel().tolist()
+        [1.0, 1.0, 1.0]
+        """
+        places, every = self.equally_spaced(count), np.arange(self.points)
+        if len(self.axes) < 2:
+            period = float(self.points) if self.is_circle else None
+            rows = np.array([np.interp(every, places, own, period=period) for own in np.eye(count)])
+        else:
+            where = np.stack(np.unravel_index(every, self.shape), axis=1) / np.array(self.shape)
+            off = np.sum((where[:, None] - where[places]) ** 2, axis=2)
+            rows = np.eye(count)[:, np.argmin(off, axis=1)]
+        found: Array = np.kron(np.eye(len(self.components)), rows.T)
+        return found
+
     def _counts(self, count: int) -> tuple[int, ...]:
         """Numbers of sensors along the axes."""
         if count > self.points:

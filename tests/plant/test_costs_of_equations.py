@@ -192,5 +192,3 @@ def test_a_cost_of_other_sizes_is_refused_in_a_sentence() -> None:
         pdeloop.problem("burgers", cost={"weights": 1.0})
     with pytest.raises(ParameterError, match="parameter 'cost': 'nonsense' is not a cost"):
         pdeloop.problem("burgers", cost=["nonsense"])
-    with pytest.raises(ValueError, match="sensors need scalar weights and a constant"):
-        pdeloop.problem("burgers", sensors=16, cost={"terminal_weight": 1.0})

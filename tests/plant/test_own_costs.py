@@ -235,8 +235,8 @@ def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str)
         DynamicsPlant(servo)
 
 
-def test_sensors_and_such_a_cost_do_not_go_together() -> None:
-    with pytest.raises(ValueError, match="sensors need scalar weights"):
+def test_sensors_and_a_moving_target_do_not_go_together() -> None:
+    with pytest.raises(ValueError, match=r"sensors need a constant target, but that of .*moves"):
         pdeloop.problem(plant=Servo(), sensors=3).plant()
 
 

@@ -8,6 +8,8 @@ import pytest
 from scipy.linalg import expm
 
 import pdeloop
+from pdeloop.messages.cost import Cost
+from pdeloop.messages.measured_cost import measured_cost
 
 pytestmark = pytest.mark.filterwarnings("ignore::pdeloop.TrainingWarning")
 
@@ -74,3 +76,38 @@ def test_a_model_that_is_exact_on_held_out_readings_is_the_one_that_is_chosen(se
     poles = np.abs(np.linalg.eigvals(run.models[0].A))
     np.testing.assert_allclose(poles, np.abs(np.linalg.eigvals(Chain().A)), rtol=1e-3)
     assert run.costs["lqt"].mean() < 0.7 * run.costs["none"].mean()
+
+
+class Weighed(Rod):
+    """The rod about a target of two outputs, with matrices as weights, bounds and a terminal weight."""
+
+    output = np.kron(np.eye(2), np.full((1, 6), 1.0 / 6.0))
+    target = np.array([0.5, 0.8])
+    state_weight = np.array([[6.0, 1.0], [1.0, 4.0]])
+    action_weight = np.diag([0.02, 0.05])
+    terminal_weight = 2.0
+    action_low, action_high = 0.0, 1.0
+
+
+@pytest.mark.parametrize("law", ["extended_kalman", "affine"])
+def test_weights_of_outputs_are_those_of_the_state_between_the_sensors(law: str) -> None:
+    run = pdeloop.train(plant=Weighed(), sensors=4, rollouts=9, law=law)
+    whole = pdeloop.train(plant=Weighed(), rollouts=9)
+    costs = {name: own.mean() for name, own in run.costs.items()}
+    assert costs["adapted"] < 0.5 * costs["none"]
+    assert costs["adapted"] < 1.3 * whole.costs["adapted"].mean()
+
+
+def test_the_cost_of_readings_is_that_of_states_that_are_linear_between_sensors() -> None:
+    values = pdeloop.problem(plant=Weighed(), sensors=4, sensor_delays=2).values
+    plant, known = Weighed(), Cost.parse(measured_cost(values))
+    assert known is not None
+    cost = pdeloop.problem(plant=plant).plant().cost
+    places = np.array([1, 4, 7, 10])  # int((j + 1/2) 12 / 4)
+    y = np.random.default_rng(0).standard_normal((5, 4))
+    z = np.array([np.interp(np.arange(12), places, own) for own in y])
+    o = np.sqrt(12 / 8) * np.hstack([y, np.zeros_like(y)])
+    a, (own, of_states) = np.full((5, 2), 0.3), np.zeros((2, 5))
+    known.add(own, o, a, 0)
+    cost.add(of_states, z, a, 0)
+    np.testing.assert_allclose(own, of_states, rtol=1e-12)

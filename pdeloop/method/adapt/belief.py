@@ -103,7 +103,9 @@ class Belief:
             assert isinstance(context.law, Observer)
             seen = self.model.U.T
             of_readings = (seen @ context.U, seen @ context.target, *problem[2:])
-            return ReplayedLoop(*of_readings, model=self.model, law=context.law)
+            known = self.model.U @ self.model.C
+            cost = None if context.cost is None else context.cost.through(known)
+            return ReplayedLoop(*of_readings, model=self.model, law=context.law, cost=cost)
         if isinstance(self.model, SensedModel):
             return sensed_loop(context, self.model)
         if isinstance(context.law, Observer):

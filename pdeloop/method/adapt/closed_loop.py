@@ -532,8 +532,9 @@ class ReplayedLoop(ObservedLoop):
 
     def curvature(self, own: Array) -> Array:
         """With R + B^T P B of the cost of the readings."""
-        model = self._readings
-        cost = Cost(
+        model, cost = self._readings, self.cost
+        seen = model.C if cost is None else np.eye(len(model.A))
+        cost = cost or Cost(
             len(model.C),
             model.n_a,
             1,
@@ -541,8 +542,8 @@ class ReplayedLoop(ObservedLoop):
             action_weight=self.action_weight,
         )
         try:
-            P = track_outputs(model.A, model.B, model.C, cost).P
-            own = self.action_weight * np.eye(model.n_a) + model.B.T @ P @ model.B
+            P = track_outputs(model.A, model.B, seen, cost).P
+            own = cost.action_matrix + model.B.T @ P @ model.B
         except DesignError:
             pass
         return super().curvature(own)

@@ -120,9 +120,17 @@ def of_rollouts(
 
 
 def can_be_sensed(context: Context) -> bool:
-    """True if the states are one reading of each of a few sensors of one component on a ring."""
+    """True if the states are one reading of each of a few sensors of one component on a ring.
+
+    And if the cost is that of q and r.
+    """
     sensors, most = context.sensors, SENSED_MOST
-    return context.periodic and sensors == len(context.target) and 0 < sensors <= most
+    return (
+        context.cost is None
+        and context.periodic
+        and sensors == len(context.target)
+        and 0 < sensors <= most
+    )
 
 
 def to_be_fitted(
