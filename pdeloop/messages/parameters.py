@@ -49,10 +49,10 @@ INSTRUMENTS = _section(
         "step if there are any; filled in by a plant of your own; -1e300 and 1e300: no bound; empty: "
         "none"
     ),
-    Spec("sensors", 0, 0, 65536, group="problem").means(
+    Spec("sensors", 0, 0, 65536, nodes="PCT", group="problem").means(
         "number n_y of equally spaced point sensors; 0: the whole state is measured"
     ),
-    Spec("sensor_delays", 1, 1, 1024, group="problem").means(
+    Spec("sensor_delays", 1, 1, 1024, nodes="PCT", group="problem").means(
         "number d of successive measurements of each sensor in the published state"
     ),
 )
