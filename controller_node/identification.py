@@ -76,6 +76,8 @@ class DesignSettings:
     grid : str
         Axes and components of the state (`pdeloop.messages.grid.Grid.parse`), for "field"; empty: one
         axis.
+    sensors, sensor_delays : int
+        n_y, 0 where the whole state is measured, and d.
     constants : dict
         Parameters of `pdeloop.messages.signature.CONSTANTS` as given; others have their
         defaults.
@@ -95,6 +97,8 @@ class DesignSettings:
     horizon: int = 1
     input_delay: Sequence[int] = ()
     grid: str = ""
+    sensors: int = 0
+    sensor_delays: int = 1
     constants: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -103,10 +107,15 @@ class DesignSettings:
         own = {"constants", "action_set", "input_delay"}
         names = {item.name for item in fields(DesignSettings)} - own
         return DesignSettings(
-            **{name: values[name] for name in names} | {"cost": measured_cost(values)},
+            **{name: values[name] for name in names},
             action_set=ActionSet.of(values),
             constants={name: value for name, value in values.items() if name.startswith(CONSTANTS)},
         )
+
+    @property
+    def measured_cost(self) -> list[str]:
+        """The cost of what is measured (`pdeloop.messages.measured_cost`)."""
+        return measured_cost(vars(self))
 
     @property
     def method(self) -> IdentificationSettings:
@@ -256,7 +265,7 @@ def designed(
     weights: dict[str, Any] = {
         "state_weight": settings.state_weight,
         "action_weight": settings.action_weight,
-        "cost": Cost.parse(settings.cost),
+        "cost": Cost.parse(settings.measured_cost),
     }
     filtered = law_kind(settings.law, settings.constants).filtered
     if delays := tuple(settings.input_delay):

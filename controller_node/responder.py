@@ -182,7 +182,9 @@ class Responder:
                 model_rows.unpack(rows.copy(), n_a, self._law_kind.filtered)
                 for rows in frame.values
             ]
-            laws = laws_of(self._law_kind, rows, self._settings.horizon, self._settings.cost)
+            laws = laws_of(
+                self._law_kind, rows, self._settings.horizon, self._settings.measured_cost
+            )
             run.models.append(Models(frame.step, digest, laws))
             run.answering = None
             if before:

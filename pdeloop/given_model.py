@@ -87,7 +87,7 @@ def with_gains(model: object, plant: Plant, values: Mapping[str, Any]) -> bytes:
         known,
         state_weight=settings.state_weight,
         action_weight=settings.action_weight,
-        cost=Cost.parse(settings.cost),
+        cost=Cost.parse(settings.measured_cost),
     )
     s_r = ProjectedLaw([known.U], plant.target).reduced_targets[0]
     rows = ModelRows(known.A, known.B, known.U, gains.K_a, gains.K_b, s_r)

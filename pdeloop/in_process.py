@@ -53,7 +53,7 @@ class LocalPair:
         unpacked = [
             model_rows.unpack(rows, self._settings.n_a, self._kind.filtered) for rows in models
         ]
-        laws = laws_of(self._kind, unpacked, self._settings.horizon, self._settings.cost)
+        laws = laws_of(self._kind, unpacked, self._settings.horizon, self._settings.measured_cost)
         self._law = LawBatch(laws, self.plant.target, self._settings.action_set)
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:

@@ -263,7 +263,7 @@ def _sensors(plant: Plant, sensors: int) -> Finding:
 def _first_law(plant: Plant, rows: ModelRows, settings: DesignSettings) -> Law:
     """The law that a training with this design begins with, for the drawn fields."""
     kind = law_kind(settings.law, settings.constants)
-    [law] = laws_of(kind, [rows], settings.horizon, settings.cost)
+    [law] = laws_of(kind, [rows], settings.horizon, settings.measured_cost)
     batch = LawBatch([law], plant.target, settings.action_set)
     batch.set(np.repeat(law.theta_start.reshape(1, *law.shape), DRAWN, axis=0))
     return batch.actions
