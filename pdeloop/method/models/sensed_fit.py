@@ -295,7 +295,7 @@ def fit_sensed(
     )
     if start is not None:
         own = np.flatnonzero(start[0][:EQUATION]).tolist()
-        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted(parts=data.two_lengths)
+        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted()
         if fit.error(data.steps) <= SENSED_REPRODUCED:
             return fit.found
     first, best = _of_first_terms(data)
@@ -343,7 +343,7 @@ def initial_field(
     exact = replace(settings, sensed_unresolved=0.0)  # the model's noise has that in it
     data = _Data(y, a, model.actuators, model.noise, target, d, exact)
     fit = _Fit(data, (), False, model.shared, model.spread, known=True)
-    for m in data.two_lengths:
+    for m in (data.lengths[:_EARLY][-1], data.steps):
         fit.descend(m)
     field: Array = field_of(fit.fields, data.n)[0]
     return field, fit.error(data.steps)
@@ -398,11 +398,6 @@ class _Data:
         return [*found, self.steps]
 
     @property
-    def two_lengths(self) -> tuple[int, int]:
-        """The same where the equation is known."""
-        return self.lengths[:_EARLY][-1], self.steps
-
-    @property
     def unexplained(self) -> float:
         """The least error that is due neither to the grid nor to chance in the noise."""
         share = (self.noise / self.size) ** 2
@@ -449,10 +444,10 @@ class _Fit:
             elif own >= SHARED:
                 self.deviations[i] = _UNEQUAL
 
-    def fitted(self, other: _Fit | None = None, parts: Sequence[int] = ()) -> _Fit:
+    def fitted(self, other: _Fit | None = None) -> _Fit:
         """This one, over longer and longer parts, as long as it is better there than another one."""
         data = self.data
-        for m in parts or data.lengths:
+        for m in data.lengths:
             self.descend(m)
             self.errors[m], most = self.error(m), _HOPELESS
             if other is not None and m >= max(_TOLD * data.steps, _ENOUGH):
