@@ -30,7 +30,10 @@ NOT_SIGNED = 0.0
 DESIGN = (
     "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
 )  # fmt: skip
-"""Parameters that a model depends on in addition to its episode, and the cost where it is not empty."""
+"""Parameters that a model depends on in addition to its episode, and the cost where it is not empty.
+
+With sensors their number and delays follow it.
+"""
 
 
 CONSTANTS = (IDENTIFICATION_SETTINGS, LAW_SETTINGS, FIELD_MODEL_SETTINGS)
@@ -58,7 +61,9 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     and those of field models with "field".
     """
     values = [parameters[name] for name in DESIGN]
-    values += ["".join(parameters["cost"])] if parameters.get("cost") else []
+    if parameters.get("cost"):
+        seen = [parameters.get("sensors", 0), parameters.get("sensor_delays", 1)]
+        values += ["".join(parameters["cost"]), *(seen if seen[0] else [])]
     law = parameters.get("law", "affine").rpartition(":")[2]
     values += [law, parameters["horizon"]] if law != "affine" else []
     noise = parameters.get("measurement_noise")

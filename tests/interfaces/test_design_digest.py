@@ -33,9 +33,21 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
         "constants",
         "law",
         "horizon",
+        "sensors",
+        "sensor_delays",
     }
     assert {*DESIGN, *own} == {*known}
     assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
+
+
+def test_sensors_count_where_a_cost_is_seen_through_them():
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    for cost, count in ((["one"], 3), ([], 1)):
+        own = [
+            known | {"cost": cost, "sensors": n, "sensor_delays": d}
+            for n, d in ((0, 1), (3, 1), (3, 2))
+        ]
+        assert len({design_digest(values) for values in own}) == count
 
 
 def test_a_digest_is_the_first_53_bits_of_blake2b_as_a_stand_in_computes_it():
