@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pdeloop
@@ -45,3 +46,17 @@ def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_fro
     assert same_bits(policies(out), here.policies)
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
     assert "no difference, to the bit" in verified
+
+
+def test_a_law_of_readings_for_any_quadratic_cost_has_the_bits_of_one_process(
+    loop: Processes, tmp_path: Path
+) -> None:
+    """The controller sees the cost through the sensors, as the tuner does."""
+    out, weights = tmp_path / "run", np.linspace(0.5, 1.5, 64)
+    own = {"terminal_weight": 1.0, "state_weight": weights, "action_weight": [1.0, 2.0, 3.0]}
+    values = {**PARAMETERS, **SETTINGS, "n_z": 64, "cost": own}
+    here = pdeloop.train("allen-cahn", **values, out=tmp_path / "here")
+    file = str(tmp_path / "here" / "parameters.yaml")
+    loop.wait(loop.pdeloop("train", file, "--record", "--out", str(out)), LIMIT)
+    assert same_bits(policies(out), here.policies)
+    assert "no difference, to the bit" in loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
