@@ -62,8 +62,10 @@ def identified(
     return identify_data(read_measurements(path, cut=cut), given)
 
 
-@pytest.mark.parametrize("method", ["regression", "subspace"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("method", "seed"),
+    [("regression", 0), ("regression", 1), ("regression", 2), ("subspace", 0)],
+)
 def test_a_regulated_plant_has_its_poles_in_kelvin_degrees_and_deviations(
     tmp_path: Path, method: str, seed: int
 ) -> None:

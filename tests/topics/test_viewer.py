@@ -73,7 +73,7 @@ def watched(loop: Processes, count: int, *without: str) -> list:
 
 
 def test_the_views_are_those_of_the_loop_and_the_policy_is_the_same(loop: Processes, tmp_path):
-    start_pair(loop, real_time_factor=2.0)  # until all views were seen
+    start_pair(loop, real_time_factor=4.0)  # until all views were seen
     viewer = loop.node("viewer_node", *PARAMETERS)
     watch = watched(loop, 12, "reduction")  # which needs costs of the same fields: the evaluation
     out = tmp_path / "run"
