@@ -171,11 +171,9 @@ def identify(
         )
     if p and method != "dmdc":
         raise ValueError(f"p is the rank of 'dmdc', but method is {method!r}; leave it out")
-    n_s = n_s or (
-        study_orders(
-            trajectories, channels=channels, settings=settings, constant=constant
-        ).suggested
-    )
+    if not n_s:
+        study = study_orders(trajectories, channels=channels, settings=settings, constant=constant)
+        n_s = study.suggested
     if method == "regression":
         return regression.exact_regression(
             trajectories, n_s=n_s, channels=channels, constant=constant
@@ -287,35 +285,27 @@ def designed(
             )
         rows = with_dead_time(inner.rows, delays, target, **weights, or_no_control=or_no_control)
         return replace(inner, rows=rows)
+    n_a = settings.n_a
+    free = settings.action_set.free(n_a)  # of mean zero, only differences show an effect
+    known, more = ([(z, a @ free) for z, a in own] for own in (trajectories, further))
     if settings.identification == "subspace":
         if not filtered:
             raise ValueError(
                 f"the identification 'subspace' designs a filter, which the law '{settings.law}' "
                 "does not use; take the law 'extended_kalman' or 'observer'"
             )
-        every, free = [*trajectories, *further], settings.action_set.free(settings.n_a)
-        if settings.action_set.zero_mean:  # only their differences show an effect
-            every = [(states, actions @ free) for states, actions in every]
+        every = [*known, *more]
+        if constant is None:
+            constant = regression.needs_constant(every, target.size)
         found_model = subspace_model(
-            every,
-            order=settings.reduced_order,
-            channels=channels,
-            constant=regression.needs_constant(every, target.size)
-            if constant is None
-            else constant,
+            every, order=settings.reduced_order, channels=channels, constant=constant
         )
-        if settings.action_set.zero_mean:
-            found_model = replace(found_model, B=found_model.B @ free.T)
+        found_model = replace(found_model, B=found_model.B @ free.T)
         return Designed(
             lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
             innovations=found_model,
         )
     truncated = settings.identification == "dmdc"
-    known: Sequence[tuple[ArrayLike, ArrayLike]] = trajectories
-    n_a = settings.n_a
-    free = settings.action_set.free(n_a)
-    if settings.action_set.zero_mean:  # only their differences show an effect
-        known = [(states, actions @ free) for states, actions in trajectories]
     model = identify(
         known,
         method="dmdc" if truncated else "regression",
@@ -325,8 +315,7 @@ def designed(
         settings=settings.method,
         constant=constant,
     )
-    if settings.action_set.zero_mean:
-        model = replace(model, B=model.B @ free.T)
+    model = replace(model, B=model.B @ free.T)
     unsolved: DesignError | None = None
     try:
         gains = lqt.track(model, **weights)
@@ -398,10 +387,9 @@ def design_each(
         late = tuple(max(n, 0) for n in study_delays(every).best)
         settings = replace(settings, input_delay=late if any(late) else ())
     whole, found = settings, dict[int, NDArray[np.float64]]()
-    measured = (
-        settings.identification != "subspace"
-    )  # whose order is that of a state behind readings
-    if measured and target.size <= SMALL and not model_order(asdict(settings)):
+    # Of "subspace" it is that of a state behind the readings.
+    of_readings = settings.identification == "subspace"
+    if not of_readings and target.size <= SMALL and not model_order(asdict(settings)):
         whole = replace(settings, reduced_order=target.size)
     for number in numbers:
         if number not in found:

@@ -118,28 +118,22 @@ class Cost:
 
     def steady(self) -> Cost:
         """The same with the mean of a moving target as its target."""
-        return Cost(
-            self.n_z,
-            self.n_a,
-            self.horizon,
-            state_weight=self.state_weight,
-            action_weight=self.action_weight,
-            target=self._mean,
-            output=self.output,
-            action_target=self.action_target,
-            terminal_weight=self.terminal_weight,
-        )
+        return self._with(self.n_z, self._mean, self.output)
 
     def through(self, matrix: Array) -> Cost:
         """The same of x (n,) with z = matrix x."""
+        output = matrix if self.output is None else self.output @ matrix
+        return self._with(matrix.shape[1], self.target, output)
+
+    def _with(self, n_z: int, target: Array, output: Array | None) -> Cost:
         return Cost(
-            matrix.shape[1],
+            n_z,
             self.n_a,
             self.horizon,
             state_weight=self.state_weight,
             action_weight=self.action_weight,
-            target=self.target,
-            output=matrix if self.output is None else self.output @ matrix,
+            target=target,
+            output=output,
             action_target=self.action_target,
             terminal_weight=self.terminal_weight,
         )

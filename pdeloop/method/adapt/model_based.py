@@ -574,9 +574,8 @@ class ModelBased(Optimizer):
         name = FIRST if np.array_equal(law, self._first) else ADAPTED
         chosen = str(row["chosen"])
         other = NAMES[FIRST] if name == FIRST else "an earlier adapted law"
-        reason = (
-            f"{size_of(other, saved, LAST if chosen == ADAPTED else NAMES[chosen])} and is returned"
-        )
+        than = LAST if chosen == ADAPTED else NAMES[chosen]
+        reason = f"{size_of(other, saved, than)} and is returned"
         if chosen != ADAPTED:
             missed = str(row["reason"]).removeprefix(f"{NO_OTHER}: ")
             within = " (within chance)" if missed != row["reason"] else ""
