@@ -30,7 +30,7 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     """
     given = flatten(options)
     plant, values = complete(training_parameters(name, given), compiled=False)
-    if plant.cost.target.ndim > 1 or _drifts(plant):  # which the plant itself may say
+    if plant.cost.target.ndim > 1 or _needs_offset(plant):  # which the plant itself may say
         values |= training_parameters(name, given, constants=True)
     resting, limits = plant.cost.action_target, (plant.action_set.low, plant.action_set.high)
     limited = any(np.isfinite(limit).any() for limit in limits)
@@ -41,10 +41,17 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     return plant, values
 
 
-def _drifts(plant: Plant) -> bool:
-    """Whether a plant of one's own leaves a target of 0 by itself, where K_b s_r cannot hold it."""
+def _needs_offset(plant: Plant) -> bool:
+    """Whether a target of 0, where K_b s_r is 0, needs actions other than 0.
+
+    They have a target of their own, or a plant of one's own leaves the state 0 by itself.
+    """
     true = getattr(plant, "plant", plant)
-    if plant.target.any() or not (isinstance(true, DynamicsPlant) and true.settable):
+    if plant.target.any():
+        return False
+    if plant.cost.action_target.any():
+        return True
+    if not (isinstance(true, DynamicsPlant) and true.settable):
         return False
     try:
         after, _ = true.evaluate(np.zeros((1, plant.n_z)), np.zeros((1, plant.n_a)))

@@ -206,6 +206,20 @@ def test_a_constant_disturbance_is_met_at_a_target_of_0_by_default() -> None:
     assert pdeloop.problem(plant=Offset(), law="observer").values["law"] == "observer"
 
 
+def test_actions_with_a_target_of_their_own_are_held_at_a_target_of_0_by_default() -> None:
+    class Held(Offset):
+        action_target, action_weight = 1.5, 5.0
+
+    own = Held(0.0)
+    run = pdeloop.train(plant=own, rollouts=12, evaluation_fields=20, reduced_order=2)
+    assert run.values["law"] == "feedforward"
+    plant = DynamicsPlant(own)
+    best = track_horizon(own.A, own.B, plant.cost, np.eye(2))
+    law: Any = lambda k, z: z @ best.K[k].T + best.b[k]  # noqa: E731
+    least = pdeloop.rollout(plant, law, run.evaluation[0]).costs.mean.mean()
+    assert least <= np.mean(run.costs["adapted"]) <= 1.01 * least < 0.9 * np.mean(run.costs["none"])
+
+
 def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
     class OfWeights(ModelBased):
         name = "of_weights"
