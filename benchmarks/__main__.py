@@ -37,6 +37,7 @@ PROGRAMS = {
     "general": "held-out plants and initial fields: first law, adapted law and best known inputs",
     "gate": "costs of trainings, beside those of the same trainings before a change",
     "plans": "time of a step of the law predictive, on each shipped problem",
+    "exported_step": "time of a step of the law neural, in C and in Python",
     "scale": "messages, bags, fits, memory and files as the state grows",
     "published": "tasks with published figures, which are shown beside ours",
     "optimum": "the best affine law and the best known inputs, by exact gradients",
