@@ -17,27 +17,25 @@ from pdeloop.law_form import law_form
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
-from pdeloop.method.adapt.base import Context, RolloutResult, Trajectory
-from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.base import RolloutResult, Trajectory
 from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
 from pdeloop.method.adapt.network import Network, NetworkTraining, rolled_out
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Neural
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.registry import action
-from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.model_files import matlab, onnx
 from tests.method.test_plans import N_A, N_Z, T, spectral
 from tests.method.test_predictive import (
-    GAINS,
     ROWS,
     STATES,
     U,
     actions_of,
-    explored_trajectory,
     spectral_step,
     start,
+)
+from tests.method.test_predictive import (
+    optimizer as planned,
 )
 from tests.tools.test_law_gradients import SEEDS, Cubic
 from tests.tools.test_law_gradients import law_of as law_of_cubic
@@ -148,26 +146,7 @@ def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_thet
 
 def optimizer() -> ModelBasedNeural:
     """Of a plant that is the spectral model, judged by rollouts of it."""
-    explored = [explored_trajectory(seed) for seed in range(2)]
-    settings = NeuralSettings(neurons=H, iterations=20)
-    context = Context(
-        U=U,
-        target=np.full(N_Z, 0.3),
-        state_weight=1.0,
-        action_weight=0.5,
-        horizon=T,
-        exploration=explored[0],
-        further=explored[1:],
-        field_models=FieldModelSettings(folds=2, largest_degree=2),
-        law=type("Short", (Neural,), {"settings": settings, "name": "neural"})(ROWS, T),
-    )
-    made = ModelBased.for_context(context)(
-        GAINS.ravel(),
-        seed=3,
-        rollouts=10,
-        settings=ModelBasedSettings(judging=2, iterations=10),
-        context=context,
-    )
+    made = planned(kind=Neural, constants=NeuralSettings(neurons=H, iterations=20))
     assert isinstance(made, ModelBasedNeural)
     return made
 

@@ -34,6 +34,7 @@ from pdeloop.method.laws.registry import action, updated
 from pdeloop.method.models.files import LARGEST, packed, unpacked
 from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
+from pdeloop.method.settings import Settings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
 from tuner_node.narration import closing_lines
 
@@ -278,7 +279,9 @@ def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
     assert np.array_equal(costs["adapted"], auto.costs["adapted"])
 
 
-def optimizer(rollouts: int = 10, kind: type[Predictive] = Predictive) -> ModelBasedPredictive:
+def optimizer(
+    rollouts: int = 10, kind: type[Law] = Predictive, constants: Settings | None = None
+) -> ModelBasedPredictive:
     """Of a plant that is the spectral model, judged by rollouts of it."""
     explored = [explored_trajectory(seed) for seed in range(2)]
     context = Context(
@@ -290,7 +293,7 @@ def optimizer(rollouts: int = 10, kind: type[Predictive] = Predictive) -> ModelB
         exploration=explored[0],
         further=explored[1:],
         field_models=FieldModelSettings(folds=2, largest_degree=2),
-        law=type("Short", (kind,), {"settings": SHORT})(ROWS, T),
+        law=type("Short", (kind,), {"settings": constants or SHORT, "name": kind.name})(ROWS, T),
     )
     own = ModelBased.for_context(context)
     settings = ModelBasedSettings(judging=2, iterations=10)
