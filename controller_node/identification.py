@@ -327,9 +327,11 @@ def designed(
         K_b = K_a
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     d = model.d if model.d.any() else None
-    if d is not None and unsolved is None and (size := float(s_r @ s_r)):
-        K_b = K_b + np.outer(gains.b, s_r) / size
-    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
+    left = None
+    if unsolved is None and gains.b.any():
+        held, left = lqt.target_gain(gains.b, s_r)
+        K_b, left = K_b + held, left if filtered else None
+    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=K_a, K_b=K_b, s_r=s_r, d=d, b=left)
     if settings.identification != "field":
         return Designed(
             lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows

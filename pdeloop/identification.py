@@ -119,8 +119,9 @@ class Identified:
                 "has no say in a cost with one weight for all: give states in units in which they vary "
                 "alike"
             )
-        if isinstance(self.model, ModelRows) and d is not None and not self.model.s_r.any():
-            A, B, K = self.model.A, self.model.B, self.model.K_a
+        law = self.model if isinstance(self.model, ModelRows) else None
+        if law is not None and d is not None and law.b is None and not law.s_r.any():
+            A, B, K = law.A, law.B, law.K_a
             rest = linalg.norm(linalg.lstsq(np.eye(len(A)) - A - B @ K, d)[0])
             if rest > ASIDE * linalg.norm(spread):
                 found.append(
@@ -250,7 +251,8 @@ class Identified:
         law = "a = K_a U^T z + K_b s_r"
         if self.model.L is not None:
             drift = "" if self.model.d is None else " + d"
-            law = f"a = K_a x + K_b s_r, x = p + L (U^T z - p), and then p = A x + B a{drift}"
+            more = "" if self.model.b is None else " + b"
+            law = f"a = K_a x + K_b s_r{more}, x = p + L (U^T z - p), and then p = A x + B a{drift}"
             names += "; p = U^T z at first"
         return [
             *loop.text(self.sample_time),
@@ -521,9 +523,9 @@ def _refitted(
 def save(found: Identified, path: Path) -> None:
     """Write the model as an .npz archive.
 
-    A, B, U, with a target also K_a, K_b, s_r, with a filter L, and `model`, the rows of the topic;
-    sample_time and the names of the channels where they are known; the arrays of a model of the whole
-    field, with `field_` in front of their names.
+    A, B, U, with a target also K_a, K_b, s_r, with a filter L (and b), and `model`, the rows of the
+    topic; sample_time and the names of the channels where they are known; the arrays of a model of
+    the whole field, with `field_` in front of their names.
     """
     model = found.model
     arrays: dict[str, Any] = {"A": model.A, "B": model.B, "U": model.U}

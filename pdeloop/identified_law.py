@@ -73,7 +73,7 @@ class ClosedLoop:
 
 
 def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:
-    """Simulate s_{k+1} = A s_k + B a_k + d under a_k = K_a s_k + K_b s_r, from s_0 = U^T z_0.
+    """Simulate s_{k+1} = A s_k + B a_k + d under a_k = K_a s_k + K_b s_r + b, from s_0 = U^T z_0.
 
     states (N + 1, n_z) and actions (N, n_a): the recorded trajectory whose first state it begins with.
     It runs for its length, or longer, until the slowest mode has decayed.
@@ -81,7 +81,7 @@ def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) ->
     radius = float(np.abs(np.linalg.eigvals(law.A + law.B @ law.K_a)).max())
     needed = np.log(DECAYED) / np.log(min(max(radius, 0.01), 1.0 - 1e-9))
     steps = int(np.clip(np.ceil(needed), len(actions), LONGEST * len(actions)))
-    s, forced = law.U.T @ states[0], law.K_b @ law.s_r
+    s, forced = law.U.T @ states[0], law.constant
     reduced, applied = [s], list[Array]()
     for _ in range(steps):
         a = law.K_a @ s + forced

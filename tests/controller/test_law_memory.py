@@ -31,7 +31,7 @@ def models() -> np.ndarray:
     """Those of the affine law with a filter gain each, which believes half of a measurement."""
     rows = affine_models()
     n_s = rows.shape[2]
-    filters = np.vstack([0.5 * np.eye(n_s), np.zeros(n_s)])  # and no constant term
+    filters = np.vstack([0.5 * np.eye(n_s), np.zeros((1 + 4, n_s))])  # and no d and b
     return np.concatenate([rows, [filters] * len(rows)], axis=1)
 
 

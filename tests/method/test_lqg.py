@@ -112,14 +112,17 @@ def test_a_mode_that_no_reading_sees_is_refused_by_name() -> None:
 def test_rows_carry_the_filter_gain_of_those_laws_that_have_one() -> None:
     L = RNG.standard_normal((N, N))
     rows = pack(model(L=L))
-    assert rows.shape == (N + 2 * N + 3 * N_A + 2, N)
+    assert rows.shape == (N + 2 * N + 4 * N_A + 2, N)
     again = unpack(rows, N_A, True)
-    assert again.L is not None and np.array_equal(again.L, L) and again.d is None
+    assert again.L is not None and np.array_equal(again.L, L) and again.d is again.b is None
     drifting = unpack(pack(model(L=L, d=np.arange(N))), N_A, True)
     assert np.array_equal(drifting.d, np.arange(N)) and np.array_equal(drifting.L, L)
     assert np.array_equal(again.U, np.eye(N))
-    # Those of version 0.2 have no d.
-    assert np.array_equal(completed(rows[:-1], N_A, N), rows)
+    offset = unpack(pack(model(L=L, b=np.arange(N_A))), N_A, True)
+    assert np.array_equal(offset.b, np.arange(N_A)) and offset.d is None
+    # Those of version 0.2 have no d, and others no b.
+    for end in (-1 - N_A, -N_A):
+        assert np.array_equal(completed(rows[:end], N_A, N), rows)
     assert completed(rows, N_A, N) is rows
     # More estimated than measured numbers.
     few = unpack(pack(ModelRows(A, B, np.ones((1, N)), B.T, B.T, np.zeros(N), L)), N_A, True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy import linalg
 
 from pdeloop.messages.cost import Cost
+from pdeloop.messages.model_rows import pack, unpack
 from pdeloop.method.design.lqg import kalman_filter, law_of_innovations
 from pdeloop.method.design.lqt import DesignError, track_outputs
 from pdeloop.method.laws import Observer
@@ -85,6 +87,26 @@ def test_its_law_costs_what_lqg_with_the_true_plant_costs() -> None:
     S = R * np.eye(N_A) + B.T @ gains.P @ B
     optimum = np.trace(gains.P @ W) + np.trace(gains.K_a.T @ S @ gains.K_a @ error)
     assert optimum <= found * (1 + 1e-9) and found < 1.02 * optimum
+
+
+def test_its_offset_is_kept_where_the_reduced_target_is_0() -> None:
+    """Against a drift, and to the target of the actions: at rest no other offset costs less."""
+    model, a_r = replace(identified(), d=np.array([0.5, -1.0, 0.3, 0.2])), np.array([0.4, -0.2])
+    cost = Cost(N_Y, N_A, 1, state_weight=Q, action_weight=R, action_target=a_r)
+    own = {"state_weight": Q, "action_weight": R, "cost": cost}
+    rows = unpack(pack(law_of_innovations(model, np.zeros(N_Y), **own)), N_A, filtered=True)
+    law = Observer(rows, 10)
+    b = law.parts(law.theta_start)["b"]
+
+    def at_rest(b: np.ndarray) -> float:
+        x = linalg.solve(np.eye(N) - rows.A - rows.B @ rows.K_a, rows.B @ b + rows.d)
+        y, a = model.U @ model.C @ x, rows.K_a @ x + b - a_r
+        return float(Q * y @ y + R * a @ a)
+
+    assert not rows.s_r.any()
+    for step in 1e-3 * np.eye(N_A):
+        up, down = at_rest(b + step) - at_rest(b), at_rest(b - step) - at_rest(b)
+        assert up == pytest.approx(down, rel=1e-6) and up > 0.0
 
 
 def test_the_order_and_the_past_are_those_of_the_least_error_on_held_out_measurements() -> None:

@@ -364,7 +364,7 @@ def field_law(
     U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, order or n_s)
     K_a, s_r = K @ U, U.T @ target
     # There is no constant part where the target is outside of U.
-    K_b = target_gain(b - K @ point, s_r)
+    K_b, _ = target_gain(b - K @ point, s_r)
     d = U.T @ (point + drift - A @ point)
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 

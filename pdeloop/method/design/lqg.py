@@ -292,8 +292,8 @@ def law_of_innovations(
         M = linalg.lstsq(A, model.G)[0]
         U = model.U @ back.T
         s_r = U.T @ target
-    K_b = target_gain(b, s_r)
-    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d)
+    K_b, left = target_gain(b, s_r)
+    return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d, b=left)
 
 
 def with_dead_time(
@@ -356,8 +356,8 @@ def with_dead_time(
         or_no_control=or_no_control,
     )
     s_r = np.concatenate([rows.s_r, none])
-    K_b = target_gain(b, s_r)
+    K_b, left = target_gain(b, s_r)
     with one_thread():
         L = linalg.block_diag(np.eye(n_s) if rows.L is None else rows.L, np.zeros((memory, memory)))
     U = np.hstack([rows.U, np.zeros((len(rows.U), memory))])
-    return replace(rows, A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=L, d=d)
+    return replace(rows, A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=L, d=d, b=left)

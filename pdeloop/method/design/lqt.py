@@ -169,14 +169,16 @@ def track_outputs(A: Array, B: Array, U: Array, cost: Cost, d: ArrayLike = 0.0) 
         p = _steady_state_map(closed_loop) @ (E.T @ w - closed_loop.T @ pushed)
         b = cost.action_target + linalg.solve(S, B.T @ (p - pushed), assume_a="pos")
         s_r = U.T @ cost.field_target
-        K_b = target_gain(b, s_r)
-    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if s_r.any() else b)
+        K_b, left = target_gain(b, s_r)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles, b=np.zeros_like(b) if left is None else left)
 
 
-def target_gain(b: Array, s_r: Array) -> Array:
-    """The least K_b with K_b s_r = b; 0 where s_r is."""
+def target_gain(b: Array, s_r: Array) -> tuple[Array, Array | None]:
+    """The least K_b with K_b s_r = b, and what is left of b: all of it where s_r is 0, else None."""
     size = float(s_r @ s_r)
-    return np.outer(b, s_r) / size if size > 0.0 else np.zeros((len(b), len(s_r)))
+    if size > 0.0:
+        return np.outer(b, s_r) / size, None
+    return np.zeros((len(b), len(s_r))), b if b.any() else None
 
 
 def output_law(

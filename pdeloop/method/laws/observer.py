@@ -17,7 +17,9 @@ class Observer(Law):
     It starts as the LQG law of the model: with its filter gain L, x_k = p_k + L (s_k - p_k) estimates
     the reduced state, p_{k+1} = A x_k + B a_k predicts it, and the tracking gains act on x_k:
 
-        F = A (I - L),    G = A L,    K = K_a (I - L),    D = K_a L,    b = K_b s_r,    c = d.
+        F = A (I - L),    G = A L,    K = K_a (I - L),    D = K_a L,    b = K_b s_r,    c = d,
+
+    with K_b s_r and what the rows of the model have besides it (`ModelRows.constant`).
 
     Its memory is p_k. B is the model's, and a_k is what the plant gets, so that a saturated action
     misleads no prediction. A model without a filter gain has L = I, the filter for exact measurements:
@@ -41,7 +43,7 @@ class Observer(Law):
         return {
             "K": model.K_a @ (eye - L),
             "D": model.K_a @ L,
-            "b": model.K_b @ model.s_r,
+            "b": model.constant,
             "F": model.A @ (eye - L),
             "G": model.A @ L,
             "c": np.zeros(len(eye)) if model.d is None else model.d,
