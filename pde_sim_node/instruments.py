@@ -107,11 +107,6 @@ class InstrumentedPlant:
         self.action_set = ActionSet.of(
             {**given, "action_bounds": bounds or plant.action_set.bounds}
         )
-        if instruments.sensors and plant.cost.target.ndim > 1:
-            raise ValueError(
-                f"sensors need a constant target, but that of {plant!r} moves, which no law of "
-                "readings follows: measure the whole state, or give a constant target"
-            )
         self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target
         sensors = instruments.sensors or self.grid.points
         self.positions = self.grid.measured(sensors)

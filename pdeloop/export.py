@@ -89,10 +89,10 @@ class Parameters:
             )
         assert law is not None
         parts = law.parts(theta)
-        matrices = {name: _rows(parts[name]) for name in ("K", "D", "F", "G")}
-        vectors = {name: _numbers(parts[name]) for name in ("b", "c")}
-        B = _rows(self.model.B)
-        return _filled("observer", self, self.model, B=B, **matrices, **vectors)
+        own = {name: np.atleast_2d(parts[name]) for name in ("K", "D", "F", "G", "b", "c")}
+        matrices = {name: _rows(part) for name, part in own.items()}
+        B, steps = _rows(self.model.B), str(len(own["b"]))
+        return _filled("observer", self, self.model, B=B, steps=steps, **matrices)
 
 
 @dataclass(frozen=True, eq=False)

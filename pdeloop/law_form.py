@@ -2,7 +2,8 @@
 """A law of a run as matrices, for exports that compute it elsewhere.
 
     affine:    a = P(K s + constant),       s = U^T y
-    observer:  a = P(K p + D s + b),        p <- F p + G s + B a + c,    p = s at first
+    observer:  a = P(K p + D s + b),        p <- F p + G s + B a + c,    p = s at first,
+               where the target moves with rows of b and c for each step
     neural:    a = P(K s + c + D tanh(W s + w))
 
 with the nearest admissible action P(a), which rate limits make one near the action before.
@@ -52,8 +53,16 @@ class LawForm:
     name: str
     spectral_radius: float
 
+    def require_constant(self) -> None:
+        """ParameterError for a law with constant parts for each step, of a target that moves."""
+        if self.kind == "observer" and self.arrays["b"].ndim > 1:
+            raise ParameterError(
+                "a law with constant parts for each step has no such form; write it as C or an FMU"
+            )
+
     def require_matrices(self) -> None:
-        """ParameterError for a law with a network."""
+        """ParameterError for a law with a network, or with constant parts for each step."""
+        self.require_constant()
         if self.kind == "neural":
             raise ParameterError(
                 "a law with a network has no such form; write it as C, an FMU or an ONNX model"

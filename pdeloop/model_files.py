@@ -107,12 +107,13 @@ def onnx(law: LawForm) -> bytes:
     An observer also takes its prediction p (n_s,), a law with rate limits the action before,
     a_before (n_a,), and both whether they have `started`; an observer also gives p_next.
 
-    ParameterError without the package onnx, and for actions of mean zero.
+    ParameterError without the package onnx, for actions of mean zero and a target that moves.
     """
     try:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ParameterError("an ONNX model needs onnx: pip install 'pdeloop[onnx]'") from error
+    law.require_constant()
     if law.action_set.zero_mean:
         raise ParameterError(
             "actions of mean zero have no form in ONNX; export the law as C or --ros2"

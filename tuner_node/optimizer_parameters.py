@@ -87,9 +87,9 @@ def _preferred(
         0 < _number(given, "sensors") < _number({POINTS.name: POINTS.default, **given}, POINTS.name)
     )
     few_now = few and _number(given, "sensor_delays") <= 1
-    if few_now and kind.law_of_sensors:
+    if (few_now or (few and constants)) and kind.law_of_sensors:
         preferences[LAW.name] = kind.law_of_sensors
-    elif kind.law_with_constants and not few and constants:
+    elif kind.law_with_constants and constants:
         preferences[LAW.name] = kind.law_with_constants
     if few_now and given.get(LAW.name) in kind.laws_of_sensors:
         given = {**given, LAW.name: kind.laws_of_sensors[given[LAW.name]]}

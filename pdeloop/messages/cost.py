@@ -120,10 +120,10 @@ class Cost:
         """The same with the mean of a moving target as its target."""
         return self._with(self.n_z, self._mean, self.output)
 
-    def through(self, matrix: Array) -> Cost:
-        """The same of x (n,) with z = matrix x."""
+    def through(self, matrix: Array, target: Array | None = None) -> Cost:
+        """The same of x (n,) with z = matrix x; target: in place of its own."""
         output = matrix if self.output is None else self.output @ matrix
-        return self._with(matrix.shape[1], self.target, output)
+        return self._with(matrix.shape[1], self.target if target is None else target, output)
 
     def _with(self, n_z: int, target: Array, output: Array | None) -> Cost:
         return Cost(

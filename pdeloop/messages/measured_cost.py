@@ -17,7 +17,8 @@ def measured_cost(values: Mapping[str, Any]) -> list[str]:
     """The texts of the parameter `cost`, of what the plant publishes.
 
     With few sensors that is o = sqrt(n_z / (n_y d)) [y_k, y_{k-1}, ...], and the state in the cost is
-    the one that the newest readings suggest (`Grid.between`).
+    the one that the newest readings suggest (`Grid.between`), or without outputs its distance from the
+    target the one that theirs suggest: the target is known between the sensors, too.
 
     values: parameters of a plant or a run.
     """
@@ -28,6 +29,9 @@ def measured_cost(values: Mapping[str, Any]) -> list[str]:
         return texts
     text = str(values.get("grid", ""))
     grid = Grid.parse(text) if text else Grid(numbers=cost.n_z)
-    newest = grid.between(sensors) / math.sqrt(grid.points / (sensors * delays))
+    between, target = grid.between(sensors), None
+    newest = between / math.sqrt(grid.points / (sensors * delays))
     older = np.zeros((cost.n_z, newest.shape[1] * (delays - 1)))
-    return cost.through(np.hstack([newest, older])).packed
+    if cost.output is None:
+        target = cost.target[..., grid.measured(sensors)] @ between.T
+    return cost.through(np.hstack([newest, older]), target).packed

@@ -22,6 +22,7 @@ from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array, unpack_arrays
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws.registry import law_kind, laws_of
 from pdeloop.method.reduce.order import OrderStudy, study_orders
@@ -269,7 +270,7 @@ def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) 
     policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     used = [models.get(name, data.models[data.shown]) for name in policies]
-    laws = laws_of(law_kind(values["law"], values), used, values["horizon"], values.get("cost", ()))
+    laws = laws_of(law_kind(values["law"], values), used, values["horizon"], measured_cost(values))
     law = LawBatch(laws, plant.target, ActionSet.of(values))
     count = len(policies)
     law.set(stacked([*policies.values()]), np.arange(count))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.method.laws import Affine, FeedForward, Law, Observer
@@ -32,6 +33,7 @@ U = np.linalg.qr(RNG.standard_normal((N_Z, N_S)))[0]
 A, B = RNG.standard_normal((N_S, N_S)), RNG.standard_normal((N_S, N_A))
 K_a, K_b = RNG.standard_normal((2, N_A, N_S))
 MODEL = ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=RNG.standard_normal(N_S))
+MOVING = Cost(N_Z, N_A, T, target=np.sin(np.arange(T * N_Z)).reshape(T, N_Z))
 
 
 def trajectory(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -95,9 +97,14 @@ def numeric(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray)
 
 
 @pytest.mark.parametrize("k", [0, 1, T])
-@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
-def test_derivatives_agree_with_finite_differences(kind: type[Law], k: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "cost"), [(Affine, None), (FeedForward, None), (Observer, None), (Observer, MOVING)]
+)
+def test_derivatives_agree_with_finite_differences(
+    kind: type[Law], cost: Cost | None, k: int
+) -> None:
     law, rng = kind(MODEL, T), np.random.default_rng(k)
+    law.cost = cost
     theta = law.theta_start + 0.3 * rng.standard_normal(law.size)
     z, memory = rng.standard_normal(N_Z), rng.standard_normal(law.memory_size)
     y, a = rng.standard_normal((2, N_A))

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ReplayedLoop
@@ -119,8 +121,17 @@ def test_the_state_that_a_rollout_began_with_is_the_likeliest_one() -> None:
     assert isinstance(again, ReadingsModel) and np.array_equal(again.G, model.G)
 
 
-def test_the_gradient_agrees_with_differences() -> None:
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_gradient_agrees_with_differences(moving: bool) -> None:
     loop, record, theta = loop_and_rollout()
+    if moving:  # b and c for each step
+        law = Observer(first_law().model, T)
+        law.cost = Cost(N_Y, N_A, T, target=np.cos(np.arange(T * N_Y)).reshape(T, N_Y))
+        own = replace(context(law=law), cost=law.cost)
+        belief = believe(own, explored(), 0.05)
+        assert belief is not None
+        loop, theta = belief.loop(own), law.theta_start
+        assert np.array_equal(loop.policy(loop.theta(theta), theta), theta)
     fields, weights = loop.beginnings([record, *explored()[:2]]), np.array([0.5, 0.2, 0.3])
     Theta = loop.theta(theta)
     value, gradient = loop.gradient(Theta, fields, weights)

@@ -16,7 +16,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
 from pdeloop.method.design.finite_horizon import finite_horizon_of, track_horizon
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws import FeedForward, Law, Observer
 from pdeloop.method.laws.registry import laws_of
 from tests.support.small import FEW_FITS
 
@@ -72,22 +72,25 @@ def test_no_law_costs_less_than_lq_tracking_over_the_horizon() -> None:
         assert up == pytest.approx(down, rel=1e-6) and up > 0.0  # the slope is zero there
 
 
-def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
-    """From s = 0 it takes the best way, with one feedback for all steps."""
+@pytest.mark.parametrize("kind", [FeedForward, Observer])
+def test_the_law_with_a_feedforward_looks_ahead_from_its_start(kind: type[Law]) -> None:
+    """From s = 0 it takes the best way, with one feedback for all steps, of states and estimates."""
     plant = DynamicsPlant(Servo())
-    best, law = track_horizon(A, B, plant.cost, np.eye(N_Z)), _feedforward(plant, np.zeros(N_Z))
-    start = law.parts(law.theta_start)
+    best, known = track_horizon(A, B, plant.cost, np.eye(N_Z)), _feedforward(plant, np.zeros(N_Z))
+    (law,) = laws_of(kind, [known.model], T, plant.cost.texts)
+    start, memory = law.parts(law.theta_start), law.memory_start()
     rest = np.zeros((1, N_Z))
     found, expected = (
         pdeloop.rollout(plant, own, rest)
         for own in (
-            lambda k, z: law.action(start, z[0], np.zeros(0), k)[None],
+            lambda k, z: law.action(start, z[0], memory, k)[None],
             lambda k, z: z @ best.K[k].T + best.b[k],
         )
     )
     np.testing.assert_allclose(found.actions, expected.actions, atol=1e-10)
-    (constant,) = laws_of(FeedForward, [law.model], T)
-    assert np.ptp(constant.parts(constant.theta_start)["b"], axis=0).max() == 0.0
+    (constant,) = laws_of(kind, [law.model], T)
+    b = np.atleast_2d(constant.parts(constant.theta_start)["b"])
+    assert np.ptp(b, axis=0).max() == 0.0
 
 
 def _feedforward(plant: DynamicsPlant, d: np.ndarray) -> FeedForward:
@@ -247,11 +250,6 @@ def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str)
     vars(servo).update(changes)
     with pytest.raises(ValueError, match=told):
         DynamicsPlant(servo)
-
-
-def test_sensors_and_a_moving_target_do_not_go_together() -> None:
-    with pytest.raises(ValueError, match=r"sensors need a constant target, but that of .*moves"):
-        pdeloop.problem(plant=Servo(), sensors=3).plant()
 
 
 def test_actions_are_moved_to_the_nearest_ones_that_are_allowed_and_cost_what_acts() -> None:

@@ -15,6 +15,7 @@ import pytest
 from controller_node.law_batch import LawBatch
 from pdeloop.export import GainLaw, Parameters
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.feedforward import FeedForward
@@ -83,10 +84,19 @@ def pointer(array: np.ndarray) -> Any:
     return array.ctypes.data_as(DOUBLES)
 
 
+MOVING = Cost(N_Z, N_A, T, target=np.sin(np.arange(T * N_Z)).reshape(T, N_Z))
+
+
 @needs_compiler
-@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer, Neural])
-def test_c_acts_as_the_loop_at_every_bound(tmp_path: Path, kind: type[Law]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "cost"),
+    [(Affine, None), (FeedForward, None), (Observer, None), (Observer, MOVING), (Neural, None)],
+)
+def test_c_acts_as_the_loop_at_every_bound(
+    tmp_path: Path, kind: type[Law], cost: Cost | None
+) -> None:
     law = kind(model(kind.filtered), T)
+    law.cost = cost
     theta = theta_of(law)
     for i, (name, allowed) in enumerate(SETS.items()):
         source, expected = tmp_path / f"law{i}.c", acting(law, allowed)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,6 +13,8 @@ from scipy.linalg import expm
 import pdeloop
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.measured_cost import measured_cost
+from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.report.data import gather
 
 pytestmark = pytest.mark.filterwarnings("ignore::pdeloop.TrainingWarning")
 
@@ -100,8 +105,7 @@ def test_weights_of_outputs_are_those_of_the_state_between_the_sensors(law: str)
 
 def test_the_cost_of_readings_is_that_of_states_that_are_linear_between_sensors() -> None:
     values = pdeloop.problem(plant=Weighed(), sensors=4, sensor_delays=2).values
-    plant, known = Weighed(), Cost.parse(measured_cost(values))
-    assert known is not None
+    plant, known = Weighed(), measured(values)
     cost = pdeloop.problem(plant=plant).plant().cost
     places = np.array([1, 4, 7, 10])  # int((j + 1/2) 12 / 4)
     y = np.random.default_rng(0).standard_normal((5, 4))
@@ -110,4 +114,48 @@ def test_the_cost_of_readings_is_that_of_states_that_are_linear_between_sensors(
     a, (own, of_states) = np.full((5, 2), 0.3), np.zeros((2, 5))
     known.add(own, o, a, 0)
     cost.add(of_states, z, a, 0)
+    np.testing.assert_allclose(own, of_states, rtol=1e-12)
+
+
+class Following(Rod):
+    """The rod, of which every cell is to follow a wave of its own."""
+
+    target = 1.0 + 0.4 * np.sin(0.15 * np.arange(61)[:, None] - 0.5 * np.arange(12))
+
+
+def test_a_target_that_moves_is_followed_with_few_sensors(tmp_path: Path) -> None:
+    """At 1.05 times the cost of the best law of all states that knows A, B and this cost."""
+    late = pdeloop.problem(plant=Following(), sensors=3, sensor_delays=2).values
+    assert late["law"] == "extended_kalman" and late["identification"] == "subspace"
+    own = {"sensors": 3, "measurement_noise": 0.02, "rollouts": 6, "evaluation_fields": 3}
+    run = pdeloop.train(plant=Following(), **own, out=tmp_path / "run")
+    assert len(gather(tmp_path / "run").problems[0].behaviours) == 3
+    plant, between = Following(), measured(pdeloop.problem(plant=Following(), sensors=3).values)
+    places = [2, 6, 10]
+    K, b = track_horizon(plant.A, plant.B, between.through(2.0 * np.eye(12)[places]), np.eye(12))
+    fields = run.evaluation[0]
+    best = pdeloop.rollout(
+        pdeloop.problem(plant=plant).plant(), lambda k, z: z @ K[k].T + b[k], fields
+    ).costs.mean
+    assert run.costs["adapted"].mean() < 1.05 * best.mean() < 0.3 * run.costs["none"].mean()
+    assert run.costs["lqt"].mean() < 1.1 * best.mean()
+
+
+def measured(values: dict[str, Any]) -> Cost:
+    cost = Cost.parse(measured_cost(values))
+    assert cost is not None
+    return cost
+
+
+def test_without_outputs_it_is_the_distance_from_the_target_that_is_linear_between_sensors() -> (
+    None
+):
+    problem = pdeloop.problem(plant=Following(), sensors=4)
+    known, cost = measured(problem.values), pdeloop.problem(plant=Following()).plant().cost
+    places, wanted = np.array([1, 4, 7, 10]), Following.target[3]
+    y = np.random.default_rng(0).standard_normal((5, 4))
+    z = wanted + np.array([np.interp(np.arange(12), places, own - wanted[places]) for own in y])
+    a, (own, of_states) = np.full((5, 2), 0.3), np.zeros((2, 5))
+    known.add(own, np.sqrt(12 / 4) * y, a, 3)
+    cost.add(of_states, z, a, 3)
     np.testing.assert_allclose(own, of_states, rtol=1e-12)

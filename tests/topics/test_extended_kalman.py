@@ -54,8 +54,10 @@ def test_a_law_of_readings_for_any_quadratic_cost_has_the_bits_of_one_process(
     """The controller sees the cost through the sensors, as the tuner does."""
     out, weights = tmp_path / "run", np.linspace(0.5, 1.5, 64)
     own = {"terminal_weight": 1.0, "state_weight": weights, "action_weight": [0.01, 0.02, 0.03]}
+    own["target"] = np.linspace(0.0, 0.5, 10)[:, None] * weights  # which moves
     values = {**PARAMETERS, **SETTINGS, "n_z": 64, "cost": own}
     here = pdeloop.train("allen-cahn", **values, out=tmp_path / "here")
+    assert len(here.laws[0].parts(here.policies[0])["b"]) == 10
     file = str(tmp_path / "here" / "parameters.yaml")
     loop.wait(loop.pdeloop("train", file, "--record", "--out", str(out)), LIMIT)
     assert same_bits(policies(out), here.policies)

@@ -16,9 +16,10 @@ or another quadratic one. With g_k = dJ/d[r_k; u_k] of the adjoint (`pdeloop.met
 gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
 
 The memory of a law with an observer (`ObservedLoop`) is the prediction p of the reduced state, and its
-theta is [D K b; G F c]. On a model of the readings (`ReplayedLoop`) it replays measured innovations: an
-initial field is a row [x_0, e_0, .., e_{T-1}] (`pdeloop.method.models.readings`), where a rollout
-began, and what in it no model predicted. Under its own law it is the rollout again.
+theta is [D K b; G F c], with columns of b and c for each step where the target moves. On a model of
+the readings (`ReplayedLoop`) it replays measured innovations: an initial field is a row [x_0, e_0, ..,
+e_{T-1}] (`pdeloop.method.models.readings`), where a rollout began, and what in it no model predicted.
+Under its own law it is the rollout again.
 """
 
 from __future__ import annotations
@@ -352,10 +353,16 @@ class ClosedLoop(ClosedLoopProblem):
         return changed
 
     def moment(self, simulation: Simulation, weights: Array) -> Array:
-        """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields."""
-        features = simulation.features
+        """F, the mean of [s; p; 1][s; p; 1]^T over steps and weighted fields.
+
+        With constant parts for each step, a number that is 1 at a step and else 0 for each of them.
+        """
+        features, T = simulation.features, self.constants
         found: Array = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
-        return found
+        if T == 1:
+            return found
+        by_step = np.einsum("kfi,f->ik", features[:, :, :-1], weights) / T
+        return np.block([[found[:-1, :-1], by_step], [by_step.T, np.eye(T) / T]])
 
     def _start(self, fields: Array) -> Array:
         """The model's state at the beginning; replayed rollouts have innovations after it."""
@@ -447,16 +454,6 @@ class FeedForwardLoop(ClosedLoop):
         parts = {"K": theta[:, :n_s], "b": theta[:, n_s:].T}
         return self.law.vector(parts).reshape(near.shape)
 
-    def moment(self, simulation: Simulation, weights: Array) -> Array:
-        """F, with a number that is 1 at a step and else 0 for each step."""
-        features, n_s, T = simulation.features, self.U.shape[1], self.horizon
-        found = np.zeros((n_s + T, n_s + T))
-        found[:n_s, :n_s] = super().moment(simulation, weights)[:n_s, :n_s]
-        found[:n_s, n_s:] = np.einsum("kfi,f->ik", features[:, :, :n_s], weights) / T
-        found[n_s:, :n_s] = found[:n_s, n_s:].T
-        found[n_s:, n_s:] = np.eye(T) / T
-        return found
-
 
 ROUND = 1e-2
 """Share of the identity in the cost matrix of a change of the memory, beyond that of the gains."""
@@ -477,10 +474,15 @@ class ObservedLoop(ClosedLoop):
     constant_feature: ClassVar[float] = 1.0
     """b and c are gains of their own, whatever the target is."""
 
+    @cached_property
+    def constants(self) -> int:
+        return len(np.atleast_2d(self.law.parts(self.law.theta_start)["b"]))
+
     def theta(self, policy: Array) -> Array:
-        """Theta (n_a + n_s, 2 n_s + 1) of the law's vector."""
+        """Theta (n_a + n_s, 2 n_s + constants) of the law's vector."""
         p = self.law.parts(np.ravel(policy))
-        return np.block([[p["D"], p["K"], p["b"][:, None]], [p["G"], p["F"], p["c"][:, None]]])
+        b, c = np.atleast_2d(p["b"]).T, np.atleast_2d(p["c"]).T
+        return np.block([[p["D"], p["K"], b], [p["G"], p["F"], c]])
 
     def policy(self, theta: Array, near: Array) -> Array:
         """The law's vector, of the shape of `near`."""
@@ -488,7 +490,7 @@ class ObservedLoop(ClosedLoop):
         (D, K, b), (G, F, c) = (
             np.split(rows, [n_s, 2 * n_s], axis=1) for rows in (theta[:n_a], theta[n_a:])
         )
-        parts = {"D": D, "K": K, "b": b[:, 0], "G": G, "F": F, "c": c[:, 0]}
+        parts = {"D": D, "K": K, "b": b.T, "G": G, "F": F, "c": c.T}
         others = self.law.parts(np.zeros(self.law.size))  # of a law that is derived from it
         return self.law.vector({**others, **parts}).reshape(near.shape)
 

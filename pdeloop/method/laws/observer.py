@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.base import Law, Parts, at_step
+from pdeloop.method.laws.feedforward import tracking_offsets
 
 
 class Observer(Law):
@@ -20,6 +21,9 @@ class Observer(Law):
         F = A (I - L),    G = A L,    K = K_a (I - L),    D = K_a L,    b = K_b s_r,    c = d,
 
     with K_b s_r and what the rows of the model have besides it (`ModelRows.constant`).
+
+    Where the target moves, b and c have a row for each step, b_k and c_k, and the b_k are those of
+    `feedforward`: an estimate takes the place of the state (separation), and the target is known ahead.
 
     Its memory is p_k. B is the model's, and a_k is what the plant gets, so that a saturated action
     misleads no prediction. A model without a filter gain has L = I, the filter for exact measurements:
@@ -37,35 +41,43 @@ class Observer(Law):
         return len(self.model.A)
 
     def start(self) -> Parts:
-        """K (n_a, n_s), D (n_a, n_s), b (n_a,), F (n_s, n_s), G (n_s, n_s) and c (n_s,)."""
+        """K (n_a, n_s), D (n_a, n_s), b (n_a,), F (n_s, n_s), G (n_s, n_s) and c (n_s,).
+
+        For a moving target b (T, n_a) and c (T, n_s).
+        """
         model, eye = self.model, np.eye(len(self.model.A))
         L = eye if model.L is None else model.L
+        b, c = model.constant, np.zeros(len(eye)) if model.d is None else model.d
+        if self.cost is not None and self.cost.target.ndim > 1:
+            b = tracking_offsets(model, self.cost, self.horizon)
+            c = np.tile(c, (self.horizon, 1))
         return {
             "K": model.K_a @ (eye - L),
             "D": model.K_a @ L,
-            "b": model.constant,
+            "b": b,
             "F": model.A @ (eye - L),
             "G": model.A @ L,
-            "c": np.zeros(len(eye)) if model.d is None else model.d,
+            "c": c,
         }
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         s = self.reduced(z)
-        a: Array = theta["K"] @ self._prediction(s, memory, k) + theta["D"] @ s + theta["b"]
-        return a
+        a: Array = theta["K"] @ self._prediction(s, memory, k) + theta["D"] @ s
+        return a + at_step(theta["b"], k)
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
         s = self.reduced(z)
-        p = theta["F"] @ self._prediction(s, memory, k) + theta["G"] @ s + theta["c"]
-        after: Array = p + self.model.B @ action
+        p = theta["F"] @ self._prediction(s, memory, k) + theta["G"] @ s
+        after: Array = p + at_step(theta["c"], k) + self.model.B @ action
         return after
 
     def pull_back(
         self, theta: Parts, z: Array, memory: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array]:
         s = self.reduced(z)
-        own = {"K": np.outer(y, self._prediction(s, memory, k)), "D": np.outer(y, s), "b": y}
-        none = {name: np.zeros_like(theta[name]) for name in ("F", "G", "c")}
+        own = {"K": np.outer(y, self._prediction(s, memory, k)), "D": np.outer(y, s)}
+        none = {name: np.zeros_like(theta[name]) for name in ("b", "F", "G", "c")}
+        at_step(none["b"], k)[:] = y
         by_z, by_memory = self._by_inputs(theta["K"].T @ y, theta["D"].T @ y, k)
         return {**own, **none}, by_z, by_memory
 
@@ -73,8 +85,9 @@ class Observer(Law):
         self, theta: Parts, z: Array, memory: Array, action: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array, Array]:
         s = self.reduced(z)
-        none = {name: np.zeros_like(theta[name]) for name in ("K", "D", "b")}
-        own = {"F": np.outer(y, self._prediction(s, memory, k)), "G": np.outer(y, s), "c": y}
+        none = {name: np.zeros_like(theta[name]) for name in ("K", "D", "b", "c")}
+        at_step(none["c"], k)[:] = y
+        own = {"F": np.outer(y, self._prediction(s, memory, k)), "G": np.outer(y, s)}
         by_z, by_memory = self._by_inputs(theta["F"].T @ y, theta["G"].T @ y, k)
         return {**none, **own}, by_z, by_memory, self.model.B.T @ y
 
