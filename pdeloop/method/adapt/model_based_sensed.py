@@ -41,7 +41,6 @@ from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
     NONE,
-    Verdict,
     choose,
     evidence_against_none,
     evidence_of_pairs,
@@ -186,8 +185,7 @@ class ModelBasedSensed(ModelBasedReadings):
             return super()._fields()
         loop = sensed_loop(self._context, self._sensed)
         found = [loop.smoothed(record) for record in self._data()]
-        most = SENSED_REPRODUCED
-        good = [field for field, error in found if error <= most]
+        good = [field for field, error in found if error <= SENSED_REPRODUCED]
         return np.stack(good or [field for field, _ in found])
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
@@ -303,12 +301,8 @@ class ModelBasedSensed(ModelBasedReadings):
             evidence = evidence_of_pairs(costs, base)
         measured = choose(evidence, base, self._settings.confidence)
         self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
-        self._report(row, measured)
-
-    @staticmethod
-    def _report(row: Row, verdict: Verdict) -> None:
-        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
-        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        row["chosen"], row["reason"] = measured.chosen, measured.reason
+        row["predicted_change"], row["deviation"] = measured.change, measured.deviation
 
 
 def _observers(

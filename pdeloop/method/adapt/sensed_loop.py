@@ -124,13 +124,8 @@ def can_be_sensed(context: Context) -> bool:
 
     And if the cost is that of q and r.
     """
-    sensors, most = context.sensors, SENSED_MOST
-    return (
-        context.cost is None
-        and context.periodic
-        and sensors == len(context.target)
-        and 0 < sensors <= most
-    )
+    alone = 0 < context.sensors == len(context.target) <= SENSED_MOST
+    return alone and context.periodic and context.cost is None
 
 
 def to_be_fitted(

@@ -110,9 +110,6 @@ class ExtendedKalman(Observer):
         }
         return self.vector(parts)
 
-    def memory_start(self) -> Array:
-        return np.zeros(self.memory_size)
-
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         p, _ = self._split(memory)
         a = super().action(theta, z, p, k)
