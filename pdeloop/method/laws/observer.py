@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.design.finite_horizon import tracking_offsets
 from pdeloop.method.laws.base import Law, Parts, at_step
-from pdeloop.method.laws.feedforward import tracking_offsets
 
 
 class Observer(Law):
