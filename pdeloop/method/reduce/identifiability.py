@@ -61,6 +61,8 @@ BY_CHANCE = 1e-4
 """Probability with which one test takes an input without effect for one that has some."""
 COARSER = 4
 """Rows of which the mean is taken, again and again, to see slow effects."""
+PAST = 8
+"""Rows whose inputs may have an effect on readings that do not show the whole state."""
 LEVELS = 10
 """Different values from which on an input counts as rounded; below it is switched."""
 
@@ -182,8 +184,9 @@ def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Ident
 def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> None:
     """NotIdentifiableError for inputs that changed the states by no more than chance does.
 
-    From one row to the next, and from one mean of 4, 16, ... rows to the next, where a slow effect in
-    noise shows. Inputs that cannot be told apart are left to others.
+    From one row to the next, from one mean of 4, 16, ... rows to the next, where a slow effect in noise
+    shows, and by the inputs of `PAST` rows, whose effect on few readings takes its time. Inputs that
+    cannot be told apart are left to others.
     """
     data, coarse = steps_of(trajectories), list(trajectories)
     y = data.inputs
@@ -194,6 +197,11 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
         while coarse and none:
             none -= _with_effect(steps_of(coarse), none)
             coarse = [_means(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
+        modes = linalg.svd(data.after, full_matrices=False)[2][:PAST].T
+        known = [_with_past(z @ modes, a) for z, a in trajectories if len(a) > 2 * PAST]
+        lags = [j + i * y.shape[1] for j in none for i in range(PAST)]
+        if none and known:
+            none -= {j % y.shape[1] for j in _with_effect(steps_of(known), lags)}
     if none:
         own = sorted(none)
         names = [channels.input(j) for j in own]
@@ -206,6 +214,12 @@ def _means(z: Array, a: Array) -> Trajectory:
     count, n, half = len(z) // COARSER, COARSER, COARSER // 2
     of_inputs = a[half : half + n * (count - 1)].reshape(count - 1, n, -1)
     return z[: n * count].reshape(count, n, -1).mean(axis=1), of_inputs.mean(axis=1)
+
+
+def _with_past(z: Array, a: Array) -> Trajectory:
+    """The last `PAST` states and inputs as those of each row."""
+    z, a = (np.hstack([x[PAST - 1 - i : len(x) - i] for i in range(PAST)]) for x in (z, a))
+    return z, a
 
 
 def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
