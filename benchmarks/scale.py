@@ -95,7 +95,7 @@ def _in_process(problem: Path, rollouts: int, out: Path) -> Row:
     message = (time.process_time() - began) / 20
     explored = known.explore(0)
     began = time.process_time()
-    pdeloop.identify(explored, n_s=ORDER)
+    pdeloop.identify(explored, n_s=ORDER, constant=None)
     fit = time.process_time() - began
     began = time.process_time()
     found = pdeloop.train(str(problem), rollouts=rollouts, evaluation_fields=1, out=out)

@@ -6,7 +6,7 @@
 >>> model = pdeloop.identify(burgers.explore(seed=0), n_s=8)
 >>> gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
 >>> plant = burgers.plant()
->>> episode = pdeloop.rollout(plant, pdeloop.projected_law(plant, model.U, gains.policy), [0, 1])
+>>> episode = pdeloop.rollout(plant, pdeloop.projected_law(plant, model.U, gains), [0, 1])
 >>> episode.states.shape
 (301, 2, 128)
 

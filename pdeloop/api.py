@@ -38,6 +38,7 @@ from pdeloop.method.laws.base import Law
 from pdeloop.method.laws.registry import OWN_LAWS
 from pdeloop.method.reduce.identifiability import IdentifiabilityWarning
 from pdeloop.method.reduce.reduced_model import ReducedModel
+from pdeloop.method.reduce.regression import has_offset
 from pdeloop.pairs import Transport
 from pdeloop.problem_values import problem_values
 from pdeloop.training_run import begin, carry_out, continuing
@@ -265,7 +266,7 @@ def identify(
     n_s: int,
     method: str = "regression",
     p: int = 0,
-    constant: bool | None = None,
+    constant: bool | None = True,
 ) -> ReducedModel:
     """A reduced linear model s_{k+1} = A s_k + B a_k + d, s = U^T z, from trajectories of one plant.
 
@@ -281,8 +282,9 @@ def identify(
     p
         Rank of dmdc; 0: n_s + n_a.
     constant
-        Whether "regression" has the constant term d, as for logs about an operating point in degrees or
-        per cent; None: where it predicts each held-out part better, as in a training.
+        Whether "regression" has the constant term d, unless that is rounding: the zero of degrees and
+        per cent is no rest of the plant. None: where it predicts each held-out part better, as in a
+        training. "dmdc" has none.
 
     Returns
     -------
@@ -312,8 +314,8 @@ def identify(
         raise ValueError("identify needs one trajectory or more, each a tuple (states, actions)")
     _check_count("n_s", n_s, 0)
     _check_count("p", p, 0)
-    if constant and method == "dmdc":
-        raise ValueError("constant is of the method 'regression'; leave it out for 'dmdc'")
+    if constant and method == "regression":
+        constant = has_offset(trajectories)
     model = identification.identify(trajectories, method=method, n_s=n_s, p=p, constant=constant)
     for remark in identification.examined(trajectories, model, method=method, p=p).remarks:
         warnings.warn(remark, IdentifiabilityWarning, stacklevel=2)

@@ -16,6 +16,7 @@ from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array, float_array
+from pdeloop.method.design.lqt import Gains
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
 
@@ -151,7 +152,7 @@ def mean_field_cost(plant: Plant, law: Law | None = None) -> float:
     return float(episode.costs.mean[0])
 
 
-def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
+def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike | Gains) -> Law:
     """The law a = K_a U^T z + K_b U^T z_r, saturated where the plant's actions are.
 
     Parameters
@@ -161,7 +162,8 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     U : (state_size, n_s)
         Basis of the reduced state, that of a reduced model.
     policy : (n_a, 2 n_s), or (M, n_a, 2 n_s)
-        [K_a K_b], one for all environments or one for each of M.
+        [K_a K_b], one for all environments or one for each of M; or the `Gains` of `pdeloop.track`,
+        whose constant part b is then in K_b U^T z_r.
 
     Returns
     -------
@@ -170,7 +172,7 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     Raises
     ------
     ValueError
-        Shapes that do not fit the plant, NaN or infinity.
+        Shapes that do not fit the plant, NaN or infinity, or a constant part with a target of 0.
 
     See Also
     --------
@@ -182,11 +184,13 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     >>> problem = pdeloop.problem("burgers")
     >>> plant, model = problem.plant(), pdeloop.identify(problem.explore(0), n_s=4)
     >>> gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
-    >>> law = pdeloop.projected_law(plant, model.U, gains.policy)
+    >>> law = pdeloop.projected_law(plant, model.U, gains)
     >>> pdeloop.rollout(plant, law, [0, 1, 2]).costs.mean.round(1)
     array([0.6, 0.7, 0.6])
     """
     basis = finite_basis(plant, U)
+    if isinstance(policy, Gains):
+        policy = policy.policy_for(basis.T @ plant.target)
     gains = float_array("policy", policy)
     gains = finite_array("policy", gains, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
     allowed, batch = plant.action_set, 0

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -90,14 +89,11 @@ def with_gains(model: object, plant: Plant, values: Mapping[str, Any]) -> bytes:
         cost=Cost.parse(settings.measured_cost),
     )
     s_r = ProjectedLaw([known.U], plant.target).reduced_targets[0]
-    rows = ModelRows(known.A, known.B, known.U, gains.K_a, gains.K_b, s_r)
-    if gains.b.any():
-        if not (size := float(s_r @ s_r)):
-            raise ParameterError(
-                "a drift d, or a target of the actions, needs a target that is not 0 in the law "
-                "a = K_a s + K_b s_r: take the state relative to another point"
-            )
-        rows = replace(rows, K_b=rows.K_b + np.outer(gains.b, s_r) / size)
+    try:
+        K_a, K_b = np.hsplit(gains.policy_for(s_r), 2)
+    except ValueError as error:
+        raise ParameterError(str(error)) from error
+    rows = ModelRows(known.A, known.B, known.U, K_a, K_b, s_r)
     arrays: dict[str, Any] = {"model": pack(rows)[np.newaxis], "d": known.d, **rows.arrays}
     content = BytesIO()
     np.savez(content, sample_time=np.array(values["sample_time"]), **arrays)

@@ -146,7 +146,7 @@ def dead_beat(known: BoundaryControlled, seed: int) -> Law:
     Of all inputs that end it, those of the first steps need the least sum of |a|.
     """
     explored = pdeloop.problem(plant=known, reduced_order=ORDER).explore(seed)
-    model = pdeloop.identify(explored, n_s=ORDER)
+    model = pdeloop.identify(explored, n_s=ORDER, constant=None)
     growth, left = unstable(model.A)
     K = -growth * (model.U @ left) / float((left @ model.B)[0])
     return lambda k, z: z @ K[:, None]

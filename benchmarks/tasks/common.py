@@ -31,7 +31,7 @@ def first_law(plant: Dynamics, seed: int, **how: Any) -> Law:
     """LQ tracking on the regression of one exploratory episode."""
     loop = DynamicsPlant(plant)
     explored = pdeloop.problem(plant=plant, **how).explore(seed)
-    model = pdeloop.identify(explored, n_s=how["reduced_order"])
+    model = pdeloop.identify(explored, n_s=how["reduced_order"], constant=None)
     weights = {name: getattr(loop, name) for name in ("state_weight", "action_weight")}
     gains = pdeloop.track(model, **weights, cost=loop.cost)
     return pdeloop.projected_law(loop, model.U, gains.policy)

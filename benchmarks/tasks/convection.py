@@ -75,7 +75,7 @@ def rows(budgets: list[int], seeds: int, cells: int = 50) -> Iterator[Row]:
         explored = _explored(convection, seed)
         for seen, found in ((every, whole), (places, probed)):
             data = [(states[:, seen] - rest[seen], actions) for states, actions in explored]
-            model = pdeloop.identify(*data, n_s=ORDER)
+            model = pdeloop.identify(*data, n_s=ORDER, constant=None)
             weights = {"state_weight": 1.0 / len(seen), "action_weight": convection.action_weight}
             K = pdeloop.track(model, **weights).K_a @ model.U.T
             held = _feedback(K, rest[seen], seen)

@@ -175,7 +175,9 @@ def copies(measured: Measured, staggered: bool = False) -> Iterator[Measured]:
 
 def identified(measured: Sequence[Measured], order: int) -> pdeloop.ReducedModel:
     """A linear model of the numbers of all fields."""
-    return pdeloop.identify(*((y.reshape(len(y), -1), a) for y, a in measured), n_s=order)
+    return pdeloop.identify(
+        *((y.reshape(len(y), -1), a) for y, a in measured), n_s=order, constant=None
+    )
 
 
 def linear(model: pdeloop.ReducedModel, effort: float, share: float = 1.0) -> Seen:

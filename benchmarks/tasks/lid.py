@@ -61,7 +61,7 @@ def _constant(action: Array, k: int, z: Array) -> Array:
 
 def _tracking(plant: DynamicsPlant, *trajectories: tuple[Array, Array]) -> Law:
     """LQ tracking with a reduced model of some trajectories."""
-    model = pdeloop.identify(*trajectories, n_s=ORDER)
+    model = pdeloop.identify(*trajectories, n_s=ORDER, constant=None)
     K, b = pdeloop.track_horizon(model.A, model.B, plant.cost, model.U)
     return lambda k, z: (z @ model.U) @ K[k].T + b[k]
 

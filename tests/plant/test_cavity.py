@@ -62,7 +62,7 @@ def test_one_random_episode_gives_the_law_that_no_actions_improve_by_a_thousandt
     plant = DynamicsPlant(cavity)
     explored = pdeloop.problem(plant=cavity, exploration_variance=1.0).explore(0)
     with pytest.warns(pdeloop.IdentifiabilityWarning, match="never moved"):
-        model = pdeloop.identify(explored, n_s=8)
+        model = pdeloop.identify(explored, n_s=8, constant=None)
     K, b = track_horizon(model.A, model.B, plant.cost, model.U)
     found = pdeloop.rollout(plant, lambda k, z: (z @ model.U) @ K[k].T + b[k], [0])
     rng = np.random.default_rng(0)
@@ -92,7 +92,7 @@ def test_a_training_from_one_initial_field_comes_to_the_law_that_looks_ahead() -
     problem = pdeloop.problem(plant=cavity, exploration_variance=1.0, reduced_order=8, law="affine")
     run = pdeloop.train(problem, rollouts=9, evaluation_fields=1)
     with pytest.warns(pdeloop.IdentifiabilityWarning):
-        model = pdeloop.identify(problem.explore(0), n_s=8)
+        model = pdeloop.identify(problem.explore(0), n_s=8, constant=None)
     K, b = track_horizon(model.A, model.B, plant.cost, model.U)
     best = pdeloop.rollout(plant, lambda k, z: (z @ model.U) @ K[k].T + b[k], [0]).costs.mean[0]
     assert run.costs["lqt"].mean() > 1.02 * best

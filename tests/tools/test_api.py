@@ -106,7 +106,9 @@ def test_its_parts_make_what_the_training_made(run, small) -> None:
     """Exploration, identification, design and rollouts one by one."""
     values = run.values
     method = {"method": values["identification"], "p": values["dmdc_rank"]}
-    model = pdeloop.identify(small.explore(seed=5), n_s=len(run.models[0].A), **method)
+    model = pdeloop.identify(
+        small.explore(seed=5), n_s=len(run.models[0].A), constant=None, **method
+    )
     for name in ("A", "B", "U"):
         assert same_bits(getattr(model, name), getattr(run.models[0], name))
     weights = {name: values[name] for name in ("state_weight", "action_weight")}

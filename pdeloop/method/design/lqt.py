@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
-from pdeloop.messages.arrays import Array
+from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.process.one_thread import one_thread
@@ -80,8 +80,35 @@ class Gains(NamedTuple):
 
     @property
     def policy(self) -> Array:
-        """[K_a K_b], shape (n_a, 2 n_s)."""
+        """[K_a K_b], shape (n_a, 2 n_s), without b; see `policy_for`."""
         return np.hstack([self.K_a, self.K_b])
+
+    def policy_for(self, s_r: ArrayLike) -> Array:
+        """[K_a K_b] of which K_b s_r has the constant part b as well.
+
+        Parameters
+        ----------
+        s_r : (n_s,)
+            The reduced target.
+
+        Returns
+        -------
+        (n_a, 2 n_s) array
+
+        Raises
+        ------
+        ValueError
+            s_r is 0, where K_b s_r has no constant part, and b is not.
+        """
+        if not self.b.any():
+            return self.policy
+        known = float_array("s_r", s_r)
+        if not known.any():
+            raise ValueError(
+                "a drift d, or a target of the actions, needs a target that is not 0 in the law "
+                "a = K_a s + K_b s_r: take the state relative to another point"
+            )
+        return np.hstack([self.K_a, self.K_b + target_gain(self.b, known)[0]])
 
 
 def track(
