@@ -233,6 +233,7 @@ def designed(
     *,
     or_no_control: bool = False,
     constant: bool | None = None,
+    innovations: InnovationModel | None = None,
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -253,6 +254,8 @@ def designed(
         Gains of 0 where there are no stabilising ones.
     constant : bool, optional
         Whether regression and subspace models have a constant term; None: as `needs_constant` says.
+    innovations : InnovationModel, optional
+        The model of "subspace", where it is known.
 
     Raises
     ------
@@ -275,6 +278,7 @@ def designed(
             shifted(further, delays) if further else (),
             or_no_control=or_no_control,
             constant=constant,
+            innovations=innovations,
         )
         if max(delays) <= 0:
             return inner
@@ -297,7 +301,7 @@ def designed(
         every = [*known, *more]
         if constant is None:
             constant = regression.needs_constant(every, target.size)
-        found_model = subspace_model(
+        found_model = innovations or subspace_model(
             every, order=settings.reduced_order, channels=channels, constant=constant
         )
         found_model = replace(found_model, B=found_model.B @ free.T)

@@ -6,7 +6,7 @@ Only states, actions and the target are used, so the plant may be any, this one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from io import BytesIO
@@ -38,7 +38,7 @@ from pdeloop.method.reduce.identifiability import (
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
 from pdeloop.method.reduce.order import OrderStudy, study_orders
 from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
-from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import Residuals, fit_percent, largest_pole, residuals, stability
 from pdeloop.process.one_thread import one_thread
 
@@ -54,6 +54,9 @@ UNLIKE = 1e3
 """Ratio of the variations of two states of which one has no say in the cost."""
 DEAD = 1e-12
 """Size of a pole, relative to the largest, that is one of a dead time."""
+BETTER = 0.97
+"""Product of the errors of single steps and of simulations, relative to that of another model, up to
+which a model is better."""
 Trajectories = Sequence[tuple[Array, Array]]
 Source = Mapping[str, int | str]
 """The name of the trajectory."""
@@ -68,7 +71,8 @@ class Identified:
     trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data;
     field: the report on the model of the whole field, for the identification "field"; input_delay: of
     each input, in steps; pole: |lambda| of the largest one, and its interval; innovations: of the
-    identification "subspace"; fits: FIT of each number of the state, by what was simulated.
+    identification "subspace"; fits: FIT of each number of the state, by what was simulated; refit: a
+    model of other data by the same method and of the same sizes.
     """
 
     model: ModelRows | ReducedModel
@@ -87,6 +91,7 @@ class Identified:
     residuals: Residuals | None = None
     innovations: InnovationModel | None = None
     fits: tuple[tuple[str, Array], ...] = ()
+    refit: Callable[[list[Trajectory]], InnovationModel] | None = None
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
@@ -212,9 +217,9 @@ class Identified:
     def orders(self) -> list[dict[str, float]]:
         """The orders that were tried, of the method that was used."""
         if self.innovations is not None:
-            names = "past", "order", "one_step_error"
-            tried = [dict(zip(names, row, strict=True)) for row in self.innovations.tried]
-            best = {row["order"]: row for row in sorted(tried, key=lambda row: -row[names[2]])}
+            names = "past", "order", "one_step_error", "rollout_error"
+            ranked = sorted(self.innovations.tried, key=lambda row: -float(np.prod(row[2:])))
+            best = {row[1]: dict(zip(names, row, strict=False)) for row in ranked}
             return [best[order] for order in sorted(best)]
         return [] if self.study is None else self.study.rows()
 
@@ -266,10 +271,13 @@ def _finite(value: float) -> float | None:
 
 def _table(rows: Sequence[Mapping[str, float]], order: int) -> list[str]:
     """Orders of models in innovation form, with their best past."""
-    lines = ["  order  past  one-step error"]
+    simulated = any("rollout_error" in row for row in rows)
+    lines = ["  order  past  one-step error" + "  rollout error" * simulated]
     for row in rows:
         mark = "  used" if row["order"] == order else ""
-        lines.append(f"  {row['order']:>5}  {row['past']:>4}  {row['one_step_error']:>14.3g}{mark}")
+        more = f"  {row['rollout_error']:>13.3g}" if simulated else ""
+        error = f"{row['one_step_error']:>14.3g}{more}"
+        lines.append(f"  {row['order']:>5}  {row['past']:>4}  {error}{mark}")
     return [*lines, "  errors on held-out steps, relative to a model in which nothing changes"]
 
 
@@ -313,18 +321,68 @@ def identify_data(
     if input_delay is not None or delays.alike or delays.at_end:
         better = delays.text(found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
-    return _identified(
-        found.trajectories,
-        found.target,
-        found.sources,
-        known,
-        given,
-        channels=found.channels,
-        remarks=found.remarks,
-        delays=used,
-        validation=validation,
-        constant=regression.has_offset(shifted(found.trajectories, used)),
+    seen = shifted(found.trajectories, used)
+    constant = regression.has_offset(seen)
+
+    def by(own: Mapping[str, Any]) -> Identified:
+        return _identified(
+            found.trajectories,
+            found.target,
+            found.sources,
+            known,
+            own,
+            channels=found.channels,
+            remarks=found.remarks,
+            delays=used,
+            validation=validation,
+            constant=constant,
+        )
+
+    first = by(given)
+    if first.innovations is not None or first.residuals is None or first.residuals.white:
+        return first
+    return _or_subspace(first, by, seen, given)
+
+
+def _or_subspace(
+    first: Identified,
+    by: Callable[..., Identified],
+    trajectories: Trajectories,
+    given: Mapping[str, Any],
+) -> Identified:
+    """A model in innovation form in place of one whose residuals are correlated, if it is better.
+
+    That is, in single steps and simulations of each held-out part of the data. Noise of measurements
+    draws the poles of a regression to 0, the more so the shorter the steps are, and with fewer readings
+    than states it has none of the plant's.
+    """
+    own = {name: value for name, value in given.items() if name != "dmdc_rank"}
+    try:
+        other = by({**own, "identification": "subspace"})
+        (*_, known), (*_, found) = errors = [
+            held_out_errors(one.refit, trajectories) for one in (first, other) if one.refit
+        ]
+    except ValueError:  # too few steps
+        return first
+    score, better = (np.prod(one, axis=1) for one in errors)
+    if not (better < score).all() or better[-1] > BETTER * score[-1]:
+        return first
+    field = first.field and first.field.rows and first.field.fitted
+    if field and field.own.simulated <= found[1] ** 2:
+        return first
+    told = (
+        f"its simulations of parts that were held out miss {100 * known[1]:.2g} % of the variation, "
+        f"those of a model in innovation form {100 * found[1]:.2g} %"
     )
+    if "identification" in given:
+        name = given["identification"]
+        text = f"the poles are hardly the plant's: {told}; leave out --identification {name}"
+        return replace(first, remarks=(*first.remarks, text))
+    text = (
+        f"the regression takes noise or missing states for dynamics: {told}, which is used "
+        "(--identification regression for the other one)"
+    )
+    return replace(other, remarks=(*other.remarks, text))
 
 
 def identify_bag(
@@ -445,6 +503,10 @@ def _identified(
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
     innovations: InnovationModel | None = None
+    if of_past and constant is not None:  # of a log
+        innovations = subspace_model(
+            trajectories, order=order or 0, channels=channels, constant=constant, simulations=True
+        )
     if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
         found = designed(
@@ -454,6 +516,7 @@ def _identified(
             channels,
             or_no_control=target is None,
             constant=constant,
+            innovations=innovations,
         )
         model, field, innovations = found.rows, found.field, found.innovations
     else:
@@ -468,6 +531,7 @@ def _identified(
         )
     late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
     aligned = shifted(logged, early) if delays else trajectories
+    refit = partial(_refitted, model, method, p, sum(late), innovations)
     return Identified(
         model,
         sources,
@@ -481,13 +545,14 @@ def _identified(
         remarks,
         field,
         delays,
-        largest_pole(model.A, seen, partial(_refitted, model, method, p, sum(late), innovations)),
+        largest_pole(model.A, seen, lambda parts: refit(parts).A),
         residuals(model, aligned),
         innovations,
         tuple(
             (name, fit_percent(model, shifted(own.trajectories, early)))
             for name, own in validation.items()
         ),
+        refit,
     )
 
 
@@ -506,18 +571,21 @@ def _refitted(
     memory: int,
     innovations: InnovationModel | None,
     trajectories: list[Trajectory],
-) -> Array:
-    """A of other data, by the same method and of the same sizes; memory: of the inputs' dead time."""
+) -> InnovationModel:
+    """That of other data, by the same method, of the same sizes; memory: of the inputs' dead time."""
     constant = model.d is not None and bool(model.d.any())
     if innovations is not None:
         order, past = len(innovations.A), innovations.past
-        return subspace_model(trajectories, order=order, past=past, constant=constant).A
+        return subspace_model(
+            trajectories, order=order, past=past, constant=constant, simulations=True
+        )
     U = model.U[:, : model.U.shape[1] - memory]
     with one_thread():
         data = steps_of(trajectories)
-        if method == "dmdc":
-            return _truncated(p, data, U).A
-        return regression.fit(data, U, constant).A
+        own = _truncated(p, data, U) if method == "dmdc" else regression.fit(data, U, constant)
+    # What is measured is the state.
+    unit = np.eye(len(own.A))
+    return InnovationModel(own.A, own.B, unit, own.A, U, unit, 1, d=own.d)
 
 
 def save(found: Identified, path: Path) -> None:

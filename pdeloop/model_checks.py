@@ -68,9 +68,14 @@ class Residuals:
     size: float = 0.0
     driven: bool = False
 
+    @property
+    def white(self) -> bool:
+        """Whether none were found to be correlated."""
+        return not (self.in_time or self.with_inputs)
+
     def summary(self) -> dict[str, Any]:
         """As data; `white` is None where nothing could be tested."""
-        white = not (self.in_time or self.with_inputs) if self.count else None
+        white = self.white if self.count else None
         return {"count": self.count, "white": white, "relative_size": self.size}
 
     def text(self, channels: Channels) -> str:

@@ -17,7 +17,9 @@ filter. The state is defined by the prediction of the future from the past:
 3. C, and A and B, by least squares on these states. G is the gain of the Kalman filter with the
    covariances of both residuals; its Riccati equation makes it stable.
 
-p and n are those of the least error in predicting held-out measurements one step ahead.
+p and n are those of the least error in predicting held-out measurements one step ahead. With noise and
+short steps that hardly depends on the poles, so for logs it is the geometric mean with the error of
+simulations, from the x_0 of least squares (`held_out_errors`).
 
 References
 ----------
@@ -30,7 +32,7 @@ methods: an overview", IET Control Theory & Applications 7(10), 2013.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -62,6 +64,10 @@ LONGER = (12, 16)
 Waves that hardly decay need many states, and a long past to tell them from noise."""
 ORDERS = (2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 """Orders that are tried where none is given."""
+PASTS_OF_LOGS, ORDERS_OF_LOGS = (1, 2, 4, 8, 16, 32, 48), (1, 2, 3, 4, 5, 6, 8, 12)
+"""Those that are tried with simulations."""
+WIDEST = 256
+"""Unknowns in a row of the vector ARX of more than 8 steps, at most."""
 MANY = 48
 """The order above which `LONGER` pasts are tried."""
 FOLDS = 4
@@ -90,7 +96,7 @@ class InnovationModel:
         where past and order were given.
     d : (n,) array or None
         The constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data.
-    tried : tuple of (p, n, error)
+    tried : tuple of (p, n, error) or (p, n, error, error of simulations)
         Those among which it was chosen.
     """
 
@@ -103,7 +109,7 @@ class InnovationModel:
     past: int
     error: float = np.nan
     d: Array | None = None
-    tried: tuple[tuple[int, int, float], ...] = ()
+    tried: tuple[tuple[float, ...], ...] = ()
 
 
 def subspace_model(
@@ -113,6 +119,7 @@ def subspace_model(
     past: int = 0,
     channels: Channels = NUMBERED,
     constant: bool = False,
+    simulations: bool = False,
 ) -> InnovationModel:
     """Identify a model in innovation form.
 
@@ -129,6 +136,8 @@ def subspace_model(
     constant : bool
         Identify the model about the means of measurements and inputs, from which its constant term
         follows: degrees and per cent of a machine at rest are then no mode that never decays.
+    simulations : bool
+        p and n have the least geometric mean of the errors of single steps and of simulations.
 
     Raises
     ------
@@ -147,14 +156,21 @@ def subspace_model(
         means = data.after.mean(axis=0), data.inputs.mean(axis=0)
         known = [(z - means[0], a - means[1]) for z, a in known]
     with one_thread():
-        few = 0 < order <= MANY
-        pasts = (past,) if past else PASTS if few else PASTS + LONGER
+        few, affine = 0 < order <= MANY, constant and simulations
+        pasts: Sequence[int] = (past,) if past else PASTS if few else PASTS + LONGER
+        if simulations and not past:
+            pasts = PASTS_OF_LOGS
         # The data may not determine as many states as were asked for.
-        asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)] or [ORDERS]
-        for asked in asked_for:
-            if tried := [(p, n) for p in pasts for n in asked if _determined(p, n, known)]:
+        asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)]
+        for asked in asked_for or [ORDERS_OF_LOGS if simulations else ORDERS]:
+            tried = [(p, n) for p in pasts for n in asked if _determined(p, n, known)]
+            if simulations:
+                tried = [(p, n) for p, n in tried if _narrow(p, n, known)]
+            if tried:
                 break
         else:
+            tried = [(past, order)] if past and order else []
+        if not tried:
             n_a = data.inputs.shape[1]
             raise NotIdentifiableError(
                 f"{len(data.inputs)} steps do not determine a model with {n_a} inputs in innovation "
@@ -162,12 +178,12 @@ def subspace_model(
                 "quarter is held out; take a longer horizon, or add a log"
             )
         if len(tried) == 1:
-            (p, n), errors = tried[0], [np.nan]
+            (p, n), errors = tried[0], np.full((1, 1), np.nan)
         else:
-            p, n, errors = _choose(tried, known)
-        error = errors[tried.index((p, n))]
-        found = _fitted(known, p, n, channels, error, constant=constant)
-        table = tuple((*sizes, own) for sizes, own in zip(tried, errors, strict=True))
+            p, n, errors = _choose(tried, known, simulations, affine)
+        error = float(errors[tried.index((p, n)), 0])
+        found = _fitted(known, p, n, channels, error, constant=constant, affine=affine)
+        table = tuple((*sizes, *own) for sizes, own in zip(tried, errors.tolist(), strict=True))
         found = replace(found, tried=table)
         if found.d is None:
             return found
@@ -188,41 +204,85 @@ def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
     return bool(n <= p * min(n, n_z) and n + n_a < samples)
 
 
+def _narrow(p: int, n: int, known: Sequence[Trajectory]) -> bool:
+    """True if the vector ARX has few unknowns in a row, beside the steps, or a short past."""
+    n_z, n_a = known[0][0].shape[1], known[0][1].shape[1]
+    steps = sum(len(a) for _, a in known)
+    return p <= max(PASTS) or p * (min(n, n_z) + n_a) <= min(WIDEST, steps // 4)
+
+
 def _choose(
-    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory]
-) -> tuple[int, int, list[float]]:
-    """p and n with the least error on parts that were held out, and the errors of all."""
-    parts = _parts(known)
-    totals, changes = np.zeros(len(tried)), np.zeros(len(tried))
-    for others, own in turns(parts, FOLDS):
+    tried: Sequence[tuple[int, int]],
+    known: Sequence[Trajectory],
+    simulations: bool,
+    affine: bool,
+) -> tuple[int, int, Array]:
+    """p and n with the least error on parts that were held out, and the errors of all, (K, 1 or 2)."""
+    parts, units = _parts(known), units_of(known)
+    # Of each fold: squared errors, and what they are relative to.
+    sums = np.zeros((2, min(len(parts), FOLDS), len(tried), 1 + simulations))
+    for fold, (others, own) in enumerate(turns(parts, FOLDS)):
         made, predictor = (0, 0), None
         for i, (p, n) in enumerate(tried):
-            if not np.isfinite(totals[i]):
+            if not np.isfinite(sums[0, :, i]).all():
                 continue
             # More states than there are readings have one predictor in common, one after the other.
             size = p, min(n, parts[0][0].shape[1])
             try:
                 if size != made or predictor is None:
-                    made, predictor = size, _predictor(others, *size, NUMBERED)
-                model = _fitted(others, p, n, NUMBERED, np.nan, check=False, predictor=predictor)
+                    made, predictor = size, _predictor(others, *size, NUMBERED, affine)
+                model = _fitted(
+                    others,
+                    p,
+                    n,
+                    NUMBERED,
+                    np.nan,
+                    check=False,
+                    constant=affine,
+                    predictor=predictor,
+                )
             except (linalg.LinAlgError, ValueError):
-                totals[i] = np.inf
+                sums[0, fold, i] = np.inf
                 continue
             for z, a in own:
-                wrong, moved = _missed(model, z, a)
-                totals[i], changes[i] = totals[i] + wrong, changes[i] + moved
-    ratios = np.divide(totals, changes, out=np.full(len(tried), np.inf), where=changes > 0.0)
-    errors = np.sqrt(ratios)
-    if not np.isfinite(errors).any():
-        return (*tried[0], [np.nan] * len(tried))
-    good = [i for i in range(len(tried)) if errors[i] <= _SUBSPACE_TOLERANCE * errors.min()]
-    least = min(tried[i][1] for i in good)
-    best = min((i for i in good if tried[i][1] == least), key=lambda i: float(errors[i]))
-    return (*tried[best], errors.tolist())
+                sums[:, fold, i, 0] += _missed(model, z, a)
+                if simulations:
+                    sums[:, fold, i, 1] += free_errors(model, z, a, units)[:, 1]
+    totals, changes = sums.sum(axis=1)
+    errors = _relative(totals, changes)
+    if not np.isfinite(errors[:, 0]).any():
+        return (*tried[0], np.full(errors.shape, np.nan))
+
+    def least(score: Array, tolerance: float) -> int:
+        good = [i for i in range(len(tried)) if score[i] <= tolerance * score.min()]
+        lowest = min(tried[i][1] for i in good)
+        return min((i for i in good if tried[i][1] == lowest), key=lambda i: float(score[i]))
+
+    best = least(errors[:, 0], _SUBSPACE_TOLERANCE)
+    if simulations:
+        score = np.prod(errors, axis=1)
+        other = least(score, _SUBSPACE_TOLERANCE**2)
+        each = np.prod(_relative(*sums), axis=2)
+        best = other if (each[:, other] < each[:, best]).all() else best
+    return (*tried[best], errors)
+
+
+def _relative(wrong: Array, moved: Array) -> Array:
+    """The root of squared errors relative to others, infinite where these are 0."""
+    ratios = np.divide(wrong, moved, out=np.full(wrong.shape, np.inf), where=moved > 0.0)
+    found: Array = np.sqrt(ratios)
+    return found
 
 
 def likeliest_start(
-    A: Array, B: Array, C: Array, G: Array, innovations: Array, v: Array, actions: Array
+    A: Array,
+    B: Array,
+    C: Array,
+    G: Array,
+    innovations: Array,
+    v: Array,
+    actions: Array,
+    d: Array | float = 0.0,
 ) -> Array:
     """The likeliest x_0 ~ N(0, I), as states are scaled, of measurements v_k = U^T z_k (m, r)."""
     L = linalg.cholesky(innovations, lower=True)
@@ -231,7 +291,7 @@ def likeliest_start(
     for measured, a in zip(v, actions, strict=False):
         rows.append(linalg.solve_triangular(L, C @ moved, lower=True))
         wanted.append(linalg.solve_triangular(L, measured - C @ x, lower=True))
-        x = A @ x + B @ a + G @ (measured - C @ x)
+        x = A @ x + B @ a + G @ (measured - C @ x) + d
         moved = A @ moved - G @ (C @ moved)
     found: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
     return found
@@ -257,18 +317,75 @@ def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     begin = min(max(PASTS), len(a) // 2)
     y = z @ model.U
     outside = z - y @ model.U.T
+    d = 0.0 if model.d is None else model.d
     x = likeliest_start(
-        model.A, model.B, model.C, model.G, model.innovations, y[: max(begin, 1)], a
+        model.A, model.B, model.C, model.G, model.innovations, y[: max(begin, 1)], a, d
     )
     wrong = moved = 0.0
     for k in range(len(a)):
-        x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x)
+        x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x) + d
         if k >= begin:
             e = y[k + 1] - model.C @ x
             wrong += float(e @ e) + float(outside[k + 1] @ outside[k + 1])
             change = z[k + 1] - z[k]
             moved += float(change @ change)
     return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
+
+
+def units_of(trajectories: Sequence[Trajectory]) -> Array:
+    """The standard deviation of each number of the measurements, 1 of those that never change."""
+    spread = np.concatenate([z for z, _ in trajectories]).std(axis=0)
+    return np.where(spread > 0.0, spread, 1.0)
+
+
+def free_errors(model: InnovationModel, z: Array, a: Array, units: Array) -> Array:
+    """Squares of the errors of single steps and of a simulation, and of the changes and variation.
+
+    (2, 2), each number of z in units of its own. Errors begin with the x_0 of least squares, and are
+    divided by the share of the numbers that it leaves free.
+    """
+    d = np.zeros(len(model.A)) if model.d is None else model.d
+    v, C, inputs = z @ model.U, model.U @ model.C / units[:, None], a @ model.B.T + d
+    seen = z / units
+    wrong = [
+        _from_any_start(A, C, own, seen)
+        for A, own in (
+            (model.A - model.G @ model.C, inputs + v[:-1] @ model.G.T),
+            (model.A, inputs),
+        )
+    ]
+    about = seen - seen.mean(axis=0)
+    return np.array([wrong, [np.sum(np.diff(seen, axis=0) ** 2), np.sum(about**2)]])
+
+
+def held_out_errors(
+    fit: Callable[[list[Trajectory]], InnovationModel], trajectories: Sequence[Trajectory]
+) -> Array:
+    """Relative errors of steps and of simulations of each held-out fold, and of all, (F + 1, 2)."""
+    units, sums = units_of(trajectories), list[Array]()
+    for others, own in turns(_parts(trajectories), FOLDS):
+        model = fit(others)
+        sums.append(np.sum([free_errors(model, z, a, units) for z, a in own], axis=0))
+    wrong, moved = np.moveaxis(np.array([*sums, np.sum(sums, axis=0)]), 1, 0)
+    return _relative(wrong, moved)
+
+
+def _from_any_start(A: Array, C: Array, inputs: Array, y: Array) -> float:
+    """The least sum |y_k - C x_k|^2 over x_0, of x_{k+1} = A x_k + inputs_k."""
+    n, size = len(A), y.size
+    x = np.empty((len(y), n, n + 1))
+    x[0] = np.eye(n, n + 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k, own in enumerate(inputs):
+            x[k + 1] = A @ x[k]
+            x[k + 1, :, n] += own
+        seen = C @ x
+        left = (y - seen[:, :, n]).ravel()
+    moved = seen[:, :, :n].reshape(size, n)
+    if size <= n or not (np.isfinite(moved).all() and np.isfinite(left).all()):
+        return np.inf
+    left -= moved @ linalg.lstsq(moved, left)[0]
+    return float(left @ left) * size / (size - n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,8 +413,13 @@ class _Predictor:
         return found
 
 
-def _predictor(known: Sequence[Trajectory], p: int, r: int, channels: Channels) -> _Predictor:
-    """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread."""
+def _predictor(
+    known: Sequence[Trajectory], p: int, r: int, channels: Channels, affine: bool
+) -> _Predictor:
+    """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread.
+
+    affine: with a constant term, without which that is a state with a pole near 1.
+    """
     after = np.concatenate([z[1:] for z, _ in known])
     values = linalg.svdvals(after)
     floor = max(after.shape) * np.finfo(np.float64).eps * values[0]
@@ -317,7 +439,10 @@ def _predictor(known: Sequence[Trajectory], p: int, r: int, channels: Channels) 
     past, y = np.concatenate(regressors), np.concatenate(targets)
     unit = np.sqrt(np.mean(past**2, axis=0))
     unit[unit == 0.0] = 1.0
-    markov = _ridge(past / unit, y).T / unit
+    about = y
+    if affine:
+        past, about = past - past.mean(axis=0), y - y.mean(axis=0)
+    markov = _ridge(past / unit, about).T / unit
     last = np.zeros(len(past), dtype=bool)
     last[np.cumsum([len(rows) for rows in regressors]) - 1] = True
     return _Predictor(U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
@@ -332,14 +457,15 @@ def _fitted(
     *,
     check: bool = True,
     constant: bool = False,
+    affine: bool = False,
     predictor: _Predictor | None = None,
 ) -> InnovationModel:
     """The model of given sizes. Call it with one LAPACK thread.
 
-    predictor: that of these trajectories, p and r, if it is known.
+    predictor: that of these trajectories, p and r, if it is known; affine: as for `_predictor`.
     """
     if predictor is None:
-        predictor = _predictor(known, p, n, channels)
+        predictor = _predictor(known, p, n, channels, affine)
     y, last = predictor.y, predictor.last
     if len(y) <= n:
         raise ValueError(f"{len(y)} samples do not determine {n} states")
