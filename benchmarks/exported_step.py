@@ -64,7 +64,7 @@ def timed(problem: str, neurons: int) -> dict[str, Any]:
     rows = ModelRows(np.eye(n_s), np.ones((n_s, n_a)), U, K[0], K[1], s_r)
     law = Neural(rows, plant.horizon)
     shapes = (neurons, n_s), (neurons,), (n_a, neurons), (n_a,)
-    theta = law.theta_of(np.hstack(list(K)), Layers(*map(rng.standard_normal, shapes)))
+    theta = law.theta_of(np.hstack(list(K)), K[0], Layers(*map(rng.standard_normal, shapes)))
     allowed = ActionSet(n_a, -1.0, 1.0)
     source = Parameters("neural", theta, law.model, law, allowed, plant.sample_time, problem).c()
     z, a = rng.standard_normal(n_z), np.zeros(n_a)

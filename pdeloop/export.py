@@ -19,6 +19,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws import Law
+from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.neural import Neural
@@ -32,6 +33,8 @@ _KEPT = """    double before[PDELOOP_N_A];
     for (int k = 0; k < PDELOOP_N_A; ++k)
         before[k] = a[k];
 """
+_STEP = """
+ *     k: the step of the episode, from 0 on; beyond the last one, as at that"""
 _TEMPLATES = Path(__file__).parent / "commands" / "template"
 
 
@@ -78,11 +81,18 @@ class Parameters:
             K, b = _rows(own["K"]), _rows(own["b"])
             return _filled("feedforward", self, self.model, K=K, b=b, steps=str(len(own["b"])))
         if isinstance(law, Neural):
-            known = {**law.matrices(theta)}
-            c, w = (_numbers(known.pop(name)) for name in ("c", "w"))
-            rows = {name: _rows(matrix) for name, matrix in known.items()}
-            n_h = str(len(known["W"]))
-            return _filled("neural", self, self.model, **rows, c=c, w=w, n_h=n_h)
+            known = law.matrices(theta)
+            many, n_h = len(np.atleast_2d(known["c"])) > 1, str(len(known["W"]))
+            rows = {name: _rows(np.atleast_2d(own)) for name, own in known.items()}
+            row = "k < 0 ? 0 : k < PDELOOP_STEPS ? k : PDELOOP_STEPS - 1" if many else "0"
+            of_steps = {
+                "steps": str(len(np.atleast_2d(known["c"]))),
+                "step": "int k, " if many else "",
+                "call": "k, " if many else "",
+                "row": row,
+                "told": _STEP if many else "",
+            }
+            return _filled("neural", self, self.model, **rows, **of_steps, n_h=n_h)
         if other or type(law) not in (Observer, ExtendedKalman):
             raise ParameterError(
                 f"the law '{self.kind}' cannot be written in C; write its parameters as .npz{other}"
@@ -134,9 +144,13 @@ def law_of(
     model, law, limit = run.models[m], _loaded(run, m), ActionSet.of(run.values)
     step = float(run.values["sample_time"])
     name = f"the {which} law of {run.values['problem']}, seed {run.seeds[m]}"
-    if law is None or not law.has_gains(policy.ravel()):
-        return Parameters(str(run.values["law"]), policy.ravel(), model, law, limit, step, name)
-    gains, n_s = law.gains(policy.ravel()), model.U.shape[1]
+    kind, theta = str(run.values["law"]), policy.ravel()
+    if isinstance(law, Extended):
+        law, theta = law.that_acts(theta)
+        kind = kind if law.extends else law.name
+    if law is None or not law.has_gains(theta):
+        return Parameters(kind, theta, model, law, limit, step, name)
+    gains, n_s = law.gains(theta), model.U.shape[1]
     own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())
     return GainLaw(own, limit, step, name)
 

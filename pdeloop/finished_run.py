@@ -104,7 +104,8 @@ class FinishedRun:
     def affine(self) -> bool:
         """True if the laws are affine, or plan nowhere, so that `policies` are gains row after row."""
         kind = OWN_LAWS.shipped.get(self.values["law"], Law)
-        return kind is Affine or (kind.extends and self.policies.shape == self.warm.shape)
+        same = kind.extends and self.policies.shape == self.warm.shape
+        return kind is Affine or (same and self.warm[0].size == self.models[0].policy.size)
 
     def index(self, seed: int | None = None) -> int:
         """The index of a training seed in the arrays.

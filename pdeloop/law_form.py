@@ -21,7 +21,9 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.spec import ParameterError
+from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 
@@ -83,6 +85,8 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
     """The matrices of a law; ParameterError for one that has none, or a seed that there is not."""
     theta, m = run.theta(which, seed).ravel(), run.index(seed)
     law, model = run.laws[m], run.models[m]
+    if isinstance(law, Extended):
+        law, theta = law.that_acts(theta)
     if law.has_gains(theta):
         projected = ProjectedLaw([model.U], run._target(model))
         gains, n_s = law.gains(theta), model.U.shape[1]
@@ -97,15 +101,16 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
         kind, arrays = "observer", {"U": model.U, "B": model.B, **own}
         B, K, D = model.B, own["K"], own["D"]
         loop = np.block([[model.A + B @ D, B @ K], [own["G"] + B @ D, own["F"] + B @ K]])
-    elif isinstance(law, Neural):
+    elif isinstance(law, Neural) and not law.depends_on_step:
         own = law.matrices(theta)
         kind, arrays = "neural", {"U": model.U, **own}
         slope = own["D"] * (1.0 - np.tanh(own["W"] @ model.s_r + own["w"]) ** 2) @ own["W"]
         loop = model.A + model.B @ (own["K"] + slope)  # at the target
     else:
+        steps = ", as it depends on the step" if isinstance(law, Neural | FeedForward) else ""
         raise ParameterError(
-            f"the law '{law.name}' has no such form; train with --law affine or observer, or write its "
-            "parameters as .npz"
+            f"the law '{law.name}' has no such form{steps}; train with --law affine or observer, or "
+            "write its parameters as .npz"
         )
     return LawForm(
         kind,

@@ -22,11 +22,13 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
 from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
 from pdeloop.method.laws import Affine, Law
+from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models.settings import SENSED_MOST
+from pdeloop.method.reduce.snapshots import LARGE
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
@@ -131,6 +133,11 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
         raise ParameterError(
             f"the parameters of the law '{law.name}' come from a model of the plant, which the "
             f"optimizer '{values['optimizer']}' does not support; choose model_based, or another law"
+        )
+    if issubclass(law, Extended) and not few_sensors(values) and values["n_z"] > LARGE:
+        raise ParameterError(
+            f"the law '{law.name}' needs a model of the whole state, of at most {LARGE:,} numbers, but "
+            f"the plant has {values['n_z']:,}; give --law affine"
         )
     if issubclass(law, Neural) and few_sensors(values):
         raise ParameterError(

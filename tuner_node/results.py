@@ -11,7 +11,8 @@ import scipy  # whose special functions, a tenth of a start, load when they are 
 from numpy.typing import NDArray
 
 from pdeloop.messages.topics import COMPLETED
-from pdeloop.method.laws import Affine, Neural, Predictive
+from pdeloop.method.laws import Affine
+from pdeloop.method.laws.extended import Extended
 from tuner_node.batch import stacked
 from tuner_node.budget import PURPOSES
 from tuner_node.readings import found_noise, seeming_noise
@@ -132,13 +133,13 @@ def acting(training: Training) -> list[dict[str, Any]]:
 
     Of laws that may plan or have a network; else none.
     """
-    if not issubclass(training.settings.law, Neural | Predictive) or training.models is None:
+    if not issubclass(training.settings.law, Extended) or training.models is None:
         return []
     found = []
     for law, policy, known in zip(
         training.laws(), training.policies(), training.explorations, strict=True
     ):
-        assert isinstance(law, Neural | Predictive) and known is not None
+        assert isinstance(law, Extended) and known is not None
         first, others = law.step_times(policy, known.states[0])
         name = law.acting(policy)
         found.append({"law": name, "first_step": first, "step": others})

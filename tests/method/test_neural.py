@@ -19,10 +19,10 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import RolloutResult, Trajectory
 from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
-from pdeloop.method.adapt.network import Network, NetworkTraining, rolled_out
-from pdeloop.method.laws import Affine, Neural
+from pdeloop.method.adapt.network import Network, NetworkTraining
+from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
-from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.plans import Planner, simulated
 from pdeloop.method.laws.registry import action
 from pdeloop.model_files import matlab, onnx
 from tests.method.test_plans import N_A, N_Z, T, spectral
@@ -47,9 +47,9 @@ RNG = np.random.default_rng(3)
 
 def with_network(law: Neural, scale: float = 0.3) -> np.ndarray:
     rng, n_a, n_s = np.random.default_rng(5), law.n_a, len(law.model.s_r)
-    shapes = (H, n_s), (H,), (n_a, H), (n_a,)
+    shapes = (H, n_s + n_a * law.depends_on_step), (H,), (n_a, H), (n_a,)
     layers = Layers(*(scale * rng.standard_normal(shape) for shape in shapes))
-    return law.theta_of(law.theta_start, layers)
+    return law.theta_of(law.theta_start, law.model.K_a, layers)
 
 
 def test_without_a_network_it_is_the_affine_law() -> None:
@@ -70,6 +70,36 @@ def test_zeros_at_the_end_of_theta_mean_nothing() -> None:
     expected = s @ m["K"].T + m["c"] + np.tanh(s @ m["W"].T + m["w"]) @ m["D"].T
     np.testing.assert_allclose(acted, expected, rtol=1e-12)
     assert not np.allclose(acted, actions_of(own, own.theta_start))
+
+
+def moving(law: type[Law] = Neural) -> Law:
+    """Of a target that moves."""
+    made = law(ROWS, T)
+    waves = np.sin(np.arange(T)[:, None] / 5.0 + np.arange(N_Z))
+    made.cost = Cost(N_Z, N_A, T, action_weight=0.5, target=waves)
+    return made
+
+
+def test_where_the_target_moves_the_network_knows_what_each_step_asks_for() -> None:
+    own, plain = moving(), moving(FeedForward)
+    assert isinstance(own, Neural) and np.array_equal(own.theta_start, plain.theta_start)
+    steps = range(len(STATES))
+    parts = plain.parts(plain.theta_start)
+    expected = [plain.action(parts, z, np.zeros(0), k) for k, z in enumerate(STATES)]
+    assert np.array_equal(actions_of(own, own.theta_start), expected)
+    whole = with_network(own)
+    m, acted = own.matrices(whole), actions_of(own, whole)
+    assert m["w"].shape == (T, H) and np.ptp(m["w"], axis=0).min() > 0.0
+    hidden = np.tanh(STATES @ U @ m["W"].T + m["w"][steps])
+    np.testing.assert_allclose(acted, STATES @ U @ m["K"].T + m["c"][steps] + hidden @ m["D"].T)
+    y, k, parts = RNG.standard_normal(N_A), 4, own.parts(whole)
+    by_theta, by_z, _ = own.pull_back(parts, STATES[0], np.zeros(0), k, y)
+    d, e = 1e-6 * RNG.standard_normal(len(whole)), 1e-6 * RNG.standard_normal(N_Z)
+    d[own.without.size] = 0.0  # the number of neurons
+    up, down = (
+        own.action(own.parts(whole + s * d), STATES[0] + s * e, np.zeros(0), k) for s in (1, -1)
+    )
+    assert y @ (up - down) / 2.0 == pytest.approx(own.vector(by_theta) @ d + by_z @ e, rel=1e-6)
 
 
 def test_numbers_that_are_no_network_are_refused() -> None:
@@ -98,16 +128,23 @@ def test_its_derivatives_agree_with_finite_differences() -> None:
         assert (up - down) / 2e-5 == pytest.approx((found.of_fields * e).sum(), rel=1e-6)
 
 
-def training(allowed: ActionSet) -> tuple[NetworkTraining, Network, Planner, np.ndarray]:
-    K, b = np.ascontiguousarray(ROWS.K_a @ U.T), ROWS.K_b @ ROWS.s_r
-    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=np.full(N_Z, 0.3))
-    planner = Planner(spectral(), cost, allowed, K, b, around=True, steps=6, terminal=True)
+QUICK = {"iterations": 1, "first": 5, "starts": 1}
+
+
+def training(
+    allowed: ActionSet, law: Neural, noise: float = 0.0
+) -> tuple[NetworkTraining, Network, np.ndarray]:
+    K, b = law.feedback(law.parts(law.theta_start))
+    cost = law.cost or Cost(N_Z, N_A, T, action_weight=0.5, target=np.full(N_Z, 0.3))
+    planner = Planner(
+        spectral(), cost, allowed, K @ U.T, b, around=True, steps=6, terminal=True, **QUICK
+    )
     fields = np.stack([start(seed) for seed in range(6)])
-    states = rolled_out(planner, lambda z: z @ K.T + b, fields)[1].reshape(-1, N_Z)
+    states = simulated(planner, fields, plans.planned(planner))[1].reshape(-1, N_Z)
     curvature = np.array([[2.0, 0.3], [0.3, 1.0]])
-    network = Network.of(U, ROWS.K_a, b, states, curvature, 3.0, H)
-    made = NetworkTraining(network, planner, fields, [1, 2], 1, periodic=True)
-    return made, network, planner, fields
+    network = Network.of(U, K, b, states, curvature, 3.0, H)
+    made = NetworkTraining(network, planner, fields, [1, 2], 1, periodic=True, noise=noise)
+    return made, network, fields
 
 
 @pytest.mark.parametrize(
@@ -115,11 +152,11 @@ def training(allowed: ActionSet) -> tuple[NetworkTraining, Network, Planner, np.
     [ANY_ACTION, ActionSet(N_A, -0.05, 0.04), ActionSet(N_A, -0.5, 0.5, rate=[0.02, np.inf])],
     ids=["free", "bounded", "rated"],
 )
-@pytest.mark.parametrize("k", [0, 3])
+@pytest.mark.parametrize(("k", "law"), [(0, Neural(ROWS, T)), (3, moving())])
 def test_the_gradient_through_the_model_agrees_with_finite_differences(
-    allowed: ActionSet, k: int
+    allowed: ActionSet, k: int, law: Neural
 ) -> None:
-    made, network, _, fields = training(allowed)
+    made, network, fields = training(allowed, law)
     made._part = T - k
     first = network.first(RNG)
     numbers = first + 0.02 * RNG.standard_normal(len(first))
@@ -130,18 +167,31 @@ def test_the_gradient_through_the_model_agrees_with_finite_differences(
         assert (up - down) / 2e-6 == pytest.approx(found @ d, rel=1e-5, abs=1e-7)
 
 
-def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_theta() -> None:
-    made, network, planner, _ = training(ANY_ACTION)
+@pytest.mark.parametrize("own", [Neural(ROWS, T), moving()], ids=["fixed", "moving"])
+def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_theta(
+    own: Neural, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, number in (("IMITATIONS", 300), ("LABELLED", 6), ("VISITED", 16), ("HELD_OUT", 8)):
+        monkeypatch.setattr(f"pdeloop.method.adapt.network.{name}", number)
+    made, network, _ = training(ANY_ACTION, own)
     first = network.first(RNG)
     numbers, others = made.trained(50), np.stack([start(seed) for seed in range(20, 40)])
-    before, after = (
-        rolled_out(planner, network.acts(own), others)[0].mean() for own in (first, numbers)
-    )
+    before, after = (made.costs(each, others).mean() for each in (first, numbers))
     assert after < 0.97 * before
-    K, layers = network.folded(numbers)
-    own = Neural(ROWS, T)
-    theta = own.theta_of(np.hstack([K, ROWS.K_b]), layers)
-    np.testing.assert_allclose(actions_of(own, theta), network.acts(numbers)(STATES), atol=1e-10)
+    theta = own.theta_of(own.theta_start, *network.folded(numbers))
+    expected = network.forward(network.parts(numbers), STATES, np.arange(len(STATES)))[0]
+    np.testing.assert_allclose(actions_of(own, theta), expected, atol=1e-10)
+
+
+def test_a_network_sees_the_declared_noise_and_plans_that_it_imitates_do_not() -> None:
+    made, network, fields = training(ANY_ACTION, Neural(ROWS, T), noise=0.1)
+    numbers, none = network.first(RNG), np.zeros((len(fields), N_A))
+    seen = fields + 0.1 * np.random.default_rng(0).standard_normal(fields.shape)
+    expected = network.forward(network.parts(numbers), seen, 0)[0]
+    assert np.array_equal(made.acts(numbers)(fields, none, 0), expected)
+    z, steps, labels = made._labelled(None)
+    first = z[steps == 0]
+    assert np.array_equal(labels[steps == 0], made._planner.step(none, first, 0)[0])
 
 
 def optimizer() -> ModelBasedNeural:
@@ -230,5 +280,7 @@ def actions_in_loop(
 def test_what_it_does_not_support_is_refused_in_a_sentence() -> None:
     with pytest.raises(ParameterError, match="acts on the whole state, but 8 sensors"):
         pdeloop.train("burgers", law="neural", sensors=8)
+    with pytest.raises(ParameterError, match="at most 2,048 numbers, but the plant has 2,100"):
+        pdeloop.train("burgers", law="neural", n_z=2100)
     with pytest.raises(ParameterError, match="choose model_based, or another law"):
         pdeloop.train("burgers", law="neural", optimizer="two_point")

@@ -119,14 +119,36 @@ def test_of_a_linear_plant_it_is_the_regulator_of_the_riccati_equation(around: b
     assert not fell.any()
 
 
+@pytest.mark.parametrize("around", [True, False], ids=["around", "bare"])
+def test_plans_deviate_from_a_law_with_an_offset_for_each_step(around: bool) -> None:
+    """Or are compared with it; beyond its last row that stays."""
+    model, rng, k = linear(n_z=4), np.random.default_rng(3), T - 5
+    rows = rng.standard_normal((T, N_A))
+    own = planner(model, b=rows, around=around, steps=8, terminal=False)
+    z = rng.standard_normal((2, 4))
+    expected, states = np.zeros(2), z
+    for i in range(k, k + 5):
+        a = states @ own.K.T + rows[i]
+        own.cost.add(expected, states, a, i)
+        states = model.step(states, a)
+    own.cost.add_terminal(expected, states)
+    plan = own._affine_plan(z, k, 5)
+    assert plan.any() != around
+    np.testing.assert_allclose(own.costs(plan, z, k), expected, rtol=1e-12)
+    found = own.gradient(plan, z, k)[1]
+    d = rng.standard_normal(plan.shape)
+    rise = own.costs(plan + 1e-5 * d, z, k) - own.costs(plan - 1e-5 * d, z, k)
+    np.testing.assert_allclose((found * d).sum(axis=(1, 2)), rise / 2e-5, rtol=1e-5)
+
+
 def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others() -> None:
     cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
     own = planner(spectral(), cost, regulated=True, first=0, starts=1)
     affine = replace(own, regulated=False)
     z = np.random.default_rng(8).standard_normal((2, N_Z))
     none = np.zeros((2, 12, N_A))
-    plan = own._affine_plan(z, 12)
-    assert plan.any() and not affine._affine_plan(z, 12).any()
+    plan = own._affine_plan(z, 0, 12)
+    assert plan.any() and not affine._affine_plan(z, 0, 12).any()
     np.testing.assert_allclose(own.costs(plan, z, 0), affine.costs(none, z, 0), rtol=1e-9)
     target = np.full((1, N_Z), 0.3)
     model, a_r = own.model, np.zeros(N_A)

@@ -24,7 +24,6 @@ from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictive,
     around,
-    simulated,
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Law, Predictive
@@ -120,7 +119,7 @@ def test_what_theta_holds_is_the_planner_and_zeros_at_its_end_mean_nothing(
 ) -> None:
     own = law(cost)
     whole = theta(own)
-    assert own.plans(whole) and not own.plans(own.theta_start)
+    assert own.is_extended(whole) and not own.plans(own.theta_start)
     found = own.planner(own.parts(whole))
     z, v = STATES[:2], RNG.standard_normal((2, 10, N_A))
     expected = replace(found, model=spectral()).costs(v, z, 0)
@@ -134,7 +133,7 @@ def test_theta_holds_which_law_a_plan_deviates_from() -> None:
     own = law()
     found = own.planner(own.parts(theta(own, regulated=True)))
     assert found.regulated and not own.planner(own.parts(theta(own))).regulated
-    assert own.plans(theta(own, regulated=True)) and found.regulator is not None
+    assert own.is_extended(theta(own, regulated=True)) and found.regulator is not None
 
 
 def test_plans_are_tried_around_the_law_of_the_whole_state_where_the_target_has_one() -> None:
@@ -219,7 +218,7 @@ def test_a_training_ends_with_the_law_that_measured_better(run: pdeloop.Finished
     *_, last = run.result["history"]
     assert last["rollouts"] == 12 and last["chosen"] in ("predictive", "adapted", "first")
     own, chosen = run.laws[0], run.policies[0]
-    assert own.plans(chosen) == (last["chosen"] == "predictive")
+    assert own.is_extended(chosen) == (last["chosen"] == "predictive")
     assert run.costs["adapted"].mean() <= run.costs["lqt"].mean()
 
 
@@ -258,6 +257,31 @@ def test_auto_is_the_affine_law_to_the_bit_where_the_model_has_no_more_to_give(
     assert "the law that acts is affine" in closing and "% more" in closing
     costs = evaluate(pdeloop.load_run(out), fields=2, seed=auto.values["evaluation_seed"])
     assert np.array_equal(costs["adapted"], auto.costs["adapted"])
+
+
+class Ramp(pdeloop.Dynamics):
+    """Two states whose target moves."""
+
+    n_z, n_a, horizon = 2, 1, 8
+    target = np.outer(np.arange(9) / 4.0, [1.0, 0.5])
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(2)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return np.array([0.9 * z[0] + 0.3 * z[1], 0.8 * z[1] + a[0]])
+
+
+def test_auto_is_the_default_law_where_it_does_not_plan(tmp_path: Path) -> None:
+    few = {"rollouts": 8, "reduced_order": 2, "evaluation_fields": 2}
+    plain = pdeloop.train(plant=Ramp(), **few)
+    auto = pdeloop.train(plant=Ramp(), **few, law="auto", out=tmp_path / "auto")
+    assert plain.values["law"] == "feedforward" and not auto.affine
+    assert np.array_equal(auto.policies[0], plain.policies[0].ravel())
+    assert np.array_equal(auto.costs["adapted"], plain.costs["adapted"])
+    assert law_of(auto).c() == law_of(plain).c()
+    closing = closing_lines("ramp", auto.result, tmp_path / "auto")
+    assert any("the law that acts is feedforward" in line for line in closing)
 
 
 def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
@@ -384,10 +408,11 @@ def test_plans_are_closed_by_a_cost_to_go_where_that_is_cheaper_on_the_model(
     bounds = ActionSet(N_A, -1.0, 1.0)
     own._context = replace(own._context, target=np.zeros(N_Z), action_set=bounds)
     fields = 0.5 * np.stack([np.cos(x), np.sin(x)])
-    chosen, costs = own._planner(Belief(model, 0.0, 1), own._affine.policy, fields)
+    belief, policy = Belief(model, 0.0, 1), own._affine.policy
+    chosen, costs = own._planner(belief, policy, fields)
     assert chosen.terminal == closed
     ways = [
-        simulated(replace(chosen, around=around, terminal=terminal), fields).sum()
+        own._costs(belief, policy, replace(chosen, around=around, terminal=terminal), fields).sum()
         for around in (True, False)
         for terminal in (True, False)
     ]

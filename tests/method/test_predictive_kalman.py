@@ -17,11 +17,11 @@ from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult
 from pdeloop.method.adapt.base import Optimizer
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictiveSensed,
-    simulated_from_estimates,
+    from_estimates,
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman
-from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.plans import Planner, simulated
 from pdeloop.method.laws.predictive import PredictiveKalman
 from pdeloop.method.laws.registry import action, along, updated
 from pdeloop.method.models.settings import DEFAULTS
@@ -34,7 +34,6 @@ from tests.support.estimated import (
     T,
     fields,
     filter_of,
-    loop_of,
     rows_of,
 )
 from tests.support.small import same_bits
@@ -73,7 +72,7 @@ def test_without_plans_it_is_the_law_extended_kalman() -> None:
         expected = along(kalman, theta, READINGS, actions)
         assert expected.any()
         assert same_bits(along(law, theta, READINGS, actions), expected)
-        assert not law.has_gains(theta) and not law.plans(theta)
+        assert not law.has_gains(theta) and not law.is_extended(theta)
 
 
 @pytest.mark.parametrize("rate", [np.inf, 0.1])
@@ -98,12 +97,15 @@ def test_a_plan_starts_from_the_estimate_and_its_memory_is_that_of_the_episode(r
 
 
 def test_its_simulation_is_what_the_law_does_on_the_model() -> None:
-    loop, _ = loop_of(replace(CUBIC, noise=0.0))
     law, theta = made()
     parts, starts = law.parts(theta), fields(2)
-    known = theta[: law.kalman.size]
-    found = simulated_from_estimates(loop, law.kalman, known, law.planner(parts), starts)
-    cost = law.planner(parts).cost
+    planner, known = law.planner(parts), law.kalman.filter(parts)
+    assert known is not None
+    found, noisy = (
+        simulated(planner, starts, from_estimates(planner, known, sigma))[0]
+        for sigma in (0.0, CUBIC.noise)
+    )
+    cost = planner.cost
     for z, expected in zip(starts, found, strict=True):
         memory, total = law.memory_start(), np.zeros(1)
         for k in range(T):
@@ -112,9 +114,7 @@ def test_its_simulation_is_what_the_law_does_on_the_model() -> None:
             cost.add(total, z[None], a[None], k)
             z = CUBIC.step(z[None], a[None])[0]
         assert total[0] / T == pytest.approx(expected, rel=1e-6)
-    noisy, _ = loop_of(CUBIC)
-    costs = simulated_from_estimates(noisy, law.kalman, known, law.planner(parts), starts)
-    assert np.isfinite(costs).all() and (costs != found).all()
+    assert np.isfinite(noisy).all() and (noisy != found).all()
 
 
 def test_plans_without_a_filter_are_refused() -> None:
@@ -170,10 +170,10 @@ def test_an_optimiser_continues_from_its_state_and_judges_pairs(
     *_, before, last = rows
     assert any("could_save" in row for row in rows) == (kind is Eager)
     assert last["role"] == "judging" and "plan_saves" in before
-    planned = [rollout for rollout in judged if own._law.plans(rollout.policy)]
-    seeds = {rollout.field_seed for rollout in asked if not own._law.plans(rollout.policy)}
+    planned = [rollout for rollout in judged if own._law.is_extended(rollout.policy)]
+    seeds = {rollout.field_seed for rollout in asked if not own._law.is_extended(rollout.policy)}
     assert len(planned) == 2 and {rollout.field_seed for rollout in planned} <= seeds
-    assert own._law.plans(own.policy) == (last["chosen"] == "predictive")
+    assert own._law.is_extended(own.policy) == (last["chosen"] == "predictive")
 
 
 def test_where_no_equation_reproduces_the_readings_the_law_stays_and_says_why() -> None:

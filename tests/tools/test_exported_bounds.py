@@ -58,6 +58,14 @@ def model(filtered: bool = False) -> ModelRows:
     )
 
 
+class MovingNeural(Neural):
+    """Of a target that moves."""
+
+    def __init__(self, model: ModelRows, horizon: int) -> None:
+        super().__init__(model, horizon)
+        self.cost = Cost(N_Z, N_A, T, target=np.outer(np.arange(T), np.ones(N_Z)))
+
+
 def acting(law: Law, allowed: ActionSet) -> np.ndarray:
     """Its actions in the loop along given states."""
     target = np.linalg.pinv(law.model.U.T) @ law.model.s_r
@@ -72,9 +80,15 @@ def theta_of(law: Law) -> np.ndarray:
     rng = np.random.default_rng(1)
     theta += 0.1 * rng.standard_normal(theta.shape)
     if isinstance(law, Neural):
-        shapes = (N_H, N_S), (N_H,), (N_A, N_H), (N_A,)
-        theta = law.theta_of(theta, Layers(*(rng.standard_normal(shape) for shape in shapes)))
+        K, _ = law.feedback(law.parts(theta))
+        shapes = (N_H, N_S + N_A * law.depends_on_step), (N_H,), (N_A, N_H), (N_A,)
+        theta = law.theta_of(theta, K, Layers(*(rng.standard_normal(shape) for shape in shapes)))
     return theta
+
+
+def arguments(kind: type[Law], k: int, memory: Any) -> tuple[Any, ...]:
+    """What the function takes before state and action."""
+    return {Affine: (), Neural: (), FeedForward: (k,), MovingNeural: (k,)}.get(kind, (memory,))
 
 
 STATES = 2.0 * RNG.standard_normal((T, N_Z))
@@ -90,13 +104,21 @@ MOVING = Cost(N_Z, N_A, T, target=np.sin(np.arange(T * N_Z)).reshape(T, N_Z))
 @needs_compiler
 @pytest.mark.parametrize(
     ("kind", "cost"),
-    [(Affine, None), (FeedForward, None), (Observer, None), (Observer, MOVING), (Neural, None)],
+    [
+        (Affine, None),
+        (FeedForward, None),
+        (Observer, None),
+        (Observer, MOVING),
+        (Neural, None),
+        (MovingNeural, None),
+    ],
 )
 def test_c_acts_as_the_loop_at_every_bound(
     tmp_path: Path, kind: type[Law], cost: Cost | None
 ) -> None:
     law = kind(model(kind.filtered), T)
-    law.cost = cost
+    if cost is not None:
+        law.cost = cost
     theta = theta_of(law)
     for i, (name, allowed) in enumerate(SETS.items()):
         source, expected = tmp_path / f"law{i}.c", acting(law, allowed)
@@ -110,7 +132,9 @@ def test_c_acts_as_the_loop_at_every_bound(
         function, a = compiled(source), np.broadcast_to(allowed.start, N_A).copy()
         memory = ctypes.create_string_buffer(8 * (1 + N_S))
         for k, z in enumerate(STATES):
-            first: Any = {Affine: (), Neural: (), FeedForward: (k,)}.get(kind, (memory,))
+            first: Any = {Affine: (), Neural: (), FeedForward: (k,), MovingNeural: (k,)}.get(
+                kind, (memory,)
+            )
             function(*first, pointer(z), pointer(a))
             np.testing.assert_allclose(a, expected[k], rtol=1e-9, atol=1e-11, err_msg=name)
         with np.load(io.BytesIO(exported.npz())) as kept:
@@ -120,7 +144,7 @@ def test_c_acts_as_the_loop_at_every_bound(
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer, Neural])
+@pytest.mark.parametrize("kind", [Affine, FeedForward, Observer, Neural, MovingNeural])
 def test_what_is_not_finite_neither_passes_nor_stays(tmp_path: Path, kind: type[Law]) -> None:
     law = kind(model(kind.filtered), T)
     allowed = SETS["each its own"]
@@ -131,7 +155,9 @@ def test_what_is_not_finite_neither_passes_nor_stays(tmp_path: Path, kind: type[
     source.write_bytes(exported.c())
     function, a = compiled(source), np.empty(N_A)
     memory = ctypes.create_string_buffer(8 * (1 + N_S))
-    first: Any = {Affine: (), Neural: (), FeedForward: (0,)}.get(kind, (memory,))
+    first: Any = {Affine: (), Neural: (), FeedForward: (0,), MovingNeural: (0,)}.get(
+        kind, (memory,)
+    )
     for bad in (np.nan, np.inf, -np.inf):
         for z in (STATES[0], np.where(np.arange(N_Z) == 2, bad, STATES[1]), STATES[2]):
             function(*first, pointer(np.ascontiguousarray(z)), pointer(a))

@@ -50,7 +50,7 @@ def test_a_killed_controller_changes_no_bit_of_a_training_with_plans(
     told = loop.wait(run, LIMIT)
     assert "controller_node was killed by SIGKILL; starting it again" in told
     here = pdeloop.train("allen-cahn", **PARAMETERS, **SETTINGS)
-    assert here.values["law"] == "predictive_kalman" and here.laws[0].plans(here.policies[0])
+    assert here.values["law"] == "predictive_kalman" and here.laws[0].is_extended(here.policies[0])
     assert [own["law"] for own in here.result["acting"]] == ["predictive"]
     assert len(here.result["history"]) == BEFORE_PLANS + 1
     assert same_bits(policies(out), here.policies)

@@ -19,9 +19,10 @@ from pdeloop.method.adapt.base import Context, Row
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.improve import curvature_of
 from pdeloop.method.adapt.model_based_predictive import Candidate, ModelBasedPredictive, share_saved
-from pdeloop.method.adapt.network import HELD_OUT, Network, NetworkTraining, rolled_out
+from pdeloop.method.adapt.network import HELD_OUT, Network, NetworkTraining, acting
 from pdeloop.method.adapt.verdict import NEURAL
 from pdeloop.method.laws.neural import Neural
+from pdeloop.method.laws.plans import Act, Planner, simulated
 from pdeloop.method.laws.predictive import Predictive
 
 _STREAM = 0x4E4554  # "NET"
@@ -45,55 +46,54 @@ class ModelBasedNeural(ModelBasedPredictive):
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
         """The law with the network of this model; or why there is none."""
         policy, context, own = self._affine.policy, self._context, self._neural
-        n_s = context.U.shape[1]
         fields, _ = self._simulated(belief, policy)
         planner, _ = self._planner(belief, policy, fields)
-        K, b = self._feedback(policy)
-
-        def affine(z: Array) -> Array:
-            return np.asarray(z @ K.T + b)
-
-        costs, states = rolled_out(planner, affine, self._affine.fields)
+        K, b = own.feedback(own.without.parts(np.ravel(policy)))
+        loop, every = belief.loop(context), self._affine.fields
+        costs, states, _ = simulated(planner, every, self._acts(planner, policy, loop.noise))
         known = np.isfinite(costs)
         if not (known.any() and costs[known].any()):
-            return "the affine law does not stay finite on the model, or costs nothing"
+            return f"the law {own.without.name} does not stay finite on the model, or costs nothing"
         network = Network.of(
             context.U,
-            policy[:, :n_s],
+            K,
             b,
             states[known].reshape(-1, states.shape[2]),
-            curvature_of(belief.loop(context)),
+            curvature_of(loop),
             float(costs[known].mean()),
             own.settings.neurons,
         )
         training = NetworkTraining(
             network,
             planner,
-            self._affine.fields,
+            every,
             [self._seed, _STREAM, self._count],
             belief.components,
             periodic=context.periodic,
+            noise=loop.noise,
         )
         numbers = training.trained(own.settings.iterations)
-        every = np.concatenate([self._affine.fields, training.drawn(HELD_OUT)])
-        before, after = (
-            rolled_out(planner, acts, every)[0] for acts in (affine, network.acts(numbers))
-        )
+        every = np.concatenate([every, training.drawn(HELD_OUT)])
+        before = simulated(planner, every, self._acts(planner, policy, loop.noise))[0]
+        after = training.costs(numbers, every)
         row["network_saves"] = share_saved(after, before)
         if not np.sum(after) < np.sum(before):
             return "on the model no network is better"
-        K_a, layers = network.folded(numbers)
-        return Candidate(own.theta_of(np.hstack([K_a, policy[:, n_s:]]), layers), after, before)
+        return Candidate(own.theta_of(policy, *network.folded(numbers)), after, before)
+
+    def _acts(self, planner: Planner, theta: Array, noise: float) -> Act:
+        """The law of a theta in simulations."""
+        own, parts = self._neural, self._neural.parts(np.ravel(theta))
+
+        def law(z: Array, k: int) -> Array:
+            return np.stack([own.action(parts, row, np.zeros(0), k) for row in z])
+
+        return acting(planner, law, noise)
 
     def _check(self, theta: Array) -> None:
         self._neural.layers(self._neural.parts(theta)["network"])
 
     def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
-        own = self._neural
         planner = self._plain(belief, self._affine.policy, self._affine.fields)
-        parts = own.parts(theta)
-
-        def acts(z: Array) -> Array:
-            return np.stack([own.action(parts, row, np.zeros(0), 0) for row in z])
-
-        return rolled_out(planner, acts, fields)[0]
+        noise = belief.loop(self._context).noise
+        return simulated(planner, fields, self._acts(planner, theta, noise))[0]

@@ -1,19 +1,20 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
 
-The affine law is trained as ever. On the last model that predicts the rollouts, plans of 20, 40 and 80
-steps are simulated in closed loop from a few measured initial fields, as actions, as deviations from
-the affine law, or from the linear-quadratic one of the whole state at the target, whichever is cheaper
-there; the shortest within 2 % of the cheapest is taken. They are closed by the cost to go at the target
-unless plans without it are 2 % cheaper: it is that of the linear problem, and far too high where
-bounded actuators can do little near the target. The last rollouts are of the law with that plan, from
-fresh fields. It replaces the affine law only if it is better by more than chance (`verdict`).
+The law that it begins as is trained as ever; here it is called the affine one, also where it has an
+offset for each step. On the last model that predicts the rollouts, plans of 20, 40 and 80 steps are
+simulated in closed loop from a few measured initial fields, as actions, as deviations from that law, or
+from the linear-quadratic one of the whole state at the target, whichever is cheaper there; the shortest
+within 2 % of the cheapest is taken. They are closed by the cost to go at the target unless plans
+without it are 2 % cheaper: it is that of the linear problem, and far too high where bounded actuators
+can do little near the target. The last rollouts are of the law with that plan, from fresh fields. It
+replaces the affine law only if it is better by more than chance (`verdict`).
 
 The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
 the affine law but the last, the best inputs for an episode are searched on the model from several
 starts, around both laws. If they save more than 3 % of the cost of the affine law, also once that is
 improved as far as at the last update, the last rollouts are kept; else they are the affine law's, which
-is then that of `law: affine` to the bit.
+is then that of that law to the bit.
 
 With few sensors the law `extended_kalman` is trained in place of the affine one. Plans start from the
 estimate of its filter, on the equation of that, and are simulated with it and with noise on the
@@ -63,7 +64,7 @@ from pdeloop.method.adapt.verdict import (
 )
 from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sensed import SensedFilter, SensedModel
@@ -121,10 +122,10 @@ class ModelBasedPredictive(Optimizer):
             raise ValueError("this optimiser needs a context with a law that plans")
         self._law, self._seed = context.law, seed
         self._settings = settings or ModelBasedSettings()
-        self._shape = self._law.without_plans.shape
+        self._shape = self._law.without.shape
         self._first = np.reshape(np.asarray(policy0, dtype=np.float64), self._shape)
         measured = [self._matrix(record) for record in context.measured]
-        own = self._law.without_plans
+        own = self._law.without
         law = None if isinstance(own, Affine) else own
         self._context = replace(context, measured=measured, law=law)
         spare = rollouts - ModelBased.first_step(self._settings)
@@ -230,9 +231,7 @@ class ModelBasedPredictive(Optimizer):
 
     def _unplanned(self, belief: Belief) -> str:
         """Why nothing can be planned on a model; empty if it can be."""
-        if len(self._context.U) == len(self._law.model.U):
-            return ""  # else the affine law is adapted in coordinates of a large state
-        return f"plans use states of at most {len(self._context.U)} numbers"
+        return ""
 
     def _simulated(self, belief: Belief, policy: Array) -> tuple[Array, Array]:
         """A few measured initial fields, and an affine law's costs from them on the model."""
@@ -263,7 +262,8 @@ class ModelBasedPredictive(Optimizer):
             why = made
         if self._left:
             row.setdefault("early", why)
-        stays = "affine law" if self._law.base is Affine else f"law {self._law.base.name}"
+        name = self._law.without.name
+        stays = f"{name} law" if name == Affine.name else f"law {name}"
         row["reason"] = f"{row.get('reason', '')}; the {stays} stays: {why}".removeprefix("; ")
 
     def _made(self, belief: Belief, row: Row) -> Candidate | str:
@@ -288,9 +288,7 @@ class ModelBasedPredictive(Optimizer):
 
     def _feedback(self, policy: Array) -> tuple[Array, Array]:
         """K and b of that law, a = K z + b, for states of the model."""
-        U, n_s = self._context.U, self._context.U.shape[1]
-        s_r = np.sum(U * self._context.target[:, None], axis=0)
-        return np.ascontiguousarray(policy[:, :n_s] @ U.T), policy[:, n_s:] @ s_r
+        return self._law.feedback_of_states(self._law.without.parts(np.ravel(policy)))
 
     def _plain(self, belief: Belief, policy: Array, fields: Array) -> Planner:
         """Plans of one step around a law."""
@@ -347,11 +345,13 @@ class ModelBasedPredictive(Optimizer):
 
     def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
         """Costs of the law that plans from initial fields on the model."""
-        return simulated(self._law.planner(self._law.parts(theta)), fields)
+        planner = self._law.planner(self._law.parts(theta))
+        return self._costs(belief, theta, planner, fields)
 
     def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
         """Costs of plans from initial fields on the model."""
-        return simulated(planner, fields)
+        noise = belief.loop(self._context).noise
+        return simulated(planner, fields, seen_with_noise(planned(planner), noise))[0]
 
     def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
@@ -468,46 +468,6 @@ def share_saved(costs: Array, before: Array) -> float:
     return share if np.isfinite(share) else 0.0
 
 
-def simulated(
-    planner: Planner,
-    fields: Array,
-    sensed: tuple[SensedModel, SensedFilter, float] | None = None,
-) -> Array:
-    """Mean stage costs (F,) of plans in closed loop on a model from initial fields (F, n).
-
-    sensed: the model that is read, the filter from whose estimates plans start, and the noise of the
-    readings; without them, plans start from the states of the planner's own model.
-    """
-    cost, z, a, count = planner.cost, fields, None, len(fields)
-    totals, plan = np.zeros(count), np.zeros((count, planner.steps, len(planner.b)))
-    model: FieldModel = planner.model
-    if sensed is not None:
-        model, known, sigma = sensed
-        x, S = (np.repeat(part[None], count, axis=0) for part in known.start)
-        shape = cost.horizon, count, model.sensors
-        noise = sigma * np.random.default_rng(0).standard_normal(shape)
-    with np.errstate(all="ignore"):
-        for k in range(cost.horizon):
-            if sensed is None:
-                x = z
-            else:
-                x, S = known.measured(x, S, z[:, known.model.seen] + noise[k])
-            a, plan, _ = planner.step(plan, planner.after(x, a), k)
-            plan = planner.shifted(plan)
-            cost.add(totals, z, a, k)
-            z = model.step(z, a)
-            lost = ~np.isfinite(z).all(axis=1)
-            if sensed is not None:
-                x, S = known.predicted(x, S, a)
-                lost |= ~np.isfinite(x).all(axis=1)
-                x[lost], S[lost], a[lost] = 0.0, 0.0, 0.0
-            totals[lost], z[lost] = np.inf, 0.0
-        cost.add_terminal(totals, z)
-    totals[~np.isfinite(totals)] = np.inf
-    found: Array = totals / cost.horizon
-    return found
-
-
 def rests(model: FieldModel, cost: Cost, fields: Array) -> bool:
     """True if the target is constant and an equilibrium of the model."""
     point, a_r = cost.field_target, cost.action_target
@@ -550,12 +510,14 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         assert isinstance(belief.model, SensedModel)
         return sensed_loop(self._context, belief.model)
 
-    def _feedback(self, policy: Array) -> tuple[Array, Array]:
-        parts = self._kalman.parts(np.ravel(policy))
-        return np.ascontiguousarray(parts["K_e"]), parts["b"]
-
     def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
-        return simulated_from_estimates(self._loop(belief), self._kalman, policy, planner, fields)
+        law = self._kalman
+        known = law.filter(law.parts(np.ravel(policy)[: law.size]))
+        if known is None:
+            return np.full(len(fields), np.inf)
+        return simulated(planner, fields, from_estimates(planner, known, self._loop(belief).noise))[
+            0
+        ]
 
     def _seeds(self) -> list[int]:
         """Those of fields of the trained law, and further ones where it has fewer."""
@@ -588,16 +550,24 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         return evidence_of_pairs({base: others, PREDICTIVE: own}, base)
 
 
-def simulated_from_estimates(
-    loop: SensedLoop, law: ExtendedKalman, theta: Array, planner: Planner, fields: Array
-) -> Array:
-    """Mean stage costs (F,) of plans from estimates on the model, from initial fields (F, n).
+def from_estimates(planner: Planner, known: SensedFilter, sigma: float) -> Act:
+    """Plans from the estimates of a filter, of readings with noise of this standard deviation."""
+    rng, of_plans, estimate = np.random.default_rng(0), planned(planner), known.start
 
-    law, theta: whose filter estimates, from readings with the model's noise.
-    """
-    model = loop.model
-    assert isinstance(model, SensedModel)
-    known = law.filter(law.parts(theta))
-    if known is None:
-        return np.full(len(fields), np.inf)
-    return simulated(planner, fields, (model, known, loop.noise))
+    def act(z: Array, before: Array, k: int) -> Array:
+        nonlocal estimate
+        if k == 0:
+            first, spread = known.start
+            estimate = np.tile(first, (len(z), 1)), np.tile(spread, (len(z), 1, 1))
+        else:
+            estimate = known.predicted(*estimate, before)
+        x, S = estimate
+        lost = ~np.isfinite(x).all(axis=1)
+        x[lost], S[lost] = 0.0, 0.0
+        seen = z[:, known.model.seen]
+        x, S = estimate = known.measured(x, S, seen + sigma * rng.standard_normal(seen.shape))
+        a = of_plans(x, before, k)
+        a[lost] = np.nan
+        return a
+
+    return act

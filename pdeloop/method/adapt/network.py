@@ -1,13 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A network beside an affine law, trained on a model of the plant.
 
-With s = U^T z of mean m and covariance C in the episodes of the affine law a = K s + b,
+With s = U^T z of mean m and covariance C in the episodes of the law a_k = K s_k + b_k,
 
-    a = K s + b + E (A x + c + D tanh(W x + w)),        x = (C + e |C| I)^-1/2 (s - m),
-    E = share sqrt(J / T) G^-1/2,                       G = R + B^T P B,
+    a_k = K s_k + b_k + E (A x_k + c + D tanh(W [x_k; r_k] + w)),    x = (C + e |C| I)^-1/2 (s - m),
+    E = share sqrt(J / T) G^-1/2,                                    G = R + B^T P B,
 
-so that no number depends on the units of states and actions. D, A and c are zero at first: the law is
-the affine one. Two descents follow, both by Adam with a step length that falls as a cosine:
+so that no number depends on the units of states and actions. r_k is b_k in such coordinates, where it
+changes: what the target of that step and those to come ask for. D, A and c are zero at first. Two
+descents follow, both by Adam with a step length that falls as a cosine:
 
     imitation   mean |G^1/2 (a - a*)|^2 of the actions a* of plans, from the states of episodes that
                 plans control, and of others that the network controls (DAgger)
@@ -29,14 +30,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.initial_fields import mixtures
 from pdeloop.method.laws.neural import Layers
-from pdeloop.method.laws.plans import Planner
+from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated
 
 LABELLED, LABEL_STEPS = 24, 200
 """Initial fields from which actions are imitated, and steps of each at most, in each round."""
@@ -58,46 +58,64 @@ AVERAGED = 0.02
 """Weight of the last iterate in the average."""
 _SHARE, _RIDGE, _DRAWN = 0.3, 1e-2, 48
 _BETAS = 0.9, 0.999
-Acts: TypeAlias = Callable[[Array], Array]
-"""States (M, n_z) to actions (M, n_a)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """Coordinates x = root^T (s - m) of rows s, with root = (C + e |C| I)^-1/2 up to a rotation."""
+
+    m: Array
+    root: Array
+
+    @staticmethod
+    def of(rows: Array) -> Whitened:
+        """Of their mean and covariance."""
+        m = rows.mean(axis=0)
+        values, vectors = np.linalg.eigh(np.atleast_2d((rows - m).T @ (rows - m) / len(rows)))
+        largest = max(float(values[-1]), 1e-300)
+        return Whitened(m, vectors / np.sqrt(np.maximum(values, 0.0) + _RIDGE * largest))
+
+    def __call__(self, rows: Array) -> Array:
+        x: Array = (rows - self.m) @ self.root
+        return x
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """The coordinates in which it is trained; U, K, b, m and E as above, root: (C + e |C| I)^-1/2."""
+    """The coordinates in which it is trained; K, b and E as above, b (n, n_a) with one row or T.
+
+    r: of b where it has rows for steps, else None.
+    """
 
     U: Array
     K: Array
     b: Array
-    m: Array
-    root: Array
     E: Array
+    x: Whitened
+    r: Whitened | None
     neurons: int
 
     @staticmethod
     def of(
         U: Array, K: Array, b: Array, states: Array, curvature: Array, cost: float, neurons: int
     ) -> Network:
-        """states (n, n_z) and their mean stage cost: of the affine law."""
-        s = np.einsum("mi,ij->mj", states, U)
-        m = s.mean(axis=0)
-        values, vectors = np.linalg.eigh(np.atleast_2d((s - m).T @ (s - m) / len(s)))
-        largest = max(float(values[-1]), 1e-300)
-        root = vectors / np.sqrt(np.maximum(values, 0.0) + _RIDGE * largest)
+        """states (n, n_z) and their mean stage cost: of the law a_k = K s_k + b_k."""
         sizes, axes = np.linalg.eigh(curvature)
         E = _SHARE * np.sqrt(cost) * (axes / np.sqrt(sizes)) @ axes.T
-        return Network(U, K, b, m, root, E, neurons)
+        x, r = Whitened.of(states @ U), Whitened.of(b) if b.ndim > 1 else None
+        return Network(U, K, np.atleast_2d(b), E, x, r, neurons)
 
     @property
     def _shapes(self) -> tuple[tuple[int, ...], ...]:
         (n_a, n), h = self.K.shape, self.neurons
-        return (n_a, n), (n_a,), (h, n), (h,), (n_a, h)
+        return (n_a, n), (n_a,), (h, n + n_a * (self.r is not None)), (h,), (n_a, h)
 
     def first(self, rng: np.random.Generator) -> Array:
-        """Numbers with which it is the affine law."""
-        (n_a, n), h = self.K.shape, self.neurons
-        W, w = rng.standard_normal((h, n)) / np.sqrt(n), 0.5 * rng.standard_normal(h)
-        return np.concatenate([np.zeros(n_a * n + n_a), W.ravel(), w, np.zeros(n_a * h)])
+        """Numbers with which it is the law without a network."""
+        A, c, W, w, D = self._shapes
+        of_x, of_1 = rng.standard_normal(W) / np.sqrt(W[1]), 0.5 * rng.standard_normal(w)
+        parts = np.zeros(A), np.zeros(c), of_x, of_1, np.zeros(D)
+        return np.concatenate([part.ravel() for part in parts])
 
     def parts(self, numbers: Array) -> list[Array]:
         """A, c, W, w and D."""
@@ -106,35 +124,36 @@ class Network:
             p.reshape(x) for p, x in zip(np.split(numbers, ends[:-1]), self._shapes, strict=True)
         ]
 
-    def acts(self, numbers: Array) -> Acts:
-        """The law."""
-        return lambda z: self.forward(self.parts(numbers), z)[0]
-
-    def forward(self, parts: list[Array], z: Array) -> tuple[Array, Array, Array]:
-        """Actions (M, n_a) before bounds, x and tanh(W x + w) of states (M, n_z)."""
+    def forward(self, parts: list[Array], z: Array, k: int | Array) -> tuple[Array, Array, Array]:
+        """Actions (M, n_a) before bounds, [x; r] and tanh of states (M, n_z) at steps k."""
         A, c, W, w, D = parts
-        s = z @ self.U
-        x = (s - self.m) @ self.root
-        hidden = np.tanh(x @ W.T + w)
-        return s @ self.K.T + self.b + (x @ A.T + c + hidden @ D.T) @ self.E.T, x, hidden
+        b, s = self.b[np.minimum(k, len(self.b) - 1)], z @ self.U
+        x = into = self.x(s)
+        if self.r is not None:
+            into = np.hstack([x, np.broadcast_to(self.r(b), (len(z), len(self.K)))])
+        hidden = np.tanh(into @ W.T + w)
+        return s @ self.K.T + b + (x @ A.T + c + hidden @ D.T) @ self.E.T, into, hidden
 
     def backward(
-        self, parts: list[Array], x: Array, hidden: Array, y: Array
+        self, parts: list[Array], into: Array, hidden: Array, y: Array
     ) -> tuple[Array, Array]:
         """Derivatives by the numbers, summed over rows, and by states, from y (M, n_a) by actions."""
         A, _, W, _, D = parts
-        e = y @ self.E
+        e, n = y @ self.E, len(self.x.m)
         g = (e @ D) * (1.0 - hidden**2)
-        own = (e.T @ x, e.sum(axis=0), g.T @ x, g.sum(axis=0), e.T @ hidden)
-        by_z = (y @ self.K + (e @ A + g @ W) @ self.root.T) @ self.U.T
+        own = (e.T @ into[:, :n], e.sum(axis=0), g.T @ into, g.sum(axis=0), e.T @ hidden)
+        by_z = (y @ self.K + (e @ A + g @ W[:, :n]) @ self.x.root.T) @ self.U.T
         return np.concatenate([part.ravel() for part in own]), by_z
 
     def folded(self, numbers: Array) -> tuple[Array, Layers]:
-        """K (n_a, n_s) and the layers of the same law in s."""
+        """K (n_a, n_s) and the layers of the same law in s, and b_k where it has rows for steps."""
         A, c, W, w, D = self.parts(numbers)
-        of_s, through = W @ self.root.T, self.E @ A @ self.root.T
-        d = self.E @ c - through @ self.m
-        return self.K + through, Layers(of_s, w - of_s @ self.m, self.E @ D, d)
+        through, n = self.E @ A @ self.x.root.T, len(self.x.m)
+        given = [(self.x, W[:, :n])] + ([(self.r, W[:, n:])] if self.r is not None else [])
+        columns = [own @ known.root.T for known, own in given]
+        moved = [column @ known.m for (known, _), column in zip(given, columns, strict=True)]
+        d = self.E @ c - through @ self.x.m
+        return self.K + through, Layers(np.hstack(columns), w - sum(moved), self.E @ D, d)
 
 
 class NetworkTraining:
@@ -147,6 +166,8 @@ class NetworkTraining:
         Model, cost, admissible actions, V, and the plans to imitate.
     fields : (n, n_z) array
         Measured initial fields, of whose distribution further ones are drawn (`mixtures`).
+    noise : float
+        Standard deviation of the noise on every number of a state that the law sees.
     seed : sequence of int
     components, periodic : int, bool
         As for `mixtures`.
@@ -161,8 +182,9 @@ class NetworkTraining:
         components: int,
         *,
         periodic: bool,
+        noise: float = 0.0,
     ) -> None:
-        self._network, self._planner, self._fields = network, planner, fields
+        self._network, self._planner, self._fields, self._noise = network, planner, fields, noise
         self._rng, self._components, self._periodic = (
             np.random.default_rng(seed),
             components,
@@ -174,7 +196,7 @@ class NetworkTraining:
         """The network after imitation and so many steps of improvement, as numbers."""
         held, first = self.drawn(HELD_OUT), self._network.first(self._rng)
         imitated = self._imitated(first)
-        numbers = min((first, imitated), key=lambda own: self._held(own, held))
+        numbers = min((first, imitated), key=lambda own: self.costs(own, held).mean())
         return self._improved(numbers, held, iterations)
 
     def drawn(self, count: int) -> Array:
@@ -188,46 +210,67 @@ class NetworkTraining:
         every = np.concatenate(found)
         return every[self._rng.permutation(len(every))[:count]]
 
-    def _held(self, numbers: Array, held: Array) -> float:
-        return float(rolled_out(self._planner, self._network.acts(numbers), held)[0].mean())
+    def acts(self, numbers: Array, rng: np.random.Generator | None = None) -> Act:
+        """The law as it sees states, with noise of one seed unless drawn otherwise."""
+        parts = self._network.parts(numbers)
+        return acting(
+            self._planner, lambda z, k: self._network.forward(parts, z, k)[0], self._noise, rng
+        )
+
+    def costs(self, numbers: Array, fields: Array) -> Array:
+        """Mean stage costs (F,) on the model from fields (F, n_z)."""
+        return simulated(self._planner, fields, self.acts(numbers))[0]
 
     def _imitated(self, numbers: Array) -> Array:
         """The network after imitation of plans."""
-        steps = min(self._planner.cost.horizon, LABEL_STEPS)
-        states, labels = list[Array](), list[Array]()
+        seen = list[tuple[Array, Array, Array]]()
         for n in range(ROUNDS):
-            acts = self._network.acts(numbers) if n else None
-            z, a = labelled(self._planner, self.drawn(LABELLED), steps, acts)
-            states.append(z)
-            labels.append(a)
-            numbers = self._imitate(numbers, np.concatenate(states), np.concatenate(labels))
+            seen.append(self._labelled(self.acts(numbers, self._rng) if n else None))
+            numbers = self._imitate(numbers, *map(np.concatenate, zip(*seen, strict=True)))
         return numbers
 
-    def _imitate(self, numbers: Array, states: Array, labels: Array) -> Array:
-        network, allowed = self._network, self._planner.action_set
+    def _labelled(self, acts: Act | None) -> tuple[Array, Array, Array]:
+        """States (n, n_z), steps and actions (n, n_a) of plans, in episodes of a law or of plans."""
+        of_plans, labels = planned(self._planner), list[Array]()
+
+        def act(z: Array, before: Array, k: int) -> Array:
+            labels.append(of_plans(z, before, k))
+            return labels[-1].copy() if acts is None else acts(z, before, k)
+
+        steps = min(self._planner.cost.horizon, LABEL_STEPS)
+        costs, states, _ = simulated(self._planner, self.drawn(LABELLED), act, steps=steps)
+        found = np.stack(labels, axis=1)
+        known = np.isfinite(costs) & np.isfinite(found).all(axis=(1, 2))
+        z, a = (part[known].reshape(-1, part.shape[2]) for part in (states[:, :-1], found))
+        return z, np.tile(np.arange(steps), known.sum()), a
+
+    def _imitate(self, numbers: Array, states: Array, steps: Array, labels: Array) -> Array:
+        network, allowed, rng = self._network, self._planner.action_set, self._rng
         G = np.linalg.inv(network.E @ network.E.T)
         size = float(np.einsum("mi,ij,mj->", labels, G, labels)) / max(len(labels), 1)
         if not (size > 0.0 and np.isfinite(size)):
             return numbers
         descent = Adam(len(numbers), IMITATIONS)
         for _ in range(IMITATIONS):
-            some = self._rng.integers(0, len(states), BATCH)
-            parts = network.parts(numbers)
-            a, x, hidden = network.forward(parts, states[some])
+            some = rng.integers(0, len(states), BATCH)
+            parts, z = network.parts(numbers), states[some]
+            if self._noise:
+                z = z + self._noise * rng.standard_normal(z.shape)
+            a, into, hidden = network.forward(parts, z, steps[some])
             error = np.clip(a, allowed.low, allowed.high) - labels[some]
-            by_numbers, _ = network.backward(parts, x, hidden, 2.0 * error @ G / (BATCH * size))
+            by_numbers, _ = network.backward(parts, into, hidden, 2.0 * error @ G / (BATCH * size))
             numbers = descent.step(numbers, by_numbers + DECAY * numbers)
         return numbers
 
     def _improved(self, numbers: Array, held: Array, iterations: int) -> Array:
         """The best average of iterates on held-out fields."""
-        network, rng, T = self._network, self._rng, self._planner.cost.horizon
-        best, least, mean = numbers, self._held(numbers, held), numbers.copy()
+        rng, T = self._rng, self._planner.cost.horizon
+        best, least, mean = numbers, self.costs(numbers, held).mean(), numbers.copy()
         descent, unit, states = Adam(len(numbers), iterations), 0.0, np.empty((0, 0, 0))
         for i in range(iterations):
             if i % REFRESH == 0:
-                acts = network.acts(numbers)
-                states = rolled_out(self._planner, acts, self.drawn(VISITED))[1]
+                fields = self.drawn(VISITED)
+                states = simulated(self._planner, fields, self.acts(numbers, rng))[1]
             k = int(rng.integers(0, T - self._part + 1)) if rng.random() < 0.5 else 0
             J, by_numbers = self.gradient(numbers, states[rng.permutation(VISITED)[:ROWS], k], k)
             unit = unit or J
@@ -238,7 +281,7 @@ class NetworkTraining:
             numbers = descent.step(numbers, g)
             mean += AVERAGED * (numbers - mean)
             if (i + 1) % REFRESH == 0 or i + 1 == iterations:
-                cost = self._held(mean, held)
+                cost = self.costs(mean, held).mean()
                 if cost < least:
                     best, least = mean.copy(), cost
         return best
@@ -248,41 +291,41 @@ class NetworkTraining:
 
         Rows that are not finite do not count.
         """
-        model, allowed, network = self._planner.model, self._planner.action_set, self._network
-        parts, H, tape = network.parts(numbers), self._part, list[tuple[Array, Array, Array]]()
-        states, actions = [z], [np.broadcast_to(allowed.start, (len(z), len(network.b)))]
+        planner, network, H = self._planner, self._network, self._part
+        parts, tape = network.parts(numbers), list[tuple[Array, Array, Array]]()
+
+        def law(seen: Array, i: int) -> Array:
+            tape.append(network.forward(parts, seen, i))
+            return tape[-1][0]
+
+        act = acting(planner, law, self._noise, self._rng)
+        costs, Z, A = simulated(planner, z, act, k, H)
         with np.errstate(all="ignore"):
-            for _ in range(H):
-                tape.append(network.forward(parts, states[-1]))
-                actions.append(allowed.project(tape[-1][0], after=actions[-1]))
-                states.append(model.step(states[-1], actions[-1]))
-            Z, A = np.stack(states, axis=1), np.stack(actions[1:], axis=1)
-            J, on_states, on_actions = self._planner.cost.along(Z[:, :-1], A, k)
-            of_end, eta = self._planner.at_end(Z[:, -1], k + H)
+            J, on_states, on_actions = planner.cost.along(Z[:, :-1], A, k)
+            of_end, eta = planner.at_end(Z[:, -1], k + H)
             J = J + of_end
-        known = np.isfinite(J) & np.isfinite(Z).all(axis=(1, 2))
-        none = ~known[:, None, None]
-        Z, A, on_states, on_actions = (
-            np.where(none, 0.0, array) for array in (Z, A, on_states, on_actions)
+        known = np.isfinite(costs) & np.isfinite(J)
+        if not known.any():
+            return np.inf, np.zeros(len(numbers))
+        Z, A, on_states, on_actions, eta = (
+            part[known] for part in (Z, A, on_states, on_actions, eta)
         )
-        eta = np.where(none[:, 0], 0.0, eta)
-        found, later = np.zeros(len(numbers)), np.zeros_like(eta[:, : A.shape[2]])
+        allowed, found, later = planner.action_set, np.zeros(len(numbers)), np.zeros_like(A[:, 0])
         for i in reversed(range(H)):
-            requested, x, hidden = tape[i]
+            requested, into, hidden = (part[known] for part in tape[i])
             with np.errstate(all="ignore"):
-                pulled, g = model.pull_back(Z[:, i], A[:, i], eta)
-                g = np.where(known[:, None], g + on_actions[:, i] + later, 0.0)
+                pulled, g = planner.model.pull_back(Z[:, i], A[:, i], eta)
+                g = g + on_actions[:, i] + later
                 if allowed.rated:
-                    g, later = allowed.pull_back_after(requested, g, actions[i])
+                    before = A[:, i - 1] if i else allowed.start
+                    g, later = allowed.pull_back_after(requested, g, before)
                 else:
                     g = allowed.pull_back(requested, g)
-                x, hidden = (np.where(known[:, None], part, 0.0) for part in (x, hidden))
-                by_numbers, by_z = network.backward(parts, x, hidden, g)
-            found += by_numbers
-            eta = np.where(known[:, None], pulled + by_z + on_states[:, i], 0.0)
-        count = max(int(known.sum()), 1)
-        total = float(J[known].sum()) / count if known.any() else np.inf
-        return total, found / count if np.isfinite(found).all() else np.zeros_like(found)
+                by_numbers, by_z = network.backward(parts, into, hidden, g)
+                found += by_numbers
+                eta = pulled + by_z + on_states[:, i]
+        found /= len(Z)
+        return float(J[known].mean()), found if np.isfinite(found).all() else np.zeros_like(found)
 
 
 class Adam:
@@ -305,44 +348,12 @@ class Adam:
         return found
 
 
-def labelled(planner: Planner, z: Array, steps: int, acts: Acts | None) -> tuple[Array, Array]:
-    """States (n, n_z) of episodes on the model, and the first actions (n, n_a) of their plans.
-
-    acts: the law of these episodes; None: plans act.
-    """
-    states, labels, a = list[Array](), list[Array](), None
-    plan, allowed = np.zeros((len(z), planner.steps, len(planner.b))), planner.action_set
-    with np.errstate(all="ignore"):
-        for k in range(steps):
-            wanted, plan, _ = planner.step(plan, planner.after(z, a), k)
-            plan = planner.shifted(plan)
-            known = np.isfinite(z).all(axis=1) & np.isfinite(wanted).all(axis=1)
-            states.append(z[known])
-            labels.append(wanted[known])
-            before = allowed.start if a is None else a
-            a = wanted if acts is None else allowed.project(acts(z), after=before)
-            z = planner.model.step(z, a)
-            lost = ~np.isfinite(z).all(axis=1)
-            z[lost], plan[lost] = planner.cost.field_target, 0.0
-    return np.concatenate(states), np.concatenate(labels)
-
-
-def rolled_out(planner: Planner, acts: Acts, z: Array) -> tuple[Array, Array]:
-    """Mean stage costs (M,) of a law on the model from fields (M, n_z), and its states (M, T + 1, n_z).
-
-    Infinite, and the target's state, where a simulation is not finite.
-    """
-    cost, allowed = planner.cost, planner.action_set
-    totals, states = np.zeros(len(z)), [z]
-    a = np.broadcast_to(allowed.start, (len(z), len(planner.b)))
-    with np.errstate(all="ignore"):
-        for k in range(cost.horizon):
-            a = allowed.project(acts(z), after=a)
-            cost.add(totals, z, a, k)
-            z = planner.model.step(z, a)
-            lost = ~np.isfinite(z).all(axis=1)
-            totals[lost], z[lost] = np.inf, cost.field_target
-            states.append(z)
-        cost.add_terminal(totals, z)
-    totals[~np.isfinite(totals)] = np.inf
-    return totals / cost.horizon, np.stack(states, axis=1)
+def acting(
+    planner: Planner,
+    law: Callable[[Array, int], Array],
+    noise: float,
+    rng: np.random.Generator | None = None,
+) -> Act:
+    """A law (M, n_z), k -> (M, n_a) as it acts in a simulation."""
+    allowed = planner.action_set
+    return seen_with_noise(lambda z, a, k: allowed.project(law(z, k), after=a), noise, rng)

@@ -1,18 +1,18 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""An affine law and a network with one hidden layer of the reduced state."""
+"""A law and a network with one hidden layer of the reduced state beside it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from time import perf_counter
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.laws.affine import Affine
-from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.base import Parts
+from pdeloop.method.laws.extended import Extended
+from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.settings import Settings, setting
 
 MOST_NEURONS = 512
@@ -28,7 +28,7 @@ class NeuralSettings(Settings):
 
 
 class Layers(NamedTuple):
-    """The network D tanh(W s + w) + d: (h, n_s), (h,), (n_a, h) and (n_a,) arrays."""
+    """The network D tanh(W x + w) + d: (h, n_x), (h,), (n_a, h) and (n_a,) arrays."""
 
     W: Array
     w: Array
@@ -36,109 +36,92 @@ class Layers(NamedTuple):
     d: Array
 
 
-class Neural(Law):
-    """An affine law and a network of the reduced state:
+class Neural(Extended):
+    """A law and a network of the reduced state beside it:
 
-        a_k = K_a s_k + K_b s_r + D tanh(W s_k + w) + d,        s = U^T z.
+        a_k = K s_k + b_k + D tanh(W x_k + w) + d,        s = U^T z,    x_k = s_k or [s_k; b_k],
 
-    It begins as the affine law, without a network. An optimiser that has a model of the plant trains
-    one and writes it into theta: `model_based` does. theta is then longer than `size` by h, the number
-    of neurons, and W, w, D and d, row after row; zeros at its end mean nothing.
+    the latter where b_k is one of each step, as of a target that moves: it tells what this target and
+    those to come ask for. It begins without a network. An optimiser that has a model of the plant
+    trains one and writes it into theta: `model_based` does. theta is then longer by h, the number of
+    neurons, and W, w, D and d, row after row.
 
     Source: Goodfellow, Bengio, Courville, *Deep Learning*, 2016, chapter 6.
     """
 
     name = "neural"
-    extends = True
-    needs_model = True
+    added = "network"
     Settings = NeuralSettings
     settings: ClassVar[NeuralSettings] = NeuralSettings()
 
-    def start(self) -> Parts:
-        """K_a and K_b, (n_a, n_s) each, and no network."""
-        return {"K_a": self.model.K_a, "K_b": self.model.K_b, "network": np.zeros(0)}
-
-    def parts(self, theta: Array) -> Parts:
-        """Those of the affine law are its beginning; the rest is `network`."""
-        affine = Affine(self.model, self.horizon)
-        return {**affine.parts(theta[: self.size]), "network": theta[self.size :]}
-
-    def vector(self, parts: Parts) -> Array:
-        gains = np.hstack([parts["K_a"], parts["K_b"]]).ravel()
-        return np.concatenate([gains, parts["network"]])
-
-    def theta_of(self, gains: Array, layers: Layers) -> Array:
-        """Theta of [K_a K_b] and a network."""
+    def theta_of(self, without: Array, K: Array, layers: Layers) -> Array:
+        """Theta of a network beside the law of another one with these gains K (n_a, n_s)."""
+        parts = dict(self.without.parts(np.ravel(without)))
+        parts["K" if "K" in parts else "K_a"] = K
         numbers = [np.array([len(layers.w)], dtype=np.float64), *map(np.ravel, layers)]
-        return np.concatenate([np.ravel(gains), *numbers])
-
-    def has_network(self, theta: Array) -> bool:
-        """Whether this theta has more than gains."""
-        return bool(theta[self.size :].any())
-
-    def acting(self, theta: Array) -> str:
-        """The name of the law that a theta is one of."""
-        return self.name if self.has_network(theta) else Affine.name
+        return np.concatenate([self.without.vector(parts), *numbers])
 
     def layers(self, network: Array) -> Layers:
         """The network of its numbers; ValueError where they are those of none."""
-        n_a, n_s = self.model.K_a.shape
+        n_a, n_x = self.n_a, self._inputs
         count = float(network[0])
         if not (1 <= count <= MOST_NEURONS and count == int(count)):
             raise ValueError(f"its network has {count:g} neurons; expected 1 to {MOST_NEURONS}")
         h = int(count)
-        ends = np.cumsum([1, h * n_s, h, n_a * h, n_a])
+        ends = np.cumsum([1, h * n_x, h, n_a * h, n_a])
         if len(network) < ends[-1]:
             raise ValueError(f"its network has {len(network)} numbers; expected {ends[-1]}")
         W, w, D, d = (network[i:j] for i, j in pairwise(ends))
-        return Layers(W.reshape(h, n_s), w, D.reshape(n_a, h), d)
+        return Layers(W.reshape(h, n_x), w, D.reshape(n_a, h), d)
+
+    @property
+    def depends_on_step(self) -> bool:
+        """Whether b_k is one of each step."""
+        return isinstance(self.without, FeedForward)
+
+    @property
+    def _inputs(self) -> int:
+        """n_x."""
+        return len(self.model.s_r) + self.n_a * self.depends_on_step
+
+    def _input(self, theta: Parts, z: Array, k: int) -> Array:
+        """x_k."""
+        s, (_, b) = self.reduced(z), self.feedback(theta)
+        return s if b.ndim == 1 else np.concatenate([s, b[min(k, len(b) - 1)]])
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
-        s = self.reduced(z)
-        a: Array = theta["K_a"] @ s + theta["K_b"] @ self.model.s_r
+        a = self.without.action(theta, z, memory, k)
         if not theta["network"].any():
             return a
         W, w, D, d = self.layers(theta["network"])
-        return a + (D @ np.tanh(W @ s + w) + d)
+        return a + (D @ np.tanh(W @ self._input(theta, z, k) + w) + d)
 
     def pull_back(
         self, theta: Parts, z: Array, memory: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array]:
-        s, by_network = self.reduced(z), np.zeros(len(theta["network"]))
-        by_s = theta["K_a"].T @ y
+        by_theta, by_z, memory = self.without.pull_back(theta, z, memory, k, y)
+        by_network, n_s = np.zeros(len(theta["network"])), len(self.model.s_r)
         if theta["network"].any():
             W, w, D, _ = self.layers(theta["network"])
-            hidden = np.tanh(W @ s + w)
+            x = self._input(theta, z, k)
+            hidden = np.tanh(W @ x + w)
             g = (1.0 - hidden**2) * (D.T @ y)
-            by_s += W.T @ g
-            own = np.concatenate([np.outer(g, s).ravel(), g, np.outer(y, hidden).ravel(), y])
+            by_x = W.T @ g
+            by_z = by_z + self.model.U @ by_x[:n_s]
+            if len(by_x) > n_s:
+                by_theta["b"][min(k, self.horizon - 1)] += by_x[n_s:]
+            own = np.concatenate([np.outer(g, x).ravel(), g, np.outer(y, hidden).ravel(), y])
             by_network[1 : 1 + len(own)] = own
-        by_theta = {
-            "K_a": np.outer(y, s),
-            "K_b": np.outer(y, self.model.s_r),
-            "network": by_network,
-        }
-        return by_theta, self.model.U @ by_s, memory
+        return {**by_theta, "network": by_network}, by_z, memory
 
     def matrices(self, theta: Array) -> dict[str, Array]:
-        """K, c, W, w and D of a = K s + c + D tanh(W s + w)."""
-        parts = self.parts(theta)
+        """K, c, W, w and D of a_k = K s_k + c_k + D tanh(W s_k + w_k).
+
+        c and w have one row for each step where b_k has.
+        """
+        parts, n_s = self.parts(theta), len(self.model.s_r)
         W, w, D, d = self.layers(parts["network"])
-        c = parts["K_b"] @ self.model.s_r + d
-        return {"K": parts["K_a"], "c": c, "W": W, "w": w, "D": D}
-
-    def step_times(self, theta: Array, z: Array, steps: int = 12) -> tuple[float, float]:
-        """Seconds of the first step from a state (n_z,), and of one of the next, in the median."""
-        parts, took = self.parts(theta), list[float]()
-        for k in range(steps):
-            began = perf_counter()
-            self.action(parts, z, np.zeros(0), k)
-            took.append(perf_counter() - began)
-        return took[0], float(np.median(took[1:]))
-
-    def has_gains(self, theta: Array) -> bool:
-        """Without a network it is the affine law, to the bit."""
-        return not self.has_network(theta)
-
-    def gains(self, theta: Array) -> Array:
-        return theta[: self.size].reshape(self.n_a, -1)
+        K, b = self.feedback(parts)
+        if W.shape[1] > n_s:
+            w = w + b @ W[:, n_s:].T
+        return {"K": K, "c": b + d, "W": W[:, :n_s], "w": w, "D": D}

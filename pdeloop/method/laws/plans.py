@@ -33,8 +33,10 @@ Nocedal, Wright, "Numerical Optimization", 2nd ed., algorithm 7.4 (L-BFGS). Grie
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +65,8 @@ LARGEST = 512
 _CLOSE = 1e-9
 """Relative distance at which an action counts as the one that was requested."""
 Flags = NDArray[np.bool_]
+Act: TypeAlias = Callable[[Array, Array, int], Array]
+"""States (M, n_z), the actions (M, n_a) before and the step to actions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +81,9 @@ class Planner:
         Of an episode of T steps.
     action_set : ActionSet
         What actuators can take.
-    K, b : (n_a, n_z) and (n_a,) arrays
-        The affine law a = K z + b.
+    K : (n_a, n_z) array
+    b : (n_a,) or (T, n_a) array
+        The affine law a_k = K z_k + b_k.
     around : bool
         Whether a plan is a deviation from a law; else it is the actions themselves.
     steps : int
@@ -115,8 +120,8 @@ class Planner:
     def begin(self, z: Array, k: int = 0) -> tuple[Array, Array]:
         """The cheapest plan (M, H, n_a) from states z (M, n_z) of those from all starts, and J."""
         M, H = len(z), self.length(k)
-        affine = self._affine_plan(z, H)
-        own = self.actions_of(affine, z)
+        affine = self._affine_plan(z, k, H)
+        own = self.actions_of(affine, z, k)
         size = np.sqrt((own**2).mean(axis=(1, 2)))[:, None, None]
         starts = [np.zeros_like(affine)]
         starts += [affine] if affine.any() else []
@@ -137,7 +142,7 @@ class Planner:
         if not self.action_set.rated:
             return z
         last = self.action_set.start if actions is None else actions
-        return np.hstack([z, np.broadcast_to(last, (len(z), len(self.b)))])
+        return np.hstack([z, np.broadcast_to(last, (len(z), self.model.n_a))])
 
     def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array, Flags]:
         """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan.
@@ -156,17 +161,17 @@ class Planner:
             plan, J = self.begin(z)
             fell = np.zeros(len(z), dtype=np.bool_)
         else:
-            affine = self._affine_plan(z, H)
+            affine = self._affine_plan(z, k, H)
             of_affine = self.costs(affine, z, k)
-            J, g, kept = self.gradient(self._extended(plan[:, :H], z), z, k)
+            J, g, kept = self.gradient(self._extended(plan[:, :H], z, k), z, k)
             fell = ~(of_affine >= J)
             plan = np.where(fell[:, None, None], affine, kept)
             if fell.any():
                 J, g, plan = self.gradient(plan, z, k)
             plan, J = self.improved(plan, z, k, self.iterations, (J, g))
         lost = ~np.isfinite(J)
-        of_law = self._law(z, self.K, self.b)
-        base = self._law(z, *self._feedback) if self.around else 0.0
+        of_law = self._law(z, k, self.K, self.b)
+        base = self._law(z, k, *self._feedback) if self.around else 0.0
         after = z[:, self.model.n_z :] if self.action_set.rated else None
         a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]), after=after)
         plan = np.where(lost[:, None, None], 0.0, plan)
@@ -176,18 +181,18 @@ class Planner:
         """A plan (M, H, n_a) without its first action, and with a zero at the end."""
         return np.concatenate([plan[:, 1:], np.zeros_like(plan[:, :1])], axis=1)
 
-    def _extended(self, plan: Array, z: Array) -> Array:
+    def _extended(self, plan: Array, z: Array, k: int) -> Array:
         """The plan (M, H, n_a) that ends as the affine law acts."""
         if self.around:
             return plan
-        found, states = plan.copy(), self._rolled(z, plan)[0]
+        found, (states, _), last = plan.copy(), self._rolled(z, plan, k), k + plan.shape[1] - 1
         with np.errstate(all="ignore"):
-            found[:, -1] = self.action_set.project(self._law(states[:, -2], self.K, self.b))
+            found[:, -1] = self.action_set.project(self._law(states[:, -2], last, self.K, self.b))
         return found
 
     def costs(self, v: Array, z: Array, k: int) -> Array:
         """J (M,) of plans v (M, H, n_a) from states z (M, n_z) at step k; infinite if not finite."""
-        states, actions = self._rolled(z, v)
+        states, actions = self._rolled(z, v, k)
         with np.errstate(all="ignore"):
             J, _, _ = self.cost.along(states[:, :-1], actions, k)
             J = J + self.at_end(states[:, -1], k + v.shape[1])[0]
@@ -200,12 +205,12 @@ class Planner:
         action at a bound that it could only leave outwards.
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
-        K, b = self._feedback
+        given, K, b = self._given(v, k, *self._feedback)
         self._to_go  # noqa: B018 - works with the model, which one thread may use at a time
 
         def work(sweep: Sweep, rows: slice) -> None:
             with np.errstate(all="ignore"):
-                states, requested, actions = sweep.roll(z[rows], v[rows], K, b)
+                states, requested, actions = sweep.roll(z[rows], given[rows], K, b)
                 costs, on_states, on_actions = self.cost.along(states[:, :-1], actions, k)
                 of_end, eta = self.at_end(states[:, -1], k + v.shape[1])
                 J[rows] = costs + of_end
@@ -307,31 +312,42 @@ class Planner:
             d += (alpha - beta)[:, None, None] * s
         return d
 
-    def actions_of(self, v: Array, z: Array) -> Array:
+    def actions_of(self, v: Array, z: Array, k: int = 0) -> Array:
         """The actions (M, H, n_a) of plans on the model, zero where they are not finite."""
-        return np.nan_to_num(self._rolled(z, v)[1], nan=0.0, posinf=0.0, neginf=0.0)
+        return np.nan_to_num(self._rolled(z, v, k)[1], nan=0.0, posinf=0.0, neginf=0.0)
 
-    def _affine_plan(self, z: Array, H: int) -> Array:
+    def _affine_plan(self, z: Array, k: int, H: int) -> Array:
         """The plans (M, H, n_a) with which the affine law acts on the model."""
-        none = np.zeros((len(z), H, len(self.b)))
+        none = np.zeros((len(z), H, self.model.n_a))
         K, b = self._feedback
         if K is self.K:
             return none
-        states, _, found = rolled(self._sweep, len(self.b), z, none, self.K, self.b)
+        states, _, found = rolled(
+            self._sweep, self.model.n_a, z, *self._given(none, k, self.K, self.b)
+        )
         if self.around:
             with np.errstate(all="ignore"):
-                law = self._law(states[:, :-1].reshape(-1, states.shape[2]), K, b)
+                law = self._law(states[:, :-1].reshape(-1, states.shape[2]), k, K, b)
                 found = found - law.reshape(found.shape)
         found[~np.isfinite(found).all(axis=(1, 2))] = 0.0
         return found
 
-    def _rolled(self, z: Array, v: Array) -> tuple[Array, Array]:
+    def _rolled(self, z: Array, v: Array, k: int) -> tuple[Array, Array]:
         """States (M, H + 1, n_z) and applied actions of plans."""
-        states, _, actions = rolled(self._sweep, len(self.b), z, v, *self._feedback)
+        given = self._given(v, k, *self._feedback)
+        states, _, actions = rolled(self._sweep, self.model.n_a, z, *given)
         return states, actions
 
-    def _law(self, z: Array, K: Array, b: Array) -> Array:
-        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], K) + b
+    def _given(self, v: Array, k: int, K: Array, b: Array) -> tuple[Array, Array, Array]:
+        """v, K and b of `Sweep.roll` from step k on, which has one b for all steps."""
+        if b.ndim == 1:
+            return v, K, b
+        steps = np.minimum(k + np.arange(v.shape[1]), len(b) - 1)
+        return v + b[steps], K, np.zeros(b.shape[1])
+
+    def _law(self, z: Array, k: int, K: Array, b: Array) -> Array:
+        now = b if b.ndim == 1 else b[min(k, len(b) - 1)]
+        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], K) + now
         return a
 
     @cached_property
@@ -395,3 +411,52 @@ class Planner:
         e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
         on_e = np.einsum("mi,ij->mj", e, self._to_go)
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
+
+
+def planned(planner: Planner) -> Act:
+    """The first actions of plans, each of which begins with the rest of the one before."""
+    plan: Array = np.zeros((0, 0, 0))
+
+    def act(z: Array, before: Array, k: int) -> Array:
+        nonlocal plan
+        a, plan, _ = planner.step(plan, planner.after(z, before), k)
+        plan = planner.shifted(plan)
+        return a
+
+    return act
+
+
+def seen_with_noise(act: Act, noise: float, rng: np.random.Generator | None = None) -> Act:
+    """The same from states with noise of this standard deviation, of one seed unless `rng` draws it."""
+    drawn = rng or np.random.default_rng(0)
+    return lambda z, before, k: act(
+        z + noise * drawn.standard_normal(z.shape) if noise else z, before, k
+    )
+
+
+def simulated(
+    planner: Planner, z: Array, act: Act, k: int = 0, steps: int = 0
+) -> tuple[Array, Array, Array]:
+    """Mean stage costs (M,), states (M, H + 1, n_z) and actions (M, H, n_a) on the model of plans.
+
+    From states z (M, n_z) at step k on, H = steps, or to the end of the episode. Where a simulation is
+    not finite, its cost is infinite, and it goes on from the target.
+    """
+    cost, model, totals = planner.cost, planner.model, np.zeros(len(z))
+    end = k + steps if steps else cost.horizon
+    a: Array = np.broadcast_to(planner.action_set.start, (len(z), model.n_a))
+    states, actions = [z], list[Array]()
+    with np.errstate(all="ignore"):
+        for i in range(k, end):
+            a = act(z, a, i)
+            cost.add(totals, z, a, i)
+            z = model.step(z, a)
+            lost = ~np.isfinite(z).all(axis=1)
+            if lost.any():
+                totals[lost], z[lost], a[lost] = np.inf, cost.field_target, 0.0
+            states.append(z)
+            actions.append(a)
+        if end == cost.horizon:
+            cost.add_terminal(totals, z)
+    totals[~np.isfinite(totals)] = np.inf
+    return totals / (end - k), np.stack(states, axis=1), np.stack(actions, axis=1)

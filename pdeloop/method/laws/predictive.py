@@ -7,8 +7,8 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from threading import get_ident
-from time import perf_counter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,8 +17,8 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import Arrays, FieldModel
@@ -30,8 +30,6 @@ LONGEST = 80
 """Steps of a plan, at most, unless the settings ask for more."""
 MOST_NUMBERS = 50_000
 """Numbers of a model that a theta has room for: messages carry one for each environment."""
-TIMED = 12
-"""Steps that are timed."""
 _MODEL = "model."
 _KEPT_PLANS, _KEPT_PLANNERS = 4096, 8
 
@@ -51,36 +49,31 @@ class PredictiveSettings(Settings):
     starts: int = setting(5, "plans that the first search begins from", 1, 100)
 
 
-class Predictive(Law):
+class Predictive(Extended):
     """The first action of a plan that is improved at every step on a model of the field:
 
-        a_k = P(K z_k + b + v_0),        v_0 .. v_{H-1} = argmin of the cost of the next H steps
+        a_k = P(K z_k + b_k + v_0),      v_0 .. v_{H-1} = argmin of the cost of the next H steps
 
-    (`pdeloop.method.laws.plans`). It begins as the affine law, without a model. An optimiser that
-    identifies one writes it into theta, with the cost, the admissible actions, H and the constants of
-    the search: `model_based` does. theta is then longer than `size`; zeros at its end mean nothing.
+    (`pdeloop.method.laws.plans`). It begins without a model. An optimiser that identifies one writes it
+    into theta, with the cost, the admissible actions, H and the constants of the search: `model_based`
+    does.
 
-    Its memory is the plan for the next steps, the action applied last, and how often the affine law's
-    plan was the cheaper one on the model, so that the search began with that.
+    Its memory is the plan for the next steps, the action applied last, and how often the plan of the
+    law that it began as was the cheaper one on the model, so that the search began with that.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd ed., 2017, chapter 2.
     """
 
     name = "predictive"
-    extends = True
-    needs_model = True
+    added = "plan"
     Settings = PredictiveSettings
     settings: ClassVar[PredictiveSettings] = PredictiveSettings()
-    base: ClassVar[type[Law]] = Affine
-    """The law that it begins as, and stays where nothing better is found."""
     worth: ClassVar[float] = 0.0
-    """Share of the affine law's cost that must be to be had on the model before rollouts are kept for a
-    law that plans; 0: they always are."""
+    """Share of the cost of the law that it begins as that must be to be had on the model before
+    rollouts are kept for a law that plans; 0: they always are."""
 
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)
-        self.without_plans = self.base(model, horizon)
-        """The law without a plan, whose parts and memory come first."""
         self._planners: OrderedDict[tuple[int, bytes], Planner] = OrderedDict()
         self._plans: OrderedDict[bytes, tuple[Array, Array, bool]] = OrderedDict()
 
@@ -91,26 +84,14 @@ class Predictive(Law):
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]
-        return self.without_plans.memory_size + (self.longest + 1) * self.n_a + 1
+        return self.without.memory_size + (self.longest + 1) * self.n_a + 1
 
     def memory_start(self) -> Array:
         own = np.zeros((self.longest + 1) * self.n_a + 1)
-        return np.concatenate([self.without_plans.memory_start(), own])
+        return np.concatenate([self.without.memory_start(), own])
 
-    def start(self) -> Parts:
-        """The parts of the law without plans, and no plan."""
-        return {**self.without_plans.start(), "plan": np.zeros(0)}
-
-    def parts(self, theta: Array) -> Parts:
-        """Those of the law without plans are its beginning; the rest is `plan`."""
-        size = self.without_plans.size
-        return {**self.without_plans.parts(theta[:size]), "plan": theta[size:]}
-
-    def vector(self, parts: Parts) -> Array:
-        return np.concatenate([self.without_plans.vector(parts), parts["plan"]])
-
-    def theta_of(self, without_plans: Array, planner: Planner) -> Array:
-        """Theta of plans on a model; without_plans: theta of the law that they are compared with.
+    def theta_of(self, without: Array, planner: Planner) -> Array:
+        """Theta of plans on a model; without: theta of the law that they are compared with.
 
         ValueError for a model of too many numbers.
         """
@@ -137,27 +118,14 @@ class Predictive(Law):
             raise ValueError(
                 f"its model has {len(numbers):,} numbers, and plans use at most {MOST_NUMBERS:,}"
             )
-        return np.concatenate([np.ravel(without_plans), numbers])
+        return np.concatenate([np.ravel(without), numbers])
 
     def _kept(self, model: FieldModel) -> Arrays:
         """What theta has of the model besides the law without plans."""
         return {_MODEL + name: own for name, own in model.arrays().items()}
 
-    def plans(self, theta: Array) -> bool:
-        """Whether this theta has a model to plan on."""
-        return bool(theta[self.without_plans.size :].any())
-
     def acting(self, theta: Array) -> str:
-        """The name of the law that a theta is one of."""
-        return Predictive.name if self.plans(theta) else self.base.name
-
-    def has_gains(self, theta: Array) -> bool:
-        """Without a model it is the law that it began as, to the bit."""
-        size = self.without_plans.size
-        return not self.plans(theta) and self.without_plans.has_gains(theta[:size])
-
-    def gains(self, theta: Array) -> Array:
-        return self.without_plans.gains(theta[: self.without_plans.size])
+        return Predictive.name if self.is_extended(theta) else self.without.name
 
     def planner(self, theta: Parts) -> Planner:
         """The planner in theta; ValueError where its numbers are those of none."""
@@ -190,7 +158,7 @@ class Predictive(Law):
             model,
             cost,
             ActionSet(n_a, low, high, zero_mean, rate=rate),
-            *self._feedback(theta),
+            *self.feedback_of_states(theta),
             around=bool(checked_array(arrays, "around", "b", ())),
             steps=steps,
             terminal=bool(checked_array(arrays, "terminal", "b", ())),
@@ -209,14 +177,14 @@ class Predictive(Law):
             raise ValueError(f"its model has sizes {model.n_z}, {model.n_a}; expected {n_z}, {n_a}")
         return model
 
-    def _feedback(self, theta: Parts) -> tuple[Array, Array]:
-        """K and b of a = K z + b for states of the model."""
-        K: Array = np.ascontiguousarray(theta["K_a"] @ self.model.U.T)
-        return K, theta["K_b"] @ self.model.s_r
+    def feedback_of_states(self, theta: Parts) -> tuple[Array, Array]:
+        """K (n_a, n_z) and b of the law that plans are compared with, for states of the model."""
+        K, b = self.feedback(theta)
+        return np.ascontiguousarray(K @ self.model.U.T), b
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         if not theta["plan"].any():
-            return self.without_plans.action(theta, z, self._split(memory)[0], k)
+            return self.without.action(theta, z, self._split(memory)[0], k)
         return self._planned(theta, z, memory, k)[0]
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
@@ -229,37 +197,21 @@ class Predictive(Law):
             after[-1] = memory[-1] + fell
         if not len(first):
             return after
-        return np.concatenate([self.without_plans.memory_update(theta, z, first, action, k), after])
+        return np.concatenate([self.without.memory_update(theta, z, first, action, k), after])
 
     def _split(self, memory: Array) -> tuple[Array, Array]:
         """The memory of the law without plans, and that of plans."""
-        size = self.without_plans.memory_size
+        size = self.without.memory_size
         return memory[:size], memory[size:]
 
     def _state(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         """The state (1, n_z) that a plan starts from."""
         return z[None]
 
-    def step_times(self, theta: Array, z: Array, steps: int = TIMED) -> tuple[float, float]:
-        """Seconds of the first step from a state (n_z,), and of one of the next, in the median.
-
-        The state follows the law's own model; without one it stays.
-        """
-        own = type(self)(self.model, self.horizon)
-        own.cost = self.cost
-        parts, memory, took = own.parts(theta), own.memory_start(), list[float]()
-        model = own.planner(parts).model if own.plans(theta) else None
-        for k in range(max(min(steps, self.horizon), 2)):
-            began = perf_counter()
-            a = own.action(parts, z, memory, k)
-            memory = own.memory_update(parts, z, memory, a, k)
-            took.append(perf_counter() - began)
-            z = z if model is None else self._measured(model, z, memory, a)
-        return took[0], float(np.median(took[1:]))
-
-    def _measured(self, model: FieldModel, z: Array, memory: Array, a: Array) -> Array:
-        """What follows the measurement z and the action a on the model; memory: after that step."""
-        after: Array = model.step(z[None], a[None])[0]
+    def followed(self, theta: Parts, z: Array, memory: Array, a: Array) -> Array:
+        if not theta["plan"].any():
+            return z
+        after: Array = self.planner(theta).model.step(z[None], a[None])[0]
         return after
 
     def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array, bool]:
@@ -286,7 +238,7 @@ class Predictive(Law):
 
 
 class Auto(Predictive):
-    """`Predictive` where the model says that more than 3 % of the cost is to be had; else `Affine`."""
+    """`Predictive` where the model says that more than 3 % of the cost is to be had; else `without`."""
 
     name = "auto"
     worth = 0.03
@@ -301,15 +253,18 @@ class PredictiveKalman(Predictive):
     """
 
     name = "predictive_kalman"
-    base = ExtendedKalman
     filtered = True
     from_readings = ExtendedKalman.from_readings
+
+    @cached_property
+    def without(self) -> Law:
+        return ExtendedKalman(self.model, self.horizon)
 
     @property
     def kalman(self) -> ExtendedKalman:
         """The law without plans."""
-        assert isinstance(self.without_plans, ExtendedKalman)
-        return self.without_plans
+        assert isinstance(self.without, ExtendedKalman)
+        return self.without
 
     def _kept(self, model: FieldModel) -> Arrays:
         return {}
@@ -320,15 +275,17 @@ class PredictiveKalman(Predictive):
             raise ValueError("it has no filter whose estimates a plan could start from")
         return known.model
 
-    def _feedback(self, theta: Parts) -> tuple[Array, Array]:
+    def feedback_of_states(self, theta: Parts) -> tuple[Array, Array]:
         return np.ascontiguousarray(theta["K_e"]), theta["b"]
 
     def _state(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         found = self.kalman.estimate(theta, z, memory, k)
         return np.full((1, self.kalman.points), np.nan) if found is None else found[0]
 
-    def _measured(self, model: FieldModel, z: Array, memory: Array, a: Array) -> Array:
-        assert isinstance(model, SensedModel)
+    def followed(self, theta: Parts, z: Array, memory: Array, a: Array) -> Array:
+        model = self.planner(theta).model if theta["plan"].any() else None
+        if not isinstance(model, SensedModel):
+            return z
         return self.kalman.prediction(self._split(memory)[0])[model.seen]
 
 
