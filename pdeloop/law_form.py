@@ -23,7 +23,6 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 
@@ -107,7 +106,7 @@ def law_form(run: FinishedRun, which: str = "adapted", seed: int | None = None) 
         slope = own["D"] * (1.0 - np.tanh(own["W"] @ model.s_r + own["w"]) ** 2) @ own["W"]
         loop = model.A + model.B @ (own["K"] + slope)  # at the target
     else:
-        steps = ", as it depends on the step" if isinstance(law, Neural | FeedForward) else ""
+        steps = ", as it depends on the step" if isinstance(law, Neural) else ""
         raise ParameterError(
             f"the law '{law.name}' has no such form{steps}; train with --law affine or observer, or "
             "write its parameters as .npz"

@@ -43,6 +43,11 @@ class Extended(Law):
         law.cost = cost
         return law
 
+    @property
+    def depends_on_step(self) -> bool:
+        """Whether b_k is one of each step."""
+        return isinstance(self.without, FeedForward)
+
     def start(self) -> Parts:
         """The parts of `without`, and nothing added."""
         return {**self.without.start(), self.added: np.zeros(0)}
@@ -100,6 +105,6 @@ class Extended(Law):
 
     def feedback(self, theta: Parts) -> tuple[Array, Array]:
         """K (n_a, n_s) and b of `without`, a_k = K s_k + b_k: (n_a,), or a row for each step."""
-        if isinstance(self.without, FeedForward):
+        if self.depends_on_step:
             return theta["K"], theta["b"]
         return theta["K_a"], theta["K_b"] @ self.model.s_r

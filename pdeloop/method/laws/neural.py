@@ -12,7 +12,6 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Parts
 from pdeloop.method.laws.extended import Extended
-from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.settings import Settings, setting
 
 MOST_NEURONS = 512
@@ -73,11 +72,6 @@ class Neural(Extended):
             raise ValueError(f"its network has {len(network)} numbers; expected {ends[-1]}")
         W, w, D, d = (network[i:j] for i, j in pairwise(ends))
         return Layers(W.reshape(h, n_x), w, D.reshape(n_a, h), d)
-
-    @property
-    def depends_on_step(self) -> bool:
-        """Whether b_k is one of each step."""
-        return isinstance(self.without, FeedForward)
 
     @property
     def _inputs(self) -> int:
