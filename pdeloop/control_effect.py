@@ -17,6 +17,10 @@ SOME_BEYOND, MOST_BEYOND = 0.05, 0.5
 """Shares of the exploratory actions beyond the bounds that are worth a note, and too many."""
 
 
+MORE = 10.0
+"""Factor of actions that are tried where the explored ones do nothing."""
+
+
 def idle_actuators(plant: Plant, states: Array, actions: Array) -> list[int]:
     """The actuators that move none of the states (N, n_z) in a step, each with its actions (N, n_a)."""
     still = plant.evaluate(states, np.zeros_like(actions))[0]
@@ -27,6 +31,22 @@ def idle_actuators(plant: Plant, states: Array, actions: Array) -> list[int]:
         if np.array_equal(plant.evaluate(states, alone)[0], still):
             idle.append(j)
     return idle
+
+
+def without_effect(plant: Plant, states: Array, actions: Array) -> str:
+    """Which actuators, by explored actions (N, n_a), move no state (N, n_z), and what to do."""
+    idle = idle_actuators(plant, states, actions)
+    if not idle:
+        return ""
+    every = len(idle) == plant.n_a
+    if set(idle) - set(idle_actuators(plant, states, MORE * actions)):
+        which = "no explored action moves" if every else f"explored actions of {idle} do not move"
+        return (
+            f"{which} the state, larger ones do: set an exploration_variance beyond what the actuators "
+            "do not answer to"
+        )
+    which = "no action moves" if every else f"actuators {idle} do not move"
+    return f"{which} the state: check how step uses its argument a"
 
 
 def beyond_bounds(plant: Plant, actions: Array) -> tuple[bool, str]:

@@ -20,7 +20,7 @@ from controller_node.identification import DesignSettings, design_each
 from controller_node.law_batch import LawBatch
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
-from pdeloop.control_effect import beyond_bounds, idle_actuators, judged
+from pdeloop.control_effect import beyond_bounds, judged, without_effect
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
@@ -65,11 +65,8 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     explored = _explore(plant, values)
     if values["plant"]:
         yield _repeatable(plant, explored)
-        if plant.settable and (idle := idle_actuators(plant, *_some_steps(explored))):
-            which = "no action moves" if len(idle) == plant.n_a else f"actuators {idle} do not move"
-            yield Finding(
-                "actuators", False, f"{which} the state: check how step uses its argument a"
-            )
+        if plant.settable and (text := without_effect(plant, *_some_steps(explored))):
+            yield Finding("actuators", False, text)
     yield _halving(plant, values, explored)
     yield _actuators(plant)
     if sensors := few_sensors(values):

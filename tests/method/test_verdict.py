@@ -21,6 +21,7 @@ from pdeloop.method.adapt.verdict import (
     choose,
     evidence_of,
     evidence_of_pairs,
+    evidence_of_rollouts,
 )
 
 
@@ -130,6 +131,23 @@ def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, exc
     assert known is not None
     favoured = held_out < 0.0 and held_out + excess < 0.0
     assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
+
+
+@pytest.mark.parametrize("order", [(FIRST, ADAPTED, NONE), (FIRST, NONE, ADAPTED)])
+def test_where_the_first_law_always_diverges_the_cheapest_of_the_others_is_taken(
+    order: tuple[str, ...],
+) -> None:
+    laws = {name: np.full((1, 1), float(i)) for i, name in enumerate((FIRST, ADAPTED, NONE))}
+    costs = {FIRST: (np.inf, np.inf), ADAPTED: (5.0, 5.2), NONE: (12.0, 13.4, 12.5)}
+    seen = [
+        Record(laws[name], cost, np.ones((1, 1)), np.ones((0, 1)), field_seed=i)
+        for name, own in costs.items()
+        for i, cost in enumerate(own)
+    ]
+    known = {name: laws[name] for name in order}
+    loop: Any = Costs(lambda x, i: 1.0)
+    assert evidence_of(loop, known, FIRST, seen, np.ones((2, 1)), ZERO) is None
+    assert choose(evidence_of_rollouts(known, FIRST, seen), FIRST, 1.0).chosen == ADAPTED
 
 
 def test_fields_from_which_both_laws_diverge_are_left_out_of_their_difference() -> None:

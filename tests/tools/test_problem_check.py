@@ -156,6 +156,20 @@ def test_inputs_without_effect_are_named() -> None:
     assert not good and text.startswith("no action moves the state")
 
 
+class Sticky(Around):
+    """The same with valves that do not answer to small actions."""
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return super().step(z, np.where(np.abs(a) < 1.5, 0.0, a))
+
+
+def test_inputs_that_only_large_actions_move_are_told() -> None:
+    good, text = findings_of(Sticky())["actuators"]
+    assert not good and text.startswith(
+        "no explored action moves the state, larger ones do: set an"
+    )
+
+
 class Bounded(Around):
     """The same with a saturation of its own, at a third of the exploration's standard deviation."""
 

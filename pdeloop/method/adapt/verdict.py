@@ -175,7 +175,8 @@ def evidence_of(
 ) -> dict[str, Evidence] | None:
     """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
 
-    None where rollouts alone count: the model replays them, or knows nothing of one of the laws.
+    None where rollouts alone count: the model replays them, or knows nothing of one of the laws; or
+    where all rollouts of the law to stay with diverged, so that its model costs mean nothing.
 
     base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
     held_out: change of the adapted law on fields that did not make it.
@@ -187,7 +188,8 @@ def evidence_of(
     for name, law in laws.items():
         own = [r for r in records if np.array_equal(r.policy, law)]
         excess = _excess(loop, law, own)
-        if any(record.usable for record in own) and not np.isfinite(excess).any():
+        lost = name == base and own and not any(record.usable for record in own)
+        if lost or (any(record.usable for record in own) and not np.isfinite(excess).any()):
             return None
         same = name != base and np.array_equal(law, laws[base])
         if same or not (len(excess) or name == base):
@@ -208,7 +210,7 @@ def evidence_of_rollouts(
     """The evidence of rollouts alone, except for `base` only for laws that were measured.
 
     It is the mean difference on the initial fields that a law and the base share if there are two or
-    more, else the difference of their means.
+    more, else the difference of their means; of the mean to 0 where the base has no finite cost.
     """
     costs: dict[str, dict[int, float]] = {}
     for name, law in laws.items():
@@ -237,9 +239,10 @@ def _difference(own: Mapping[int, float], base: Mapping[int, float]) -> Estimate
     common = [seed for seed in finite if seed >= 0 and seed in others]
     if len(common) > 1:
         return mean_of(np.array([finite[seed] - others[seed] for seed in common]))
-    if not (finite and others):
+    if not finite:
         return ZERO
-    return mean_of(np.array(list(finite.values()))) - mean_of(np.array(list(others.values())))
+    mean = mean_of(np.array(list(finite.values())))
+    return mean - mean_of(np.array(list(others.values()))) if others else mean
 
 
 def cheaper_law(
