@@ -49,20 +49,18 @@ from pdeloop.method.models.base import FieldModel, Measured, least_squares
 from pdeloop.method.models.noise_level import signal_power
 from pdeloop.method.models.prediction import finite
 from pdeloop.method.models.settings import (
-    CLIP,
     COEFFICIENT_RIDGE,
     FAR,
-    FIRST_SUBSTEPS,
     LEAST_CORRECTION,
     FieldModelSettings,
 )
 from pdeloop.method.models.spectral import SpectralModel, Spectrum
 from pdeloop.method.models.spectral_fit import (
-    POWERS,
     Form,
     Regression,
     fewer_of,
-    polynomial,
+    nothing,
+    solved,
     substeps_of,
 )
 from pdeloop.solver.polynomial_step import phi_functions
@@ -227,17 +225,7 @@ def fit_noisy(
     largest = max(float(np.abs(rollout.states).max()) for rollout in rollouts)
     noise_power = noise**2 / n_z
     cut, shares = _wavenumbers(rollouts, noise)
-    modes = n_z // 2 + 1
-    model = SpectralModel(
-        form.name,
-        np.zeros(modes, complex),
-        np.zeros((form.degree - 1, modes), complex),
-        np.eye(form.degree - 1),
-        np.zeros((n_z, n_a)),
-        np.zeros(n_z),
-        FIRST_SUBSTEPS,
-        CLIP * largest if form.degree > POWERS else np.inf,
-    )
+    model = nothing(form, n_z, n_a, largest)
     best, least = None, np.inf
     known = filtered(model, rollouts, first, shares)
     for window, share in PASSES:
@@ -251,7 +239,7 @@ def fit_noisy(
         compared = replace(form, shares=(max(share, form.shares[-1]),))
         for strictness in STRICTNESS:
             strict = replace(data, strictness=strictness)
-            found = _pass(strict, model, compared)
+            found = solved(strict, model, compared, 0)
             if found is None:
                 continue
             found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
@@ -374,31 +362,3 @@ def _orthonormal(columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
         columns / np.where(scale > 0.0, scale, 1.0), full_matrices=False
     )
     return left * (values > 1e-10 * values[:, :1])[:, None]
-
-
-def _pass(data: WindowRegression, model: SpectralModel, form: Form) -> SpectralModel | None:
-    """The equation of a regression; None where it is not finite."""
-    linear, multipliers, polynomials = polynomial(data, form, 0)
-    if form.degree <= POWERS:
-        multipliers, polynomials = polynomials.T @ multipliers, np.eye(form.degree - 1)
-    cut, modes = data.y.shape[1], len(linear)
-    # What is not seen decays, as small scales of any equation do that stays finite (Tadmor's vanishing
-    # viscosity): without it a front would gather its energy there.
-    beyond = np.maximum(np.arange(modes) - cut, 0) / max(modes - cut, 1)
-    linear = np.where(beyond > 0.0, np.minimum(linear.real, -beyond) + 1j * linear.imag, linear)
-    symbols = polynomials.T @ multipliers
-    left = data.y - (linear[:cut] - data.symbols[0, :cut]) * data.W[0]
-    left = left - np.einsum("pk,pnk->nk", symbols[:, :cut], data.W[1:])
-    if not (np.isfinite(left).all() and np.isfinite(symbols).all() and np.isfinite(linear).all()):
-        return None
-    spectrum = np.zeros((model.n_a + 1, modes), complex)
-    spectrum[:, :cut] = data.inputs(left)
-    inputs = model.n_z * scipy.fft.irfft(spectrum, model.n_z)
-    return replace(
-        model,
-        linear=linear,
-        multipliers=multipliers,
-        polynomials=polynomials,
-        B=inputs[:-1].T,
-        constant=inputs[-1],
-    )

@@ -124,6 +124,11 @@ class Regression:
         """Real coefficients of complex columns (N, terms) that explain values (N,) best."""
         return _real_least_squares(columns, values)
 
+    def inputs(self, left: Spectrum) -> Spectrum:
+        """F of B and c, (n_a + 1, modes), from what the other terms leave (N, modes)."""
+        found: Spectrum = least_squares(self.common, left) / self.phi
+        return found
+
     @property
     def k(self) -> Spectrum:
         """ik, in units of the highest wavenumber."""
@@ -257,21 +262,10 @@ def fit_spectral(
 ) -> SpectralModel | None:
     """The equation of that form, or None where half of the samples overflow the first ones."""
     samples = samples.thinned(_SAMPLES)
-    start = None
-    if form.free == "linear":  # whose passes need one
-        start = fit_spectral(samples, replace(form, free="none"), settings)
-    (_, n_z), n_a = samples.before.shape, samples.actions.shape[1]
     largest = float(np.abs(samples.before).max())
-    model = start or SpectralModel(
-        form.name,
-        np.zeros(n_z // 2 + 1, complex),
-        np.zeros((form.degree - 1, n_z // 2 + 1), complex),
-        np.eye(form.degree - 1),
-        np.zeros((n_z, n_a)),
-        np.zeros(n_z),
-        FIRST_SUBSTEPS,
-        CLIP * largest if form.degree > POWERS else np.inf,
-    )
+    model = nothing(form, samples.before.shape[1], samples.actions.shape[1], largest)
+    if form.free == "linear":  # whose passes need a start
+        model = fit_spectral(samples, replace(form, free="none"), settings) or model
     # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
     best, least, tried = None, np.inf, model
     for turn in range(_PASSES + 1):
@@ -284,7 +278,7 @@ def fit_spectral(
         if turn == _PASSES or (settled and turn > len(form.shares)):
             break
         if data is not None and (tried is best or turn <= len(form.shares)):
-            model, found = tried, _pass(data, tried, form, turn)
+            model, found = tried, solved(data, tried, form, turn)
         else:
             found = _between(best or model, tried)  # half of the way
         if found is None:
@@ -304,7 +298,22 @@ def _between(first: SpectralModel, second: SpectralModel) -> SpectralModel:
     return replace(second, **middle)
 
 
-def _pass(data: Regression, model: SpectralModel, form: Form, turn: int) -> SpectralModel | None:
+def nothing(form: Form, n_z: int, n_a: int, largest: float) -> SpectralModel:
+    """The equation of that form of which nothing is known; largest: measured value."""
+    modes, powers = n_z // 2 + 1, form.degree - 1
+    return SpectralModel(
+        form.name,
+        np.zeros(modes, complex),
+        np.zeros((powers, modes), complex),
+        np.eye(powers),
+        np.zeros((n_z, n_a)),
+        np.zeros(n_z),
+        FIRST_SUBSTEPS,
+        CLIP * largest if form.degree > POWERS else np.inf,
+    )
+
+
+def solved(data: Regression, model: SpectralModel, form: Form, turn: int) -> SpectralModel | None:
     """The equation of a regression; None where it is not finite."""
     if form.free == "all":
         linear, multipliers, polynomials = all_free(data)
@@ -314,11 +323,20 @@ def _pass(data: Regression, model: SpectralModel, form: Form, turn: int) -> Spec
         linear, multipliers, polynomials = polynomial(data, form, turn)
     if form.degree <= POWERS:
         multipliers, polynomials = polynomials.T @ multipliers, np.eye(form.degree - 1)
+    modes, seen = len(linear), data.y.shape[1]
+    # What is not seen decays, as small scales of any equation do that stays finite (Tadmor's vanishing
+    # viscosity): without it a front would gather its energy there.
+    beyond = np.maximum(np.arange(modes) - seen, 0) / max(modes - seen, 1)
+    linear = np.where(beyond > 0.0, np.minimum(linear.real, -beyond) + 1j * linear.imag, linear)
     symbols = polynomials.T @ multipliers
-    left = data.y - (linear - data.symbols[0]) * data.W[0]
-    left = left - np.einsum("pk,pnk->nk", symbols, data.W[1:])
-    inputs = model.n_z * scipy.fft.irfft(least_squares(data.common, left) / data.phi, model.n_z)
-    if not (np.isfinite(linear).all() and np.isfinite(symbols).all() and np.isfinite(inputs).all()):
+    left = data.y - (linear[:seen] - data.symbols[0, :seen]) * data.W[0]
+    left = left - np.einsum("pk,pnk->nk", symbols[:, :seen], data.W[1:])
+    if not all(np.isfinite(own).all() for own in (left, linear, symbols)):
+        return None
+    spectrum = np.zeros((model.n_a + 1, modes), complex)
+    spectrum[:, :seen] = data.inputs(left)
+    inputs = model.n_z * scipy.fft.irfft(spectrum, model.n_z)
+    if not np.isfinite(inputs).all():
         return None
     return replace(
         model,
