@@ -19,10 +19,6 @@ from pdeloop.method.models.linear import LinearModel, LowRankModel
 from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import (
-    EQUATION,
-    FIRST,
-    SHARED,
-    TERMS,
     Actuators,
     SensedModel,
     grid_points,
@@ -123,29 +119,6 @@ def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     again = model_of(arrays).arrays()
     assert again.keys() == arrays.keys()
     assert all(np.array_equal(again[name], arrays[name]) for name in arrays)
-
-
-VARIED = np.arange(len(TERMS), EQUATION)
-"""The unknowns of coefficients that depend on x."""
-
-
-def test_an_older_model_between_sensors_has_equal_actuators_of_no_declared_width() -> None:
-    arrays = MODELS["sensed"].arrays()
-    older = {name: own for name, own in arrays.items() if name != "widths"}
-    own = arrays["shared"]
-    first, terms = np.append(own[: len(FIRST)], own[EQUATION:]), np.delete(own, VARIED)
-    for known in (terms, first, first[: len(first) - N_A]):
-        found = model_of({**older, "shared": known}).arrays()
-        shared = found["shared"]
-        assert shared.shape == own.shape and not shared[VARIED].any()
-        assert shared[len(FIRST) : len(TERMS)].any() == (known is terms)
-        np.testing.assert_array_equal(shared[: len(FIRST)], own[: len(FIRST)])
-        np.testing.assert_array_equal(shared[EQUATION:SHARED], own[EQUATION:SHARED])
-        equal = len(known) < len(first)
-        np.testing.assert_array_equal(shared[SHARED:], 0.0 if equal else own[SHARED:])
-    np.testing.assert_array_equal(found["widths"], np.zeros(N_A))
-    declared = model_of({**older, "width": np.array(0.25)}).arrays()
-    np.testing.assert_array_equal(declared["widths"], np.full(N_A, 0.25))
 
 
 def test_a_model_has_no_actuators_of_negative_width() -> None:

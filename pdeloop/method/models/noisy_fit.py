@@ -70,11 +70,13 @@ from pdeloop.solver.polynomial_step import phi_functions
 class Filtered:
     """States of rollouts, (L + 1, n_z) each, and the model's predictions of them.
 
-    power: mean power of the innovations at each wavenumber, of Fourier transforms over the number of
-    points; lost: predictions that were not finite, in whose place the last state stood.
+    innovations: measured minus predicted states, (L, n_z) each; power: their mean at each wavenumber,
+    of Fourier transforms over the number of points; lost: predictions that were not finite, in whose
+    place the last state stood.
     """
 
     states: list[Array]
+    innovations: list[Array]
     power: Array
     lost: int
 
@@ -84,14 +86,18 @@ def filtered(
     rollouts: Sequence[Measured],
     first: Sequence[Array],
     shares: Array,
+    *,
+    settling: bool = False,
 ) -> Filtered:
     """The states of rollouts, each with one state more than actions.
 
-    first: their initial states; shares: g, of each wavenumber. A prediction far beyond the measured
-    states is rejected.
+    first: their initial states; shares: g, of each wavenumber; settling: at the beginning no less than
+    that of an unknown state that rests, 1/(k + 2). A prediction far beyond the measured states is
+    rejected.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]
+    innovations = [np.empty(own[1:].shape) for own in found]
     for own, state in zip(found, z, strict=True):
         own[0] = state
     lengths = np.array([len(rollout.actions) for rollout in rollouts])
@@ -104,15 +110,15 @@ def filtered(
             predicted = model.step(z[rows], actions)
             wrong = ~(np.abs(predicted).max(axis=1) <= most)
         predicted[wrong] = z[rows][wrong]
-        innovation = (
-            scipy.fft.rfft(np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted) / n_z
-        )
-        z[rows] = predicted + n_z * scipy.fft.irfft(shares * innovation, n_z)
-        for i in rows:
-            found[i][k + 1] = z[i]
+        left = np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted
+        innovation = scipy.fft.rfft(left) / n_z
+        own_shares = np.maximum(shares, 1.0 / (k + 2)) if settling else shares
+        z[rows] = predicted + n_z * scipy.fft.irfft(own_shares * innovation, n_z)
+        for i, own in zip(rows, left, strict=True):
+            found[i][k + 1], innovations[i][k] = z[i], own
         total += np.sum(np.abs(innovation) ** 2, axis=0)
         count, lost = count + len(rows), lost + int(wrong.sum())
-    return Filtered(found, total / count, lost)
+    return Filtered(found, innovations, total / count, lost)
 
 
 _NOISY_STEPS = 2000

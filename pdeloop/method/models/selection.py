@@ -46,10 +46,10 @@ from pdeloop.method.models.choice import (
     with_clean,
 )
 from pdeloop.method.models.noise_level import is_white, noise_level, share_of_noise, short_waves
+from pdeloop.method.models.noisy_fit import filtered
 from pdeloop.method.models.prediction import beginnings, errors, pieces
 from pdeloop.method.models.settings import (
     DEFAULTS,
-    FAR,
     LEAST_CORRECTION,
     NOISE_MISJUDGED,
     FieldModelSettings,
@@ -328,37 +328,19 @@ def fit_undeclared_noise(
 def innovations(
     model: FieldModel, rollouts: Sequence[Measured], noise: float
 ) -> list[Array] | None:
-    """Measured minus predicted states (L, n_z) of each rollout, along its filtered states.
+    """Measured minus predicted states of each rollout, along its filtered states, but for the first.
 
     rollouts: with `clean`, where the filter begins; None where the model runs away.
     """
     power = noise**2 / model.n_z
     shares = np.full(model.n_z // 2 + 1, 0.5)
     for _ in range(_TURNS):
-        left = []
-        for rollout in rollouts:
-            if (own := _along(model, rollout, shares)) is None:
-                return None
-            left.append(own)
+        first = [rollout.known[0] for rollout in rollouts]
+        along = filtered(model, rollouts, first, shares, settling=True)
+        if along.lost:
+            return None
+        left = [own[_BEGINNING:] for own in along.innovations]
         spectra = np.concatenate([scipy.fft.rfft(own) / model.n_z for own in left])
         error = np.maximum(np.mean(np.abs(spectra) ** 2, axis=0) - power, 0.0)
         shares = np.clip(error / (error + power), LEAST_CORRECTION, 1.0)
     return left
-
-
-def _along(model: FieldModel, rollout: Measured, shares: Array) -> Array | None:
-    """The innovations of one rollout, but for the first; None where the model runs away.
-
-    Until the share that is given is the best one, it is that of an unknown state that rests, 1/(k + 1).
-    """
-    z, most = rollout.known[:1], FAR * float(np.abs(rollout.states).max())
-    left = np.empty((len(rollout.actions), model.n_z))
-    for k, action in enumerate(rollout.actions):
-        with np.errstate(all="ignore"):
-            predicted = model.step(z, action[None])
-        if not np.abs(predicted).max() <= most:
-            return None
-        left[k] = rollout.states[k + 1] - predicted[0]
-        own = np.maximum(shares, 1.0 / (k + 2))
-        z = predicted + scipy.fft.irfft(own * scipy.fft.rfft(left[k : k + 1]), model.n_z)
-    return left[_BEGINNING:]

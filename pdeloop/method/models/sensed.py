@@ -41,7 +41,6 @@ Anderson, Moore, "Optimal Filtering", 1979, section 8.2 (extended Kalman filter)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property, lru_cache
 from typing import ClassVar
@@ -114,20 +113,6 @@ def well_posed(shared: Array) -> Array:
         reached, most = float(np.hypot(cosines, sines).sum()), sign * found[TERMS.index(term)]
         if reached > most and not any(found[TERMS.index(other)] for other in others):
             found[waves] *= max(most / reached, _KEPT)
-    return found
-
-
-def unknowns_of(arrays: Mapping[str, NDArray[np.generic]], name: str, n_a: int) -> Array:
-    """The unknowns of `arrays`; older ones have no coefficients of x, or the first terms alone."""
-    known, others = arrays.get(name), SHARED - EQUATION
-    pairs = (len(FIRST), 0), (len(FIRST), n_a), (len(TERMS), n_a)
-    older = {(terms + others + strengths,): terms for terms, strengths in pairs}
-    if known is None or known.shape not in older:
-        return numbers_of(arrays, name, unknowns(n_a))
-    terms, found = older[known.shape], np.zeros(unknowns(n_a))
-    own = numbers_of(arrays, name, len(known))
-    found[:terms] = own[:terms]
-    found[EQUATION : EQUATION + len(own) - terms] = own[terms:]
     return found
 
 
@@ -242,26 +227,15 @@ class SensedModel(SpectralModel):
         sensors = int(checked_array(arrays, "sensors", "i", ()))
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
-        own = shaped({"largest": np.array(0.0)} | arrays, cls.OWN)
-        centres = numbers_of(arrays, "centres", whole.n_a)
-        own["shared"] = unknowns_of(arrays, "shared", whole.n_a)
+        own = shaped(arrays, cls.OWN)
+        own["shared"] = numbers_of(arrays, "shared", unknowns(whole.n_a))
         known = {name: getattr(whole, name) for name in _FIELDS}
-        actuators = Actuators(centres, _widths_of(arrays, whole.n_a))
-        return SensedModel(**known, **own, actuators=actuators)
-
-
-def _widths_of(arrays: Arrays, n_a: int) -> Array:
-    """The widths of `arrays`; older ones have one for all actuators, or none."""
-    if "widths" in arrays:
-        widths = numbers_of(arrays, "widths", n_a)
-    else:
-        width = float(checked_array(arrays, "width", "f", ())) if "width" in arrays else 0.0
-        widths = np.full(n_a, width)
-    if (widths < 0.0).any():
-        raise ValueError(
-            f"a model has actuators of the width {widths.min():g}; expected at least 0"
-        )
-    return widths
+        where = {name: numbers_of(arrays, name, whole.n_a) for name in ("centres", "widths")}
+        if (where["widths"] < 0.0).any():
+            raise ValueError(
+                f"a model has actuators of the width {where['widths'].min():g}; expected at least 0"
+            )
+        return SensedModel(**known, **own, actuators=Actuators(**where))
 
 
 def sensed_model(
