@@ -113,6 +113,10 @@ MODELS[NEIGHBOURS] = FiniteDifferenceModel(
 )
 
 
+SHIFTS = np.isin(np.arange(12), range(6, 11)).astype(np.int64)
+"""Where a table has the shifts of factors."""
+
+
 @pytest.mark.parametrize("form", [*FORMS, NEIGHBOURS])
 def test_a_model_comes_back_from_its_arrays(form: str) -> None:
     arrays = MODELS[form].arrays()
@@ -152,9 +156,9 @@ def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
         ("spectral", "fewer", np.array([[1.0, 5.0]])),
         ("spectral", "fewer", np.array([[1.0, 0.0]])),
         ("finite-difference", "substeps", np.array(2**62)),
-        ("finite-difference", "table", np.full((len(features_of(1)), 7), 9)),
-        ("finite-difference", "table", np.full((len(features_of(1)), 7), -9)),
-        (NEIGHBOURS, "shifts", np.full((len(neighbour_features(1)), 5), 3)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 12), 9)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 12), -9)),
+        (NEIGHBOURS, "table", MODELS[NEIGHBOURS].arrays()["table"] + N_Z * SHIFTS),
         ("sensed", "sensors", np.array(-1)),
         ("sensed", "sensors", np.array(SENSORS + 1)),
         ("linear", "form", np.array("quantum")),

@@ -79,7 +79,7 @@ def test_a_model_comes_back_from_its_arrays_or_is_refused(made: type) -> None:
     prefix = "inner." if isinstance(own, CoarseModel) else ""
     for shape in ((NY, NX + 1), (N_Z,), (-NY, -NX), (NY, 0)):
         with pytest.raises(ValueError, match="axes"):
-            model_of(own.arrays() | {f"{prefix}shape": np.array(shape)})
+            model_of(own.arrays() | {f"{prefix}axes": np.array(shape)})
     if isinstance(own, CoarseModel):
         for number in (-1, own.n_z):
             with pytest.raises(ValueError, match="outside of its state"):

@@ -29,7 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from pdeloop.method.models.base import (
     checked_substeps,
     linearised,
     numbers_of,
+    shaped,
     text_of,
 )
 from pdeloop.method.models.finite_difference_kernels import (
@@ -121,6 +122,14 @@ class FiniteDifferenceModel(StoredModel):
     """
 
     FORM = "finite-difference"
+    SHAPES: ClassVar = {
+        "table": f"i:f {2 + 2 * MOST_FACTORS}",
+        "coefficients": "f c p",
+        "B": "n a",
+        "constant": "n",
+        "substeps": "i:",
+        "axes": "i:d",
+    }
     kind: str
     features: tuple[Feature, ...]
     coefficients: Array
@@ -141,13 +150,13 @@ class FiniteDifferenceModel(StoredModel):
     def step(self, states: Array, actions: Array) -> Array:
         z, a = read_only(states), read_only(actions)
         after = np.empty_like(z)
-        advance(z, a, self.table, self._axes, *self._arrays, self.substeps, after)
+        advance(z, a, self.table, self.axes, *self._arrays, self.substeps, after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         z, a, y = read_only(states), read_only(actions), read_only(covectors)
         on_states, on_actions = np.empty_like(z), np.empty_like(a)
-        known = (self.table, self._axes, *self._arrays, self.substeps)
+        known = (self.table, self.axes, *self._arrays, self.substeps)
         pull_back(z, a, y, *known, on_states, on_actions)
         return on_states, on_actions
 
@@ -163,59 +172,43 @@ class FiniteDifferenceModel(StoredModel):
         z, a, end = read_only(states), read_only(actions), read_only(after)
         found = np.empty((len(z), len(self.features), self.coefficients.shape[2]))
         miss = np.empty_like(z)
-        known = (self.table, self._axes, *self._arrays, self.substeps)
+        known = (self.table, self.axes, *self._arrays, self.substeps)
         mean_features(z, a, end, *known, found, miss)
         return found, miss
 
-    def arrays(self) -> Arrays:
-        own: Arrays = {"shape": self._axes} if self.shape else {}
-        if any(any(feature.shifts) for feature in self.features):
-            own["shifts"] = np.array([_filled(feature.shifts, 0) for feature in self.features])
-        return own | {
-            "form": np.array(self.FORM),
-            "kind": np.array(self.kind),
-            "table": np.delete(self.table, np.s_[1 + MOST_FACTORS : -1], axis=1),
-            "coefficients": self.coefficients,
-            "B": self.B,
-            "constant": self.constant,
-            "substeps": np.array(self.substeps),
-        }
-
     @classmethod
-    def from_arrays(cls, arrays: Arrays) -> FiniteDifferenceModel:
-        table = checked_array(arrays, "table", "i", (None, MOST_FACTORS + 2))
-        coefficients = numbers_of(arrays, "coefficients", len(table), None, None)
-        _, components, n_x = coefficients.shape
-        shifts = [()] * len(table)
-        if "shifts" in arrays:
-            every = checked_array(arrays, "shifts", "i", (len(table), MOST_FACTORS)).tolist()
-            shifts = [tuple(own[: row[0]]) for own, row in zip(every, table.tolist(), strict=True)]
+    def from_arrays(cls, arrays: Arrays) -> Self:
+        own = shaped(arrays, cls.SHAPES)
+        table, axes = own.pop("table"), own.pop("axes").tolist()
+        _, components, n_x = own["coefficients"].shape
+        factors, shifts = table[:, 1 : 1 + MOST_FACTORS], table[:, 1 + MOST_FACTORS : -1]
+        counts, orders = table[:, 0], table[:, -1]
+        used = np.arange(MOST_FACTORS) < counts[:, None]
+        ranges = (
+            (counts - 1, MOST_FACTORS),
+            (factors[used], components),
+            (shifts, n_x),
+            (orders, 1 + 2 * len(axes)),
+        )
+        if not all((numbers >= 0).all() and (numbers < end).all() for numbers, end in ranges):
+            raise ValueError(f"a model of {n_x} points on {len(axes)} axes has unknown terms")
+        if min(axes, default=0) < 1 or math.prod(axes) != n_x:
+            raise ValueError(f"a model of {n_x} points has axes of {shown(axes)}")
+        if components * n_x != len(own["constant"]):
+            raise ValueError(f"a model of {n_x} points has {len(own['constant'])} numbers")
         features = tuple(
-            Feature(tuple(row[1 : 1 + row[0]]), row[-1], own)
-            for row, own in zip(table.tolist(), shifts, strict=True)
+            Feature(
+                tuple(row[1 : 1 + row[0]]), row[-1], tuple(ahead[: row[0]]) if any(ahead) else ()
+            )
+            for row, ahead in zip(table.tolist(), shifts.tolist(), strict=True)
         )
-        shape: tuple[int, ...] = ()
-        if "shape" in arrays:
-            shape = tuple(checked_array(arrays, "shape", "i", (None,)).tolist())
-            if len(shape) < 2 or min(shape) < 1 or math.prod(shape) != n_x:
-                raise ValueError(f"a model of {n_x} points has axes of {shown(shape)}")
-        known = set(features_of(components, MOST_FACTORS, len(shape) or 1))
-        if "shifts" in arrays and not shape:
-            known = set(neighbour_features(components))
-        if unknown := set(features) - known:
-            raise ValueError(f"a model has unknown terms: {shown(sorted(unknown))}")
-        return FiniteDifferenceModel(
-            text_of(arrays, "kind"),
-            features,
-            coefficients,
-            numbers_of(arrays, "B", components * n_x, None),
-            numbers_of(arrays, "constant", components * n_x),
-            checked_substeps(int(checked_array(arrays, "substeps", "i", ())), least=0),
-            shape,
-        )
+        checked_substeps(own["substeps"], least=0)
+        kind, shape = text_of(arrays, "kind"), tuple(axes) if len(axes) > 1 else ()
+        return cls(kind=kind, features=features, shape=shape, **own)
 
     @cached_property
-    def _axes(self) -> Table:
+    def axes(self) -> Table:
+        """Grid points of each axis, also of a single one."""
         return np.array(self.shape or self.coefficients.shape[2:], dtype=np.int64)
 
     @cached_property

@@ -70,45 +70,30 @@ def monomial(z: Array, table: Table, f: int, value: Array) -> None:
 
 
 @jit
-def difference_along(values: Array, order: int, shape: Table, out: Array) -> None:
-    """`difference` on several axes, each of them a ring."""
+def difference(values: Array, order: int, shape: Table, out: Array) -> None:
+    """D^order at all points, order > 0, along an axis that is a ring."""
     axis = len(shape) - 1 - (order - 1) // 2
     stride = 1
     for other in range(axis + 1, len(shape)):
         stride *= shape[other]
-    length = shape[axis]
-    for begin in range(0, out.size, length * stride):
-        for place in range(length):
-            here = begin + place * stride
-            before = here - stride if place > 0 else here + (length - 1) * stride
-            after = here + stride if place < length - 1 else begin
-            if order % 2 == 1:
-                for i in range(stride):
-                    out[here + i] = 0.5 * (values[after + i] - values[before + i])
-            else:
-                for i in range(stride):
-                    centre = 2.0 * values[here + i]
-                    out[here + i] = values[after + i] - centre + values[before + i]
-
-
-@jit
-def difference(values: Array, order: int, shape: Table, out: Array) -> None:
-    """D^order at all points, order > 0."""
-    n_x = out.size
-    if len(shape) > 1:
-        difference_along(values, order, shape, out)
-        return
-    first, second, last, before = values[0], values[1 % n_x], values[n_x - 1], values[n_x - 2]
-    if order == 1:
-        out[0] = 0.5 * (second - last)
-        for i in range(1, n_x - 1):
-            out[i] = 0.5 * (values[i + 1] - values[i - 1])
-        out[n_x - 1] = 0.5 * (first - before)
-    else:
-        out[0] = second - 2.0 * first + last
-        for i in range(1, n_x - 1):
-            out[i] = values[i + 1] - 2.0 * values[i] + values[i - 1]
-        out[n_x - 1] = first - 2.0 * last + before
+    block = shape[axis] * stride
+    inner = block - 2 * stride
+    for begin in range(0, out.size, block):
+        z, target = values[begin : begin + block], out[begin : begin + block]
+        for edge in (0, block - stride):
+            for i in range(edge, edge + stride):
+                before, after = z[(i - stride) % block], z[(i + stride) % block]
+                target[i] = after - 2.0 * z[i] + before
+                if order % 2 == 1:
+                    target[i] = 0.5 * (after - before)
+        # Slices, as in `multiply`.
+        behind, own, ahead, there = z, z[stride:], z[2 * stride :], target[stride:]
+        if order % 2 == 1:
+            for i in range(inner):
+                there[i] = 0.5 * (ahead[i] - behind[i])
+        else:
+            for i in range(inner):
+                there[i] = ahead[i] - 2.0 * own[i] + behind[i]
 
 
 @jit
