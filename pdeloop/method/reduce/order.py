@@ -34,10 +34,10 @@ from pdeloop.method.reduce.reduced_model import (
     ReducedModel,
     Steps,
     Trajectory,
+    distinct,
     leading_modes,
     numerical_rank,
     pieces,
-    repeated,
     steps_of,
     turns,
 )
@@ -168,12 +168,7 @@ def study_orders(
     (array([1, 2]), 2)
     """
     everything = steps_of(trajectories)
-    copies = repeated(trajectories)
-    known = [
-        (np.asarray(z, np.float64), np.asarray(a, np.float64))
-        for number, (z, a) in enumerate(trajectories)
-        if number not in copies
-    ]
+    known = distinct(trajectories)
     asked = list(orders)
     if wrong := [order for order in asked if not isinstance(order, Integral)]:
         raise ValueError(f"orders holds {wrong[0]!r}; expected whole numbers")

@@ -387,8 +387,7 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
             "expected trajectories of one plant, got states and actions of "
             f"{' and of '.join(f'{n_z} and {n_a}' for n_z, n_a in sizes[:4])} numbers."
         )
-    copies = repeated(checked)
-    for z, own in [pair for number, pair in enumerate(checked) if number not in copies]:
+    for z, own in distinct(checked):
         if z.shape[0] != len(own) + 1:
             raise ValueError(
                 f"{len(own)} actions belong to {len(own) + 1} states, but {z.shape[0]} states were "
@@ -413,6 +412,16 @@ def repeated(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> dict[int, i
         if (earlier := first.setdefault(content.digest(), number)) != number:
             found[number] = earlier
     return found
+
+
+def distinct(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Trajectory]:
+    """Trajectories as arrays, without copies of earlier ones."""
+    copies = repeated(trajectories)
+    return [
+        (np.asarray(z, np.float64), np.asarray(a, np.float64))
+        for number, (z, a) in enumerate(trajectories)
+        if number not in copies
+    ]
 
 
 def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:

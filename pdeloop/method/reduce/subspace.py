@@ -34,7 +34,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,8 +45,9 @@ from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_
 from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
+    distinct,
     leading_modes,
-    repeated,
+    pieces,
     steps_of,
     turns,
 )
@@ -145,12 +145,7 @@ def subspace_model(
         Shapes that do not fit, NaN or infinity, or data that do not determine a model.
     """
     data = steps_of(trajectories)
-    copies = repeated(trajectories)
-    known = [
-        (np.asarray(z, dtype=np.float64), np.asarray(a, dtype=np.float64))
-        for number, (z, a) in enumerate(trajectories)
-        if number not in copies
-    ]
+    known = distinct(trajectories)
     means = np.zeros(data.after.shape[1]), np.zeros(data.inputs.shape[1])
     if constant:
         means = data.after.mean(axis=0), data.inputs.mean(axis=0)
@@ -299,13 +294,7 @@ def likeliest_start(
 
 def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
     """At least as many as there are folds, of one trajectory its quarters."""
-    if len(known) >= FOLDS:
-        return list(known)
-    cut: list[Trajectory] = []
-    for z, a in known:
-        edges = np.linspace(0, len(a), FOLDS + 1).astype(int)
-        cut += [(z[b : e + 1], a[b:e]) for b, e in pairwise(edges) if e > b]
-    return cut
+    return list(known) if len(known) >= FOLDS else pieces(known, FOLDS)
 
 
 def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
