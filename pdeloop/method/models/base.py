@@ -90,6 +90,16 @@ class Measured:
         """The states as they are best known."""
         return np.asarray(self.states if self.clean is None else self.clean)
 
+    def part(self, begin: int, end: int) -> Measured:
+        """Its steps from one up to another, with the state at their end."""
+        law, clean = self.law, self.clean
+        return Measured(
+            np.asarray(self.states)[begin : end + 1],
+            np.asarray(self.actions)[begin:end],
+            law and (lambda k, z: law(k + begin, z)),
+            None if clean is None else clean[begin : end + 1],
+        )
+
 
 def affine_law(K: Array, b: Array) -> Law:
     """The law a = K z + b; K (n_a, n_z), b (n_a,)."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import FieldModel, Law, Measured, Samples
+from pdeloop.method.models.base import FieldModel, Measured, Samples
 
 _SHORT = 8
 """Steps of a short piece of a beginning, at most."""
@@ -104,8 +104,7 @@ def finite(rollout: Measured) -> Measured:
     """The rollout up to the first value that is not finite, with one state more than actions."""
     states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
     steps = min(_leading(np.isfinite(actions)), max(_leading(np.isfinite(states)) - 1, 0))
-    clean = None if rollout.clean is None else rollout.clean[: steps + 1]
-    return Measured(states[: steps + 1], actions[:steps], rollout.law, clean)
+    return rollout.part(0, steps)
 
 
 def _leading(good: NDArray[np.bool_]) -> int:
@@ -117,16 +116,7 @@ def pieces(rollout: Measured, count: int) -> list[Measured]:
     """A rollout cut into at most this many parts of equal length, each with the state at its end."""
     steps = min(len(rollout.actions), len(rollout.states) - 1)
     edges = [steps * part // count for part in range(count + 1)]
-    return [
-        Measured(
-            rollout.states[begin : end + 1],
-            rollout.actions[begin:end],
-            _later(rollout.law, begin),
-            None if rollout.clean is None else rollout.clean[begin : end + 1],
-        )
-        for begin, end in pairwise(edges)
-        if end > begin
-    ]
+    return [rollout.part(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
 def beginnings(
@@ -149,15 +139,5 @@ def beginnings(
     for own, sizes in zip(rollouts, away, strict=True):
         end = _leading((sizes <= most)[:, None])
         if end > 1:
-            clean = None if own.clean is None else own.clean[:end]
-            begun = Measured(own.states[:end], own.actions[: end - 1], own.law, clean)
-            found += pieces(begun, -(-len(begun.actions) // _SHORT) if short else 1)
+            found += pieces(own.part(0, end - 1), -(-(end - 1) // _SHORT) if short else 1)
     return found
-
-
-def _later(law: Law | None, steps: int) -> Law | None:
-    """The law from a step of its episode on."""
-    if law is None:
-        return None
-    whole = law
-    return lambda k, z: whole(k + steps, z)
