@@ -22,7 +22,7 @@ from benchmarks.families.cases import CASES, Case
 from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array
 from pdeloop.method.design.finite_horizon import finite_horizon
-from pdeloop.method.models import FittedModel, Measured, affine_law, fit_field_model
+from pdeloop.method.models import FittedModel, Measured, Selection, affine_law
 from pdeloop.method.models.base import Law, saturated
 from pdeloop.method.models.prediction import errors
 
@@ -105,13 +105,13 @@ class Rollouts:
 
     def fit(self, rollouts: Sequence[Rollout]) -> FittedModel | None:
         """The model of measured rollouts."""
-        return fit_field_model(
-            [rollout.measured for rollout in rollouts],
-            self.target,
+        how = Selection(
+            target=self.target,
             components=self.components,
             noise=self.noise,
             action_set=self.action_set,
         )
+        return how.fit([rollout.measured for rollout in rollouts])
 
     def law(self, fitted: FittedModel) -> Law | None:
         """The law of a model linearised at the target."""

@@ -316,7 +316,7 @@ def test_where_nothing_was_measured_only_an_exact_model_is_linearised(
 ) -> None:
     rng = np.random.default_rng(0)
     states, actions = rng.uniform(-1.0, 1.0, (50, 6)), rng.standard_normal((49, 1))
-    features = features_of(1, 3, 1)
+    features = features_of(1)
     model = FiniteDifferenceModel(
         "x", features, np.zeros((len(features), 1, 6)), np.zeros((6, 1)), np.zeros(6), 1
     )

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from benchmarks.families import equations, plants
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.action_set import ActionSet
-from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models import FieldModelSettings, Measured
 from pdeloop.method.models.base import Samples
 from pdeloop.method.models.choice import NEAR_RIDGES, kinds_of
 from pdeloop.method.models.linear import fit_linear
 from pdeloop.method.models.prediction import errors
+from tests.support.fitted import fit_field_model
 from tests.support.plants import plant_of
 
 N_Z, N_A = 64, 4
@@ -85,6 +86,7 @@ def test_burgers_is_recovered_with_its_coefficients():
     [
         (AllenCahnModes(), 0.01, 1, "poly3", 1e-6),
         (KortewegDeVriesModes(), 0.01, 10, "poly2", 1e-4),
+        (equations.Kawahara(), 0.02, 10, "fifth2", 1e-3),
         (equations.BenjaminOno(), 0.05, 5, "nonlocal2", 1e-3),
         (equations.BenjaminBonaMahony(), 0.1, 2, "free2", 1e-5),
         (equations.SineReaction(), 0.02, 1, "poly7", 2e-3),
@@ -235,8 +237,8 @@ def test_kinds_for_large_states_have_no_matrix_of_their_size():
     settings = FieldModelSettings()
     small = {kind.name for kind in kinds_of(512, 1, settings)}
     large = {kind.name for kind in kinds_of(514, 1, settings)}
-    near = {prefix + name for prefix in ("", "two-") for name in NEAR_RIDGES}
-    assert small - large == {"linear", "linear1e-4", "two-convolution"} | near
+    near = {*NEAR_RIDGES, "two-near-shared"}
+    assert small - large == {"two-convolution"} | near
     assert "convolution" not in {kind.name for kind in kinds_of(514, 2, settings)}
 
 

@@ -47,9 +47,9 @@ def spectral(n_z=24, degree=3, clip=np.inf):
     )
 
 
-def finite_difference(components, degree=3, n_x=9):
+def finite_difference(components, n_x=9):
     rng = np.random.default_rng(components)
-    features = features_of(components, degree)
+    features = features_of(components)
     C = 0.03 * rng.normal(size=(len(features), components, n_x))
     n_z = components * n_x
     B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
@@ -78,7 +78,7 @@ MODELS = {
     "degree 7": lambda: spectral(degree=7, clip=1.1),
     "odd": lambda: spectral(n_z=25),
     "fewer steps": lambda: replace(spectral(), fewer=np.array([[0.9, 1.0], [1.2, 2.0]])),
-    "one component": lambda: finite_difference(1, 5),
+    "one component": lambda: finite_difference(1),
     "two components": lambda: finite_difference(2),
     "neighbours": lambda: neighbours(1),
     "neighbours of two components": lambda: neighbours(2),
@@ -227,7 +227,7 @@ def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> No
     kinds = [z, frozen, np.asfortranarray(z), np.repeat(z, 2, axis=1)[:, ::2], z.astype(np.float32)]
     assert len({numba.typeof(read_only(kind)) for kind in kinds}) == 1
     model = LinearModel("k", np.asfortranarray(np.eye(16)), np.zeros((16, 1)), np.zeros(16))
-    features = features_of(1, 2)
+    features = features_of(1)
     C, B = np.zeros((len(features), 1, 16)), np.zeros((16, 3))[:, ::3]
     differences = FiniteDifferenceModel("k", features, C, B, np.zeros(16), 1)
     for states in kinds:

@@ -10,13 +10,13 @@ from pdeloop.method.models import FieldModel
 from pdeloop.method.models.base import MAX_SUBSTEPS
 from pdeloop.method.models.files import FORMS, model_of
 from pdeloop.method.models.finite_difference import (
-    CoarseModel,
     FiniteDifferenceModel,
     features_of,
     neighbour_features,
 )
-from pdeloop.method.models.linear import LinearModel, LowRankModel
+from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.polynomial import PolynomialModel
+from pdeloop.method.models.projected import ProjectedModel
 from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import (
     Actuators,
@@ -59,7 +59,7 @@ MODELS: dict[str, FieldModel] = {
         numbers(N_Z),
         4,
     ),
-    "coarse": CoarseModel(
+    "projected": ProjectedModel(
         FiniteDifferenceModel(
             "k",
             features_of(1, axes=2),
@@ -69,13 +69,10 @@ MODELS: dict[str, FieldModel] = {
             4,
             (2, N_Z // 2),
         ),
-        np.arange(0, 2 * N_Z, 2),
+        numbers(N_Z, 2 * N_Z),
         numbers(2 * N_Z, N_Z),
     ),
     "linear": LinearModel("k", numbers(N_Z, N_Z), numbers(N_Z, N_A), numbers(N_Z)),
-    "low-rank": LowRankModel(
-        "k", numbers(N_Z, 3), numbers(3, 3), numbers(3, N_A), constant=numbers(3)
-    ),
     "polynomial": PolynomialModel(
         "k",
         numbers(N_Z, 3),
@@ -86,8 +83,10 @@ MODELS: dict[str, FieldModel] = {
         numbers(1 + 3 + N_A + 2, N_Z),
     ),
     "readings": ReadingsModel(
+        "k",
         numbers(3, 3),
         numbers(3, N_A),
+        numbers(3),
         numbers(2, 3),
         numbers(3, 2),
         numbers(N_Z, 2),
@@ -113,7 +112,7 @@ MODELS[NEIGHBOURS] = FiniteDifferenceModel(
 )
 
 
-SHIFTS = np.isin(np.arange(12), range(6, 11)).astype(np.int64)
+SHIFTS = np.isin(np.arange(8), range(4, 7)).astype(np.int64)
 """Where a table has the shifts of factors."""
 
 
@@ -134,7 +133,7 @@ def test_a_model_has_no_actuators_of_negative_width() -> None:
 def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
     arrays = MODELS[form].arrays()
     # Axes that nothing else tells the length of; the sensed model has a centre for each actuator.
-    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, "inner.B": 1, "interpolation": 0}
+    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, "inner.B": 1}
     free |= {} if form == "sensed" else {"B": 1}
     for name, array in arrays.items():
         for axis in range(array.ndim):
@@ -156,8 +155,8 @@ def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
         ("spectral", "fewer", np.array([[1.0, 5.0]])),
         ("spectral", "fewer", np.array([[1.0, 0.0]])),
         ("finite-difference", "substeps", np.array(2**62)),
-        ("finite-difference", "table", np.full((len(features_of(1)), 12), 9)),
-        ("finite-difference", "table", np.full((len(features_of(1)), 12), -9)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 8), 9)),
+        ("finite-difference", "table", np.full((len(features_of(1)), 8), -9)),
         (NEIGHBOURS, "table", MODELS[NEIGHBOURS].arrays()["table"] + N_Z * SHIFTS),
         ("sensed", "sensors", np.array(-1)),
         ("sensed", "sensors", np.array(SENSORS + 1)),

@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models import FieldModelSettings, finite_difference_fit, fit_field_model
+from pdeloop.method.models import FieldModelSettings, finite_difference_fit
 from pdeloop.method.models.base import Samples
-from pdeloop.method.models.choice import NEAR_NEEDED, NEAR_RIDGES, kinds_of
+from pdeloop.method.models.choice import NEAR_NEEDED, kinds_of
 from pdeloop.method.models.finite_difference_fit import fit_neighbours
 from pdeloop.method.models.prediction import errors
+from tests.support.fitted import fit_field_model
 from tests.support.ordinary import rolled_out
 
 N_X, DT = 12, 0.1
@@ -133,7 +134,7 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
 @pytest.mark.parametrize(("components", "prefix"), [(1, "two-"), (2, "")])
 def test_pairs_of_components_need_not_be_declared(components, prefix):
     names = {kind.name for kind in kinds_of(2 * N_X, components, SETTINGS)}
-    assert {prefix + name for name in NEAR_RIDGES} <= names
+    assert prefix + "near-shared" in names
 
 
 def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():

@@ -23,10 +23,11 @@ from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.method.design.lqg import noise_of
 from pdeloop.method.laws.registry import OWN_LAWS, law_kind
-from pdeloop.method.models import FieldModelSettings, Measured, fit_field_model
+from pdeloop.method.models import FieldModelSettings, Measured
 from pdeloop.method.reduce.order import study_orders
 from pdeloop.method.reduce.reduced_model import IdentificationSettings
 from pdeloop.method.settings import Settings, setting
+from tests.support.fitted import fit_field_model
 from tests.support.interpreter import ROOT
 from tests.support.small import SMALL
 from tuner_node.build import build_training

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.models import Measured, finite_difference_fit, fit_field_model
+from pdeloop.method.models import Measured, projected
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
-    CoarseModel,
     Feature,
     FiniteDifferenceModel,
-    coarse_points,
     features_of,
 )
+from pdeloop.method.models.projected import ProjectedModel, coarse_points
+from tests.support.fitted import fit_field_model
 
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX
@@ -32,9 +32,9 @@ def model(components: int = 1, scale: float = 0.05) -> FiniteDifferenceModel:
     return FiniteDifferenceModel("x1e-5", features, *numbers, 3, SHAPE)
 
 
-def coarse() -> CoarseModel:
+def coarse() -> ProjectedModel:
     points = np.sort(RNG.choice(2 * N_Z, N_Z, replace=False))
-    return CoarseModel(model(), points, RNG.standard_normal((2 * N_Z, N_Z)) / 7)
+    return ProjectedModel(model(), np.eye(2 * N_Z)[points], RNG.standard_normal((2 * N_Z, N_Z)) / 7)
 
 
 @pytest.mark.parametrize("order", range(5))
@@ -76,14 +76,10 @@ def test_a_model_comes_back_from_its_arrays_or_is_refused(made: type) -> None:
     again = model_of(own.arrays())
     z, a = RNG.standard_normal((2, own.n_z)), RNG.standard_normal((2, N_A))
     assert again.kind == "x1e-5" and np.array_equal(again.step(z, a), own.step(z, a))
-    prefix = "inner." if isinstance(own, CoarseModel) else ""
+    prefix = "inner." if isinstance(own, ProjectedModel) else ""
     for shape in ((NY, NX + 1), (N_Z,), (-NY, -NX), (NY, 0)):
         with pytest.raises(ValueError, match="axes"):
             model_of(own.arrays() | {f"{prefix}axes": np.array(shape)})
-    if isinstance(own, CoarseModel):
-        for number in (-1, own.n_z):
-            with pytest.raises(ValueError, match="outside of its state"):
-                model_of(own.arrays() | {"points": np.full(N_Z, number)})
 
 
 def plate(ny: int, nx: int, count: int) -> list[Measured]:
@@ -116,11 +112,11 @@ def test_a_reacting_plate_between_walls_is_predicted(
     """Well enough to be believed, as no linear model is; every second point suffices for that."""
     believed = ModelBasedSettings().believed
     ny, nx = 12, 16
-    monkeypatch.setattr(finite_difference_fit, "_COARSE_POINTS", points)
+    monkeypatch.setattr(projected, "_COARSE_POINTS", points)
     found = fit_field_model(plate(ny, nx, 6), np.zeros(ny * nx), line=False, shape=(ny, nx))
     assert found is not None and found.error <= believed
     assert found.model.kind.startswith("x") and found.model.n_z == ny * nx
-    assert isinstance(found.model, CoarseModel) == (points < ny * nx)
+    assert isinstance(found.model, ProjectedModel) == (points < ny * nx)
     errors = dict(found.candidates)
     assert min(errors[kind] for kind in errors if not kind.startswith("x")) > believed
 

@@ -10,7 +10,6 @@ from pdeloop.method.models import (
     FieldModelSettings,
     Measured,
     finite_difference_fit,
-    fit_field_model,
 )
 from pdeloop.method.models.base import Samples
 from pdeloop.method.models.choice import SPARSE, kinds_of
@@ -18,6 +17,7 @@ from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
 from pdeloop.method.models.finite_difference_fit import chosen, fit_sparse, products
 from pdeloop.method.models.prediction import errors
+from tests.support.fitted import fit_field_model
 from tests.support.ordinary import rolled_out
 
 SETTINGS = FieldModelSettings(folds=2)

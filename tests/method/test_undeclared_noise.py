@@ -17,8 +17,7 @@ from pdeloop.messages.model_rows import pack
 from pdeloop.method.models import Measured
 from pdeloop.method.models import selection as of_models
 from pdeloop.method.models.noise_level import correlations, is_white, noise_level, short_waves
-from pdeloop.method.models.selection import fit_undeclared_noise
-from pdeloop.method.models.settings import DEFAULTS
+from pdeloop.method.models.selection import Selection
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import misjudged_noise, warnings
@@ -46,10 +45,10 @@ def explored(name: str, **parameters: Any) -> tuple[Rollouts, np.ndarray]:
     return [problem.explore(seed) for seed in range(2)], problem.plant().target
 
 
-def found_in(rollouts: Rollouts, target: np.ndarray, **given: Any) -> float:
+def found_in(rollouts: Rollouts, target: np.ndarray, declared: float = 0.0) -> float:
     """The noise that is found in rollouts; 0: none."""
     known = [Measured(states, actions) for states, actions in rollouts]
-    found = fit_undeclared_noise(known, target, settings=DEFAULTS, most=0.3, **given)
+    found = Selection(target=target, noise=declared).undeclared_noise(known)
     return 0.0 if found is None else found[1]
 
 
@@ -125,13 +124,12 @@ def test_a_model_that_predicts_what_noise_would_not_allow_ends_the_search(
     """Whatever the data look like: with noise that was not declared, nothing is even fitted."""
     white = np.random.default_rng(7).standard_normal((L, N))
     rollout, fits = Measured(white, np.zeros((L - 1, 1))), []
-    monkeypatch.setattr(of_models, "fit_field_model", lambda *_, **on: fits.append(on))
+    monkeypatch.setattr(Selection, "fit", lambda own, *_, **__: fits.append(own.noise))
     # All of these states is noise, of which a share of 1 cannot be predicted.
     for error, tried in ((0.45, 0), (0.55, 1)):
-        given = {"settings": DEFAULTS, "most": 0.3, "better_than": error}
-        fit_undeclared_noise([rollout], np.zeros(N), **given)
+        Selection(target=np.zeros(N)).undeclared_noise([rollout], error)
         assert len(fits) == tried
-    assert fits[0]["noise"] == pytest.approx(1.0, rel=0.05)
+    assert fits[0] == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_front_that_looks_like_noise_in_its_short_waves_is_none(

@@ -26,7 +26,7 @@ def load_field_models() -> None:
     B, constant = np.zeros((n, 1)), np.zeros(n)
     none = np.zeros(n // 2 + 1, dtype=np.complex128)
     spectral = SpectralModel("poly2", none, none[None], np.ones((1, 1)), B, constant, 2)
-    features = features_of(1, 2)
+    features = features_of(1)
     C = np.zeros((len(features), 1, n))
     differences = FiniteDifferenceModel("tiny", features, C, B, constant, 1)
     states, actions = np.zeros((2, n)), np.zeros((2, 1))

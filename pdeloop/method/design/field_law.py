@@ -57,10 +57,11 @@ from pdeloop.method.models.choice import (
     scale_of,
     turns,
 )
-from pdeloop.method.models.linear import LinearModel, LowRankModel
+from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.noise_level import smoothed
 from pdeloop.method.models.prediction import pieces as cut
 from pdeloop.method.models.prediction import predicted, usable
+from pdeloop.method.models.projected import ProjectedModel
 from pdeloop.method.models.selection import Selected, Selection
 from pdeloop.method.models.settings import BETTER
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
@@ -208,7 +209,7 @@ def best_model(
 
     A target far outside of the data makes every error small, so a model that does not reproduce what
     the data do is chosen again by that. The work grows with the third power of the size of the state,
-    so there is a largest one. axes: as for `field_law`; weights: as for `fit_field_model`.
+    so there is a largest one. axes: as for `field_law`; weights: as for `Selection`.
     """
     if len(target) > _FIELD_LARGEST:
         return None
@@ -259,10 +260,10 @@ def regression_accuracy(
     return accuracy_of(parts, scale, models.worst, noise)
 
 
-def _whole(model: ReducedModel | ModelRows) -> LowRankModel:
+def _whole(model: ReducedModel | ModelRows) -> ProjectedModel:
     """A reduced model as one of the whole state: what is outside of U is lost in a step."""
-    parts = model.U, model.A, model.B, np.zeros(len(model.A)) if model.d is None else model.d
-    return LowRankModel("regression", *(np.ascontiguousarray(part) for part in parts))
+    d = np.zeros(len(model.A)) if model.d is None else model.d
+    return ProjectedModel(LinearModel("regression", model.A, model.B, d), model.U.T, model.U)
 
 
 def field_law(
@@ -432,7 +433,7 @@ def linearisation_point(
     mean, units = scale_of([states for states, _ in trajectories])
     away = np.linalg.norm((states - mean) / units, axis=1)
     far = float(np.linalg.norm((target - mean) / units) / max(away.max(), 1e-300))
-    if far <= FAR or isinstance(fitted.model, LinearModel | LowRankModel):
+    if far <= FAR or isinstance(getattr(fitted.model, "inner", fitted.model), LinearModel):
         return target, ""
     where = (
         f"the target is {far:.3g} times as far from the mean state as any measured state: the model"

@@ -2,7 +2,8 @@
 """Models of the whole field of a plant, identified from its rollouts."""
 
 from pdeloop.method.models.base import FieldModel, Measured, affine_law
-from pdeloop.method.models.choice import FittedModel, fit_field_model
+from pdeloop.method.models.choice import FittedModel
+from pdeloop.method.models.selection import Selection
 from pdeloop.method.models.settings import FieldModelSettings
 
 __all__ = [
@@ -10,6 +11,6 @@ __all__ = [
     "FieldModelSettings",
     "FittedModel",
     "Measured",
+    "Selection",
     "affine_law",
-    "fit_field_model",
 ]

@@ -13,43 +13,37 @@ lists the kinds in the order in which they are tried, with the number of their u
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import FieldModel, Measured, Samples, saturated
 from pdeloop.method.models.finite_difference import features_of, neighbour_features
 from pdeloop.method.models.finite_difference_fit import (
-    fit_coarse,
     fit_finite_difference,
     fit_neighbours,
     fit_sparse,
 )
-from pdeloop.method.models.linear import fit_convolution, fit_linear, fit_low_rank
-from pdeloop.method.models.noise_level import cleaned_states, share_of_noise
+from pdeloop.method.models.linear import fit_convolution, fit_linear
+from pdeloop.method.models.noise_level import cleaned_states
 from pdeloop.method.models.noisy_fit import fit_noisy
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
 from pdeloop.method.models.prediction import errors, one_step, pieces, predicted, usable
-from pdeloop.method.models.settings import (
-    BETTER,
-    DEFAULTS,
-    DENSE,
-    REPRODUCED_NOISY,
-    SPARSE_TERMS,
-    FieldModelSettings,
-)
+from pdeloop.method.models.projected import fit_coarse, fit_low_rank
+from pdeloop.method.models.settings import SPARSE_TERMS, FieldModelSettings
 from pdeloop.method.models.spectral_fit import Form, fit_spectral
-from pdeloop.process.one_thread import one_thread
+from pdeloop.method.reduce.reduced_model import turns as held_out
 
 _FEWEST_POINTS = 8
 """Minimum number of points of a field."""
 NEAR_NEEDED = 0.05
 """Least E of the other kinds above which models of neighbours are tried."""
+DENSE = 512
+"""Largest state for the kinds whose cost grows with its square, and for models of neighbours."""
 _SPARSE_NUMBERS = 40
 """Largest state for models of few products of any of its numbers."""
 _CONVOLUTION_RIDGE = 1e-9
@@ -59,25 +53,28 @@ FORMS = (
     Form(name="poly2", degree=2),
     Form(name="poly3", degree=3),
     Form(name="front2", degree=2, linear_order=2, shares=(8,)),
-    Form(name="poly7", degree=7),
+    Form(name="fifth2", degree=2, linear_order=5),
     Form(name="nonlocal2", degree=2, hilbert=True),
-    Form(name="nonlocal3", degree=3, hilbert=True),
-    Form(name="semi2", degree=2, hilbert=True, free="linear"),
-    Form(name="semi3", degree=3, hilbert=True, free="linear"),
-    Form(name="free2", degree=2, free="all"),
-    Form(name="free3", degree=3, free="all"),
+    Form(name="free2", degree=2, free=True),
+    Form(name="poly7", degree=7),
 )
-POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
+POINT_RIDGES = {"x-shared": None, "x1e-5": 1e-5, "x1e-7": 1e-7}
 NEAR_RIDGES = {"near-shared": None, "near1e-9": 1e-9}
-LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
+_POINT_DEGREE = 3
+"""Of equations whose coefficients depend on the place."""
+LINEAR = "linear"
+_LINEAR_RIDGE, _LINEAR_MODES = 1e-6, 64
+"""Ridge of a linear model of the whole state; POD modes of one of a large state, at most."""
 SPARSE = {"sparse-map": True, "sparse": False}
-LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SQUARES_ENOUGH = 0.01
 """`enough` of an equation with squares alone, as cubes may be small where it was measured."""
-SIMPLEST = 4
+SIMPLEST = 3
 """Forms of the fewest unknowns, the first ones."""
 ACCURATE, TRIED = 5e-3, "front2"
 """E at which no kind after this form is tried: hardly one is `BETTER` times better."""
+
+
+Fit = Callable[[Sequence[Measured], float], FieldModel | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +85,12 @@ class Kind:
     ----------
     name : str
     fit : callable
-        The model of samples, or None.
+        The model of rollouts, whose states have noise of a standard deviation that is known or 0; or
+        None.
     unknowns : (float, int)
         Those of each point or wavenumber, by which kinds are compared first, and those that all share.
-    fit_noisy : callable, optional
-        The model of rollouts whose states have noise of a known standard deviation, or None; without
-        it, `fit` is given the denoised states.
+    knows_noise : bool
+        Whether it is fitted to noisy states, not to denoised ones.
     needed : float
         It is tried only where the best E so far is larger.
     enough : float
@@ -101,9 +98,9 @@ class Kind:
     """
 
     name: str
-    fit: Callable[[Samples], FieldModel | None]
+    fit: Fit
     unknowns: tuple[float, int]
-    fit_noisy: Callable[[Sequence[Measured], float], FieldModel | None] | None = None
+    knows_noise: bool = False
     needed: float = 0.0
     enough: float = 1.0
 
@@ -121,56 +118,45 @@ def kinds_of(
     line: whether a point has one neighbour at each side, which is not so on several axes; shape: points
     of each axis, where there are several and the states are fields on them.
     """
-    kinds: list[Kind] = []
-    if not line or n_z > DENSE:
-        kinds = [
-            Kind(
-                name,
-                partial(fit_low_rank, kind=name, most=most),
-                (float(most), 0),
-            )
-            for name, most in LOW_RANKS.items()
-        ]
     if shape:
-        several = _finite_difference(n_z // math.prod(shape), settings, "", shape)
-        return kinds + _linear(n_z) + several
+        return _linear(n_z) + _finite_difference(n_z // math.prod(shape), settings, "", shape)
     if not line:
-        return kinds + _linear(n_z) + _sparse(n_z) + _polynomial(n_z)
-    if components == 1 and n_z >= _FEWEST_POINTS:
-        kinds += [
-            _spectral(form, settings) for form in FORMS if form.degree <= settings.largest_degree
-        ]
-    kinds += _several_fields(n_z, components, settings)
-    near = _neighbours(n_z, components)
+        return _linear(n_z) + _sparse(n_z) + _polynomial(n_z)
+    forms = FORMS if components == 1 and n_z >= _FEWEST_POINTS else ()
+    spectral = [_spectral(own, settings) for own in forms if own.degree <= settings.largest_degree]
+    several, near = _several_fields(n_z, components, settings), _neighbours(n_z, components)
     if components == 1:  # two fields that were not declared
         two = _several_fields(n_z, 2, settings, "two-")
         # Linear ones are tried early, as that is quick.
-        kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
-        kinds += [kind for kind in two if kind.name != "two-convolution"]
+        spectral[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
+        several += [kind for kind in two if kind.name != "two-convolution"]
         near += _neighbours(n_z, 2, "two-")
-    kinds += _linear(n_z) + near + _sparse(n_z)
-    return kinds + _polynomial(n_z)
+    # And equations of a high degree late, as that takes long.
+    late = [kind for kind in spectral if kind.name == FORMS[-1].name]
+    early = [kind for kind in spectral if kind.name != FORMS[-1].name]
+    return early + several + late + _linear(n_z) + near + _sparse(n_z) + _polynomial(n_z)
+
+
+def _of_samples(fit: Callable[..., FieldModel | None], **known: Any) -> Fit:
+    """A fit to the steps of rollouts, whatever their order."""
+    return lambda rollouts, _: fit(Samples.of(rollouts), **known)
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
-    fit = partial(fit_spectral, form=form, settings=settings)
+    def fit(rollouts: Sequence[Measured], noise: float) -> FieldModel | None:
+        if noise and not form.free:
+            return fit_noisy(rollouts, form, settings, noise)
+        return fit_spectral(Samples.of(rollouts), form, settings)
+
     enough = SQUARES_ENOUGH if form is FORMS[0] else 1.0
-    if form.free != "none":
-        return Kind(form.name, fit, form.unknowns)
-
-    def noisy(rollouts: Sequence[Measured], noise: float) -> FieldModel | None:
-        return fit_noisy(rollouts, form, settings, noise)
-
-    return Kind(form.name, fit, form.unknowns, noisy, enough=enough)
+    return Kind(form.name, fit, form.unknowns, not form.free, enough=enough)
 
 
 def _linear(n_z: int) -> list[Kind]:
     if n_z > DENSE:
-        return []
-    return [
-        Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0))
-        for name, ridge in LINEAR_RIDGES.items()
-    ]
+        fit = _of_samples(fit_low_rank, kind=LINEAR, most=_LINEAR_MODES)
+        return [Kind(LINEAR, fit, (_LINEAR_MODES, 0))]
+    return [Kind(LINEAR, _of_samples(fit_linear, kind=LINEAR, ridge=_LINEAR_RIDGE), (n_z, 0))]
 
 
 def _several_fields(
@@ -182,7 +168,7 @@ def _several_fields(
     kinds: list[Kind] = []
     if components > 1 and n_z <= DENSE:
         name = f"{prefix}convolution"
-        convolution = partial(
+        convolution = _of_samples(
             fit_convolution, kind=name, ridge=_CONVOLUTION_RIDGE, components=components
         )
         kinds.append(Kind(name, convolution, (float(components), 0)))
@@ -196,7 +182,9 @@ def _neighbours(n_z: int, components: int, prefix: str = "") -> list[Kind]:
         return []
     kinds = []
     for name, ridge in NEAR_RIDGES.items():
-        fit = partial(
+        if ridge is not None and components > 1:
+            continue  # too many unknowns
+        fit = _of_samples(
             fit_neighbours,
             components=components,
             kind=prefix + name,
@@ -214,7 +202,7 @@ def _sparse(n_z: int) -> list[Kind]:
     return [
         Kind(
             name,
-            partial(fit_sparse, kind=name, is_map=is_map),
+            _of_samples(fit_sparse, kind=name, is_map=is_map),
             (n_z + SPARSE_TERMS, 0),
             needed=NEAR_NEEDED,
         )
@@ -226,40 +214,28 @@ def _polynomial(n_z: int) -> list[Kind]:
     """Products of the leading modes and of actions, where nothing simpler describes the plant."""
     if n_z > LARGEST_STATE:
         return []
-    fit = partial(fit_polynomial, kind="polynomial")
-    return [Kind("polynomial", fit, (n_z + 1.0, 0))]
+    return [Kind("polynomial", lambda rollouts, _: fit_polynomial(rollouts), (n_z + 1.0, 0))]
 
 
 def _finite_difference(
-    components: int, settings: FieldModelSettings, prefix: str, shape: tuple[int, ...] = ()
+    components: int, settings: FieldModelSettings, prefix: str = "", shape: tuple[int, ...] = ()
 ) -> list[Kind]:
     """Equations whose coefficients depend on the place; shape: as for `kinds_of`."""
-    kinds: list[Kind] = []
-    for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
-        if degree > settings.largest_degree:
-            continue
-        count = components * len(features_of(components, degree, len(shape) or 1))
-        for name, ridge in ridges.items():
-            known: dict[str, Any] = {
-                "kind": prefix + name,
-                "ridge": ridge,
-                "degree": degree,
-            }
-            fit: Callable[[Samples], FieldModel | None] = partial(
-                fit_finite_difference, components=components, **known
-            )
-            if shape:
-                fit = partial(fit_coarse, shape=shape, **known)
-            # An unknown that a ridge holds at zero counts as part of one; only the order matters.
-            own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-4 else 1.0)
-            kinds.append(Kind(prefix + name, fit, (own, count)))
+    if settings.largest_degree < _POINT_DEGREE:
+        return []
+    kinds, count = list[Kind](), components * len(features_of(components, len(shape) or 1))
+    for name, ridge in POINT_RIDGES.items():
+        known: dict[str, Any] = {"kind": prefix + name, "ridge": ridge}
+        if shape:
+            fit = _of_samples(fit_coarse, shape=shape, **known)
+        else:
+            fit = _of_samples(fit_finite_difference, components=components, **known)
+        kinds.append(Kind(prefix + name, fit, (0.0 if ridge is None else count, count)))
     return kinds
 
 
 _HOPELESS = 20.0
 """Multiple of the best E, or of `reproduced`, above which a kind is dropped from further folds."""
-_GROWN = 10.0
-"""E that the noise of an initial state may lead to, per share of the noise in the states."""
 
 LEAST_UNIT = 1e-6
 """Least unit of a number of the state, relative to the largest: what hardly moves has no say."""
@@ -319,111 +295,6 @@ class FittedModel:
     own: Accuracy = UNKNOWN
 
 
-def fit_field_model(
-    rollouts: Sequence[Measured],
-    target: Array,
-    *,
-    settings: FieldModelSettings = DEFAULTS,
-    components: int = 1,
-    noise: float = 0.0,
-    action_set: ActionSet = ANY_ACTION,
-    first: str | None = None,
-    line: bool = True,
-    shape: tuple[int, ...] = (),
-    knows_noise: bool = False,
-    scale: Scale | None = None,
-    by_scale: bool = False,
-    weights: Array | None = None,
-    most: float = np.inf,
-    linear: bool = False,
-) -> FittedModel | None:
-    """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
-
-    Parameters
-    ----------
-    rollouts : sequence of Measured
-        Whole or not; values that are not finite are left out.
-    target : (n_z,) array
-        z_r; the error is measured by the distance to it.
-    settings : FieldModelSettings
-        Constants of the fits.
-    components : int
-        Number of fields in a state, stored one after the other.
-    noise : float
-        Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
-        the error beyond what it explains, and kinds that know of noise are fitted as `noisy_fit` says.
-    action_set : ActionSet
-        Admissible actions, the nearest of which is applied.
-    first : str, optional
-        Kind to be tried first, that of the last choice.
-    line : bool
-        Whether the states are fields on one axis, or plain vectors.
-    shape : tuple of int
-        Points of each axis, where the states are fields on several; none: they are not.
-    knows_noise : bool
-        Try only the kinds that are fitted for noise.
-    scale : Scale, optional
-        Of the errors `own` of the result, always of rollouts or pieces that it was not fitted to.
-    by_scale : bool
-        Whether E is relative to this scale instead of the distance to the target.
-    weights : (n_z,) or (n, n_z) array, optional
-        W of E (`prediction.errors`), in which the numbers of a state count as in the cost.
-    most : float
-        Largest E with which a model is used: one of fewer unknowns is no better than others above it.
-    linear : bool
-        Try only linear models.
-    """
-    rollouts = [limited(rollout, action_set) for rollout in rollouts]
-    if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
-        return None
-    if noise:
-        rollouts = with_clean(rollouts, noise, components, line=line)
-        enough = _GROWN * share_of_noise(noise, [r.states for r in rollouts], target, weights)
-        enough = min(enough, REPRODUCED_NOISY)
-        settings = replace(settings, reproduced=max(settings.reproduced, enough))
-    kinds = kinds_of(len(target), components, settings, line=line, shape=shape)
-    if linear:
-        kinds = [kind for kind in kinds if kind.name in LINEAR_RIDGES]
-    if knows_noise:
-        kinds = [kind for kind in kinds if kind.fit_noisy is not None]
-    kinds.sort(key=lambda kind: kind.name != first)
-    judged: dict[Kind, float] = {}
-    own: dict[Kind, Accuracy] = {}
-    with one_thread():  # a rounding must not depend on the machine's load
-        for kind in kinds:
-            least = min(judged.values(), default=np.inf)
-            if not least > kind.needed:
-                continue
-            found = _error(kind, rollouts, target, settings, least, noise, scale, weights)
-            if found is not None:
-                error, own[kind] = found
-                error = own[kind].simulated if by_scale else error
-                judged[kind] = error
-                if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
-                    break
-                if kind.name == TRIED and min(judged.values()) <= ACCURATE:
-                    break
-        if not judged:
-            return None
-        least = min(judged.values())
-        near = min(BETTER * least, max(least, most))
-        good = [
-            kind
-            for kind, error in judged.items()
-            if error <= max(settings.reproduced * kind.enough, near)
-        ]
-        for kind in sorted(good, key=lambda kind: kind.unknowns):
-            model = _fitted(kind, rollouts, noise)
-            if model is not None:
-                if scale and len(rollouts) == 1 and not kind.unknowns[0]:
-                    cut = pieces(rollouts[0], settings.folds)
-                    held = _error(kind, cut, target, settings, np.inf, noise, scale, weights)
-                    own[kind] = held[1] if held else UNKNOWN
-                seen = [(kind.name, error) for kind, error in judged.items()]
-                return FittedModel(model, judged[kind], seen, own[kind])
-    return None
-
-
 def with_clean(
     rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
 ) -> list[Measured]:
@@ -433,12 +304,12 @@ def with_clean(
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
 
-def _error(
+def judged(
     kind: Kind,
     rollouts: Sequence[Measured],
+    least: float,
     target: Array,
     settings: FieldModelSettings,
-    least: float,
     noise: float,
     scale: Scale | None,
     weights: Array | None,
@@ -455,7 +326,7 @@ def _error(
     found: list[float] = []
     parts: list[tuple[FieldModel, list[Measured], list[Array]]] = []
     for others, own in turns(rollouts, settings.folds):
-        model = _fitted(kind, others, noise)
+        model = fitted(kind, others, noise)
         if model is None:
             return None
         own = usable(own)
@@ -471,12 +342,11 @@ def _error(
 
 def turns(
     rollouts: Sequence[Measured], folds: int
-) -> Iterator[tuple[list[Measured], list[Measured]]]:
+) -> Iterable[tuple[list[Measured], list[Measured]]]:
     """Rollouts to fit to and others to judge by, so that each is judged once; a single one is both."""
-    folds = min(len(rollouts), folds)
-    for fold in range(folds):
-        others = [rollout for i, rollout in enumerate(rollouts) if i % folds != fold]
-        yield others or list(rollouts), list(rollouts[fold::folds])
+    if len(rollouts) == 1:
+        return [(list(rollouts), list(rollouts))]
+    return held_out(rollouts, folds)
 
 
 def accuracy_of(
@@ -495,16 +365,13 @@ def accuracy_of(
         return Accuracy(float(np.mean(found)), float(np.sqrt(sums[0] / sums[1])))
 
 
-def _fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:
+def fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:
     """A fit, or None where the data overflow it."""
-    samples = Samples.of(rollouts)
-    if len(samples) < FEWEST_SAMPLES:
+    if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
     try:
         with np.errstate(all="ignore"):
-            if noise and kind.fit_noisy is not None:
-                return kind.fit_noisy(rollouts, noise)
-            return kind.fit(samples)
+            return kind.fit(rollouts, noise)
     except (np.linalg.LinAlgError, ValueError, FloatingPointError):
         return None
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.method.models.base import Arrays, FieldModel, text_of
-from pdeloop.method.models.finite_difference import CoarseModel, FiniteDifferenceModel
-from pdeloop.method.models.linear import LinearModel, LowRankModel
+from pdeloop.method.models.finite_difference import FiniteDifferenceModel
+from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.polynomial import PolynomialModel
+from pdeloop.method.models.projected import ProjectedModel
 from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.spectral import SpectralModel
@@ -24,9 +25,8 @@ from pdeloop.method.models.spectral import SpectralModel
 FORMS: dict[str, Callable[[Arrays], FieldModel]] = {
     "spectral": SpectralModel.from_arrays,
     "finite-difference": FiniteDifferenceModel.from_arrays,
-    "coarse": CoarseModel.from_arrays,
     "linear": LinearModel.from_arrays,
-    "low-rank": LowRankModel.from_arrays,
+    "projected": lambda arrays: ProjectedModel.from_arrays(arrays, model_of),
     "polynomial": PolynomialModel.from_arrays,
     "readings": ReadingsModel.from_arrays,
     "sensed": SensedModel.from_arrays,

@@ -14,12 +14,6 @@ that are no difference of any monomial, such as those of chains and rings of osc
 
 Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
 its numbers, has products of any of them.
-
-Fields on several axes may be modelled on a coarser grid: z_{k+1} = P f(S z_k, a_k), where S takes
-the values at some of the grid points, f is the model of them, and P, the least-squares
-interpolation of measured states, gives the whole field. Fields that a law can influence are smooth,
-whereas the work of a step of f grows with the number of points, times that of the internal steps,
-which on half the spacing is four times as large.
 """
 
 from __future__ import annotations
@@ -34,15 +28,12 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.messages.text import shown
 from pdeloop.method.models.base import (
     Arrays,
     StoredModel,
     checked_substeps,
-    linearised,
-    numbers_of,
     shaped,
     text_of,
 )
@@ -52,7 +43,6 @@ from pdeloop.method.models.finite_difference_kernels import (
     mean_features,
     pull_back,
 )
-from pdeloop.method.models.linear import add_products
 
 
 class Feature(NamedTuple):
@@ -73,8 +63,8 @@ class Feature(NamedTuple):
     shifts: tuple[int, ...] = ()
 
 
-def features_of(components: int, degree: int = 3, axes: int = 1) -> tuple[Feature, ...]:
-    """Monomials of a field's components up to degree 3; pure powers up to `degree`.
+def features_of(components: int, axes: int = 1) -> tuple[Feature, ...]:
+    """Monomials of a field's components up to degree 3.
 
     Linear ones have all differences, and squares those of first order, or all of a single component.
     """
@@ -82,7 +72,6 @@ def features_of(components: int, degree: int = 3, axes: int = 1) -> tuple[Featur
     of_squares = [j for j in every if components == 1 or j % 2 or not j]
     orders = {1: list(every), 2: of_squares}
     monomials = [m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)]
-    monomials += [(c,) * p for c in range(components) for p in range(4, degree + 1)]
     return tuple(Feature(m, j) for m in monomials for j in orders.get(len(m), [0]))
 
 
@@ -218,93 +207,3 @@ class FiniteDifferenceModel(StoredModel):
 
 def _filled(numbers: Sequence[int], value: int) -> list[int]:
     return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
-
-
-Points = NDArray[np.int64]
-_INNER = "inner."
-
-
-@dataclass(frozen=True, eq=False)
-class CoarseModel:
-    """An equation on a coarser grid.
-
-    Attributes
-    ----------
-    inner : FiniteDifferenceModel
-        f.
-    points : (m,) array of int
-        Numbers of a state that S takes.
-    interpolation : (n_z, m) array
-        P.
-    """
-
-    FORM = "coarse"
-    inner: FiniteDifferenceModel
-    points: Points
-    interpolation: Array
-
-    @property
-    def kind(self) -> str:
-        return self.inner.kind
-
-    @property
-    def n_z(self) -> int:
-        return len(self.interpolation)
-
-    @property
-    def n_a(self) -> int:
-        return self.inner.n_a
-
-    def step(self, states: Array, actions: Array) -> Array:
-        coarse = self.inner.step(states[:, self.points], actions)
-        after = np.zeros(states.shape)
-        add_products(read_only(coarse), read_only(self.interpolation.T), after)
-        return after
-
-    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        coarse = np.zeros((len(covectors), len(self.points)))
-        add_products(read_only(covectors), read_only(self.interpolation), coarse)
-        on_points, on_actions = self.inner.pull_back(states[:, self.points], actions, coarse)
-        on_states = np.zeros(states.shape)
-        on_states[:, self.points] = on_points
-        return on_states, on_actions
-
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return linearised(self, state, action)
-
-    def arrays(self) -> Arrays:
-        inner = {_INNER + n: array for n, array in self.inner.arrays().items() if n != "form"}
-        own = {"points": self.points, "interpolation": self.interpolation}
-        return inner | own | {"form": np.array(self.FORM), "kind": np.array(self.kind)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> CoarseModel:
-        inner = FiniteDifferenceModel.from_arrays(
-            {name.removeprefix(_INNER): a for name, a in arrays.items() if name.startswith(_INNER)}
-        )
-        if text_of(arrays, "kind") != inner.kind:
-            raise ValueError(f"a model '{text_of(arrays, 'kind')}' is made of one '{inner.kind}'")
-        points = checked_array(arrays, "points", "i", (inner.n_z,))
-        interpolation = numbers_of(arrays, "interpolation", None, inner.n_z)
-        if points.min(initial=0) < 0 or points.max(initial=0) >= len(interpolation):
-            raise ValueError(f"a model '{inner.kind}' has points outside of its state")
-        return CoarseModel(inner, points.copy(), interpolation)
-
-
-def coarse_points(shape: tuple[int, ...], most: int) -> tuple[Points, tuple[int, ...]]:
-    """At most this many points of a grid, equally spaced along each axis, and how many along each.
-
-    >>> coarse_points((4, 6), 6)
-    (array([ 7,  9, 11, 19, 21, 23]), (2, 3))
-    """
-    spacing = [1] * len(shape)
-
-    def sizes() -> list[int]:
-        return [n // own for n, own in zip(shape, spacing, strict=True)]
-
-    while math.prod(sizes()) > most:
-        spacing[int(np.argmax(sizes()))] += 1
-    numbers = np.arange(math.prod(shape)).reshape(shape)
-    for axis, (size, own) in enumerate(zip(sizes(), spacing, strict=True)):
-        numbers = np.take(numbers, own // 2 + own * np.arange(size), axis=axis)
-    return numbers.ravel(), tuple(sizes())

@@ -6,8 +6,6 @@ measured state; the change z_{k+1} - z_k is then linear in the coefficients, eac
 feature on the way. Coefficients are the sum of one that all points share and a part of each point's
 own, which a ridge holds at zero where the data say nothing of it.
 
-Fields on several axes are fitted on as fine a grid as is affordable (`fit_coarse`).
-
 Of states that are values of cells, not fields, the features are all monomials of a few neighbours
 to begin with (`fit_neighbours`). Of states that are neither, as of networks whose parts act on each
 other in no order, there are far too many products to be fitted together: for each number those are
@@ -35,9 +33,7 @@ matching pursuit", Asilomar Conference, 1993.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -45,10 +41,8 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Samples, least_squares, orthonormal
 from pdeloop.method.models.finite_difference import (
-    CoarseModel,
     Feature,
     FiniteDifferenceModel,
-    coarse_points,
     features_of,
     neighbour_features,
 )
@@ -62,8 +56,6 @@ _POINT_PASSES = 4
 """How often an equation of finite differences is refitted along the paths of the last fit."""
 _POINT_SUBSTEPS = 32
 """Maximum number of internal steps per sampling time."""
-_COARSE_POINTS = 256
-"""Maximum number of grid points of a model on several axes; on finer grids every n-th point is used."""
 _POINT_REACH = 2.5
 """Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
@@ -79,7 +71,6 @@ def fit_finite_difference(
     kind: str,
     components: int = 1,
     ridge: float | None = None,
-    degree: int = 3,
     shape: tuple[int, ...] = (),
 ) -> FiniteDifferenceModel | None:
     """The equation, or None where half of the samples overflow the first ones.
@@ -88,7 +79,7 @@ def fit_finite_difference(
     axis, where there are several.
     """
     samples = samples.thinned(POINT_SAMPLES)
-    features = features_of(components, degree, len(shape) or 1)
+    features = features_of(components, len(shape) or 1)
     size = largest_of(samples)
     model, fitted = nothing(kind, features, samples, components, shape), None
     for _ in range(_POINT_PASSES):
@@ -444,43 +435,3 @@ def _pursued(X: Array, y: Array) -> list[int]:
         kept.append(likely)
         rest = left
     return kept
-
-
-def fit_coarse(
-    samples: Samples,
-    *,
-    kind: str,
-    shape: tuple[int, ...],
-    ridge: float | None,
-    degree: int,
-) -> CoarseModel | FiniteDifferenceModel | None:
-    """The equation on as fine a grid as is affordable, or None where there is none.
-
-    shape: points of each axis; kind, ridge, degree: as for `fit_finite_difference`.
-    """
-    n_z = samples.before.shape[1]
-    components = n_z // math.prod(shape)
-    fit = partial(
-        fit_finite_difference,
-        kind=kind,
-        components=components,
-        ridge=ridge,
-        degree=degree,
-    )
-    points, few = coarse_points(shape, _COARSE_POINTS)
-    if few == shape:
-        return fit(samples, shape=shape)
-    every = (np.arange(components)[:, None] * math.prod(shape) + points).ravel()
-    seen = Samples(samples.before[:, every], samples.actions, samples.after[:, every])
-    inner = fit(seen, shape=few)
-    if inner is None:
-        return None
-    some = samples.thinned(POINT_SAMPLES)
-    states = np.concatenate([some.before, some.after])
-    values = states[:, every]
-    gram = values.T @ values
-    gram[np.diag_indices(len(gram))] += COEFFICIENT_RIDGE * np.trace(gram) / len(gram)
-    interpolation = np.linalg.solve(gram, values.T @ states).T
-    if not np.isfinite(interpolation).all():
-        return None
-    return CoarseModel(inner, every, np.ascontiguousarray(interpolation))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pdeloop.jit.cache import cached_njit, jit
 from pdeloop.messages.arrays import Array
 
-MOST_FACTORS = 5
+MOST_FACTORS = 3
 Table = NDArray[np.int64]
 """A feature a row: its number of factors, the factors, their shifts, and the order of its difference.
 

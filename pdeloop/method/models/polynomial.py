@@ -29,8 +29,10 @@ from scipy import linalg
 
 from pdeloop.jit.cache import cached_njit
 from pdeloop.messages.arrays import Array, read_only
-from pdeloop.method.models.base import Arrays, Samples, StoredModel
+from pdeloop.method.models.base import Arrays, Measured, Samples, StoredModel
 from pdeloop.method.models.linear import add_products
+from pdeloop.method.models.prediction import errors, pieces, predicted, usable
+from pdeloop.method.reduce.reduced_model import turns
 
 LARGEST_STATE = 256
 """Numbers of a state up to which a polynomial is fitted."""
@@ -44,8 +46,6 @@ _PIECE, _PARTS = 25, 3
 """Steps of a piece that is predicted, and parts of the rollouts, of which one is left out."""
 _ROUNDING = 1e-9
 """Standard deviation of a component, relative to its mean, up to which it rests."""
-_FAR = 1e3
-"""Magnitude of a scaled state at which a prediction ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,87 +213,40 @@ class _Scaled:
         return found
 
 
-def fit_polynomial(samples: Samples, *, kind: str) -> PolynomialModel | None:
+def fit_polynomial(
+    rollouts: Sequence[Measured], kind: str = "polynomial"
+) -> PolynomialModel | None:
     """The polynomial that predicts rollouts, and pieces of them, best that it was not fitted to."""
-    n_z = samples.before.shape[1]
-    if n_z > LARGEST_STATE or len(samples) < 4 * _PARTS:
+    rollouts = usable([Measured(own.known, own.actions) for own in rollouts])
+    samples = Samples.of(rollouts)
+    if len(samples) < 4 * _PARTS:
         return None
-    cuts = _pieces(samples, len(samples))
-    if len(cuts) < _PARTS:
-        cuts = _pieces(samples, _PIECE)
+    short = len(rollouts) < _PARTS
     ridges = list(product(LINEAR_RIDGES, PRODUCT_RIDGES))
+    n_z = samples.before.shape[1]
     leading = [q for i, q in enumerate(LEADING) if not i or LEADING[i - 1] < n_z]
-    errors = np.zeros((len(leading), len(ridges)))
-    for part in range(_PARTS):
-        own = [cut for i, cut in enumerate(cuts) if i % _PARTS == part]
-        others = [cut for i, cut in enumerate(cuts) if i % _PARTS != part]
-        if not own or not others:
-            return None
-        rest = np.concatenate([np.arange(begin, end) for begin, end in others])
-        data = _Scaled.of(_rows(samples, rest))
+    missed = np.zeros((len(leading), len(ridges)))
+    for others, own in turns(_cut(rollouts) if short else rollouts, _PARTS):
+        data = _Scaled.of(Samples.of(others))
         # Whole rollouts tell what is unstable, and pieces what is wrong where nothing predicts those.
-        short = [(k, min(k + _PIECE, end)) for begin, end in own for k in range(begin, end, _PIECE)]
-        cut = [own] if own == short else [own, short]
-        both = [_Pieces.of(samples, each, data.scale) for each in cut]
+        both = [own] if short else [own, _cut(own)]
         for i, q in enumerate(leading):
             for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
-                errors[i, j] += sum(_error(model, pieces, data.scale) for pieces in both)
-    i, j = divmod(int(np.argmin(errors)), len(ridges))
+                missed[i, j] += sum(_error(model, parts, data.scale) for parts in both)
+    i, j = divmod(int(np.argmin(missed)), len(ridges))
     data = _Scaled.of(samples)
     return data.fits(data.empty(kind, leading[i]), [ridges[j]])[0]
 
 
-def _rows(samples: Samples, rows: NDArray[np.int64]) -> Samples:
-    return Samples(samples.before[rows], samples.actions[rows], samples.after[rows])
+def _cut(rollouts: Sequence[Measured]) -> list[Measured]:
+    """In pieces of at most so many steps."""
+    return [part for own in rollouts for part in pieces(own, -(-len(own.actions) // _PIECE))]
 
 
-def _pieces(samples: Samples, most: int) -> list[tuple[int, int]]:
-    """Begin and end of rows that follow each other in time, at most so many."""
-    joined = (samples.after[:-1] == samples.before[1:]).all(axis=1)
-    cuts, begin = [], 0
-    for end in range(1, len(samples) + 1):
-        if end == len(samples) or not joined[end - 1] or end - begin == most:
-            cuts.append((begin, end))
-            begin = end
-    return cuts
-
-
-@dataclass(frozen=True, eq=False)
-class _Pieces:
-    """What is measured along pieces of rollouts that models predict.
-
-    first: their beginnings (n, n_z); steps: for each the pieces that are as long, their actions and the
-    states after it; size: the sum of their mean squared scaled changes (n,).
-    """
-
-    first: Array
-    steps: list[tuple[NDArray[np.int64], Array, Array]]
-    size: Array
-
-    @staticmethod
-    def of(samples: Samples, cuts: Sequence[tuple[int, int]], scale: Array) -> _Pieces:
-        begins, ends = np.array(cuts).T
-        first, size = samples.before[begins], np.zeros(len(cuts))
-        steps = []
-        for k in range(int((ends - begins).max())):
-            alive = np.flatnonzero(begins + k < ends)
-            after = samples.after[begins[alive] + k]
-            steps.append((alive, samples.actions[begins[alive] + k], after))
-            with np.errstate(all="ignore"):
-                size[alive] += np.mean(((after - first[alive]) / scale) ** 2, axis=1)
-        return _Pieces(first, steps, size)
-
-
-def _error(model: PolynomialModel, pieces: _Pieces, scale: Array) -> float:
-    """Mean square of the scaled error over pieces, relative to their change; at most 1 a piece."""
-    z, error = pieces.first.copy(), np.zeros(len(pieces.first))
-    with np.errstate(all="ignore"):
-        for alive, actions, measured in pieces.steps:
-            after = model.step(z[alive], actions)
-            error[alive] += np.mean(((after - measured) / scale) ** 2, axis=1)
-            z[alive] = after
-            far = ~(np.abs(z / scale).max(axis=1) < _FAR)
-            if far.any():
-                error[far], z[far] = np.inf, pieces.first[far]
-        relative = np.nan_to_num(error / pieces.size, nan=1.0, posinf=1.0)
-    return float(np.minimum(relative, 1.0).mean())
+def _error(model: PolynomialModel, parts: Sequence[Measured], scale: Array) -> float:
+    """Mean square of the scaled error over parts, relative to their change; at most 1 each."""
+    found = [
+        errors(model, [own], own.states[0], 1.0, 0.0, 1.0 / scale, [simulated])
+        for own, simulated in zip(parts, predicted(model, parts), strict=True)
+    ]
+    return float(np.mean(found))

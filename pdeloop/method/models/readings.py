@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import StoredModel
+from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.reduce.reduced_model import Trajectory
 from pdeloop.method.reduce.subspace import InnovationModel, likeliest_start, subspace_model
 
@@ -32,47 +32,28 @@ FOREMOST = 60
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingsModel(StoredModel):
-    """A model in innovation form, as a model of its state (`pdeloop.method.models.FieldModel`).
+class ReadingsModel(LinearModel):
+    """A model in innovation form, as a linear model of its state.
 
     Attributes
     ----------
-    A, B, C, G, U : arrays
+    C, G, U : arrays
         As for `InnovationModel`.
     innovations : (r, r) array
         Covariance of e.
     """
 
     FORM = "readings"
-    SHAPES: ClassVar = {
-        "G": "n r",
-        "A": "n n",
-        "B": "n a",
+    SHAPES: ClassVar = LinearModel.SHAPES | {
         "C": "r n",
+        "G": "n r",
         "U": "y r",
         "innovations": "r r",
     }
-    A: Array
-    B: Array
     C: Array
     G: Array
     U: Array
     innovations: Array
-    kind: str = KIND
-
-    @property
-    def n_z(self) -> int:
-        return len(self.A)
-
-    def step(self, states: Array, actions: Array) -> Array:
-        after: Array = states @ self.A.T + actions @ self.B.T
-        return after
-
-    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        return covectors @ self.A, covectors @ self.B
-
-    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
-        return self.A.copy(), self.B.copy()
 
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""
@@ -125,4 +106,6 @@ def fit_readings(
 
 
 def _model(found: InnovationModel) -> ReadingsModel:
-    return ReadingsModel(found.A, found.B, found.C, found.G, found.U, found.innovations)
+    none = np.zeros(len(found.A))
+    own = found.C, found.G, found.U, found.innovations
+    return ReadingsModel(KIND, found.A, found.B, none, *own)

@@ -3,7 +3,7 @@
 
 The model is that which predicts whole rollouts (`choice`), where one is accepted, or else
 
-- one fitted for measurement noise that nobody declared (`fit_undeclared_noise`), which is looked
+- one fitted for measurement noise that nobody declared (`Selection.undeclared_noise`), which is looked
   for first, as any model that takes noise for the state seems to predict pieces;
 - of a chaotic plant, one that predicts pieces of rollouts, where small errors have not grown yet. They
   are then far smaller than those of whole rollouts; those of a plant that is described badly add up;
@@ -36,11 +36,20 @@ import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import FieldModel, Measured
+from pdeloop.method.models.base import FieldModel, Measured, Samples
 from pdeloop.method.models.choice import (
+    ACCURATE,
+    FEWEST_SAMPLES,
+    LINEAR,
+    TRIED,
+    UNKNOWN,
+    Accuracy,
     FittedModel,
+    Kind,
     Scale,
-    fit_field_model,
+    fitted,
+    judged,
+    kinds_of,
     limited,
     scale_of,
     with_clean,
@@ -49,6 +58,7 @@ from pdeloop.method.models.noise_level import is_white, noise_level, share_of_no
 from pdeloop.method.models.noisy_fit import filtered
 from pdeloop.method.models.prediction import beginnings, errors, pieces
 from pdeloop.method.models.settings import (
+    BETTER,
     DEFAULTS,
     LEAST_CORRECTION,
     NOISE_MISJUDGED,
@@ -59,6 +69,8 @@ from pdeloop.process.one_thread import one_thread
 ACCEPTED_NOISY = 0.3
 """Largest error of a model that is accepted with measurement noise, or is linear and of beginnings:
 initial states are uncertain then, and what leaves the target at once says little."""
+REPRODUCED_NOISY = 0.05
+"""Largest E at which a kind is selected with measurement noise: initial states are uncertain then."""
 ONE_STEP = 0.3
 """Largest error of single steps, relative to the change in them."""
 PIECES = 8
@@ -67,6 +79,23 @@ CHAOTIC_GROWTH = 20.0
 """Least ratio of the errors on whole rollouts and on pieces of a chaotic plant."""
 NEAR = (10.0, 3.0, 1.0)
 """Distances from the target, relative to the largest of initial states, of beginnings."""
+
+
+_NOISE_EXCESS = 1.3
+"""Largest root mean square of the innovations of an equation, relative to the noise."""
+_WHITE_LEVEL = 0.01
+"""Rate at which the test for white innovations rejects independent noise."""
+_WHITE_TOLERANCE = 0.5
+"""Root sum of squares of the correlations of innovations that counts as white."""
+
+PREDICTED = 0.5
+"""E of a model without noise, relative to the share of the noise, below which there is no noise."""
+_BEGINNING = 8
+"""Innovations of a rollout that are left out, as those of its uncertain initial state."""
+_TURNS = 4
+"""Times that the filter's shares are computed from its innovations."""
+_GROWN = 10.0
+"""E that the noise of an initial state may lead to, per share of the noise in the states."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +146,35 @@ class Selected:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Selection:
-    """How a model is selected; the arguments of `fit_field_model` are as there.
+    """How a model is selected.
 
     Attributes
     ----------
+    target : (n_z,) array
+        z_r; the error is measured by the distance to it.
     accepted : float
         Largest E of a model that is accepted without noise.
+    settings : FieldModelSettings
+        Constants of the fits.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
+        the error beyond what it explains, and kinds that know of noise are fitted as `noisy_fit` says.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
+    line : bool
+        Whether the states are fields on one axis, or plain vectors.
+    shape : tuple of int
+        Points of each axis, where the states are fields on several; none: they are not.
+    weights : (n_z,) or (n, n_z) array, optional
+        W of E (`prediction.errors`), in which the numbers of a state count as in the cost.
     undeclared : bool
         Whether noise that was not declared is looked for.
+    components : int
+        Number of fields in a state, stored one after the other.
     """
 
     target: Array
-    accepted: float
+    accepted: float = np.inf
     settings: FieldModelSettings = DEFAULTS
     noise: float = 0.0
     action_set: ActionSet = ANY_ACTION
@@ -136,6 +182,7 @@ class Selection:
     shape: tuple[int, ...] = ()
     weights: Array | None = None
     undeclared: bool = True
+    components: int = 1
 
     @cached_property
     def most(self) -> float:
@@ -145,28 +192,77 @@ class Selection:
     def fit(
         self,
         rollouts: Sequence[Measured],
-        scale: Scale,
+        scale: Scale | None = None,
         first: str = "",
         *,
         linear: bool = False,
         by_scale: bool = False,
+        knows_noise: bool = False,
     ) -> FittedModel | None:
-        """`fit_field_model` of these rollouts."""
-        return fit_field_model(
-            rollouts,
-            self.target,
-            settings=self.settings,
-            noise=self.noise,
-            action_set=self.action_set,
-            first=first,
-            line=self.line,
-            shape=self.shape,
-            scale=scale,
-            by_scale=by_scale,
-            weights=self.weights,
-            most=self.most,
-            linear=linear,
-        )
+        """The model that predicts these rollouts, or None where none can be fitted.
+
+        Parameters
+        ----------
+        rollouts : sequence of Measured
+            Whole or not; values that are not finite are left out.
+        scale : Scale, optional
+            Of the errors `own` of the result, always of rollouts or pieces that it was not fitted to.
+        first : str
+            Kind to be tried first, that of the last choice.
+        linear, knows_noise : bool
+            Try only linear models, or the kinds that are fitted for noise.
+        by_scale : bool
+            Whether E is relative to this scale instead of the distance to the target.
+        """
+        target, noise, settings = self.target, self.noise, self.settings
+        rollouts = [limited(rollout, self.action_set) for rollout in rollouts]
+        if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
+            return None
+        if noise:
+            rollouts = with_clean(rollouts, noise, self.components, line=self.line)
+            share = share_of_noise(noise, [r.states for r in rollouts], target, self.weights)
+            enough = min(_GROWN * share, REPRODUCED_NOISY)
+            settings = replace(settings, reproduced=max(settings.reproduced, enough))
+        kinds = kinds_of(len(target), self.components, settings, line=self.line, shape=self.shape)
+        if linear:
+            kinds = [kind for kind in kinds if kind.name == LINEAR]
+        if knows_noise:
+            kinds = [kind for kind in kinds if kind.knows_noise]
+        kinds.sort(key=lambda kind: kind.name != first)
+        tried: dict[Kind, float] = {}
+        own: dict[Kind, Accuracy] = {}
+        known = target, settings, noise, scale, self.weights
+        with one_thread():  # a rounding must not depend on the machine's load
+            for kind in kinds:
+                least = min(tried.values(), default=np.inf)
+                if not least > kind.needed:
+                    continue
+                found = judged(kind, rollouts, least, *known)
+                if found is not None:
+                    error, own[kind] = found
+                    error = own[kind].simulated if by_scale else error
+                    tried[kind] = error
+                    if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
+                        break
+                    if kind.name == TRIED and min(tried.values()) <= ACCURATE:
+                        break
+            least = min(tried.values(), default=np.inf)
+            # One of fewer unknowns is no better than others where it is not accepted.
+            near = min(BETTER * least, max(least, self.most))
+            good = [
+                kind
+                for kind, error in tried.items()
+                if error <= max(settings.reproduced * kind.enough, near)
+            ]
+            for kind in sorted(good, key=lambda kind: kind.unknowns):
+                model = fitted(kind, rollouts, noise)
+                if model is not None:
+                    if scale and len(rollouts) == 1 and not kind.unknowns[0]:
+                        held = judged(kind, pieces(rollouts[0], settings.folds), np.inf, *known)
+                        own[kind] = held[1] if held else UNKNOWN
+                    seen = [(kind.name, error) for kind, error in tried.items()]
+                    return FittedModel(model, tried[kind], seen, own[kind])
+        return None
 
     def select(self, rollouts: Sequence[Measured], first: str = "") -> Selected | None:
         """The model, which need not be accepted; None where none can be fitted.
@@ -201,20 +297,44 @@ class Selection:
         """An equation for noise that was not declared, of fields on one axis."""
         if not (self.undeclared and self.line) or self.shape:
             return None
-        found = fit_undeclared_noise(
-            [replace(own, law=None) for own in rollouts],
-            self.target,
-            settings=self.settings,
-            most=ACCEPTED_NOISY,
-            # E without another noise is no measure for E with it.
-            better_than=np.inf if self.noise or whole is None else whole.error,
-            declared=self.noise,
-            action_set=self.action_set,
-            weights=self.weights,
-        )
+        # E without another noise is no measure for E with it.
+        better_than = np.inf if self.noise or whole is None else whole.error
+        found = self.undeclared_noise([replace(own, law=None) for own in rollouts], better_than)
         if found is None:
             return None
         return Selected(found[0], rollouts, ACCEPTED_NOISY, noise=found[1])
+
+    def undeclared_noise(
+        self, rollouts: Sequence[Measured], better_than: float = np.inf
+    ) -> tuple[FittedModel, float] | None:
+        """An equation fitted for measurement noise, and the noise; None where there is no such noise.
+
+        Where some is declared another one is looked for only if it is `NOISE_MISJUDGED` times as large,
+        or as small.
+
+        rollouts: fields of one component on a periodic axis; better_than: E of the best model without
+        noise.
+        """
+        states = [np.asarray(rollout.states) for rollout in rollouts]
+        noise, declared = noise_level(states), self.noise
+        misjudged = max(noise, declared) > NOISE_MISJUDGED * min(noise, declared)
+        if not noise or not misjudged:
+            return None
+        if better_than < PREDICTED * share_of_noise(noise, states, self.target, self.weights):
+            return None
+        found = replace(self, noise=noise).fit(rollouts, knows_noise=True)
+        if found is None or found.error > ACCEPTED_NOISY or not found.error < better_than:
+            return None
+        known = with_clean([limited(rollout, self.action_set) for rollout in rollouts], noise)
+        with one_thread():
+            left = innovations(found.model, known, noise)
+        if left is None:
+            return None
+        short = [short_waves(own) for own in left]
+        if not is_white(short, _WHITE_LEVEL, _WHITE_TOLERANCE):
+            return None
+        size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
+        return (found, noise) if size <= _NOISE_EXCESS * noise else None
 
     def _of_pieces(
         self, rollouts: list[Measured], scale: Scale, whole: Selected
@@ -243,86 +363,6 @@ class Selection:
                 found.append(self._selected(fitted, parts, near if linear else np.inf))
         good = [own for own in found if own and own.predicts and own.one_step <= ONE_STEP]
         return min(good, key=lambda own: own.error, default=None)
-
-
-_NOISE_EXCESS = 1.3
-"""Largest root mean square of the innovations of an equation, relative to the noise."""
-_WHITE_LEVEL = 0.01
-"""Rate at which the test for white innovations rejects independent noise."""
-_WHITE_TOLERANCE = 0.5
-"""Root sum of squares of the correlations of innovations that counts as white."""
-
-PREDICTED = 0.5
-"""E of a model without noise, relative to the share of the noise, below which there is no noise."""
-_BEGINNING = 8
-"""Innovations of a rollout that are left out, as those of its uncertain initial state."""
-_TURNS = 4
-"""Times that the filter's shares are computed from its innovations."""
-
-
-def fit_undeclared_noise(
-    rollouts: Sequence[Measured],
-    target: Array,
-    *,
-    settings: FieldModelSettings,
-    most: float,
-    better_than: float = np.inf,
-    declared: float = 0.0,
-    action_set: ActionSet = ANY_ACTION,
-    weights: Array | None = None,
-) -> tuple[FittedModel, float] | None:
-    """An equation fitted for measurement noise, and the noise; None where there is no such noise.
-
-    Parameters
-    ----------
-    rollouts : sequence of Measured
-        Of fields of one component on a periodic axis.
-    target : (n_z,) array
-        z_r.
-    settings : FieldModelSettings
-        Constants.
-    most : float
-        Largest error E of the equation.
-    better_than : float
-        E of the best model without noise.
-    declared : float
-        Noise that was declared; another one is looked for only if it is `noise_misjudged` times as
-        large, or as small.
-    action_set : ActionSet
-        Admissible actions, the nearest of which is applied.
-    weights : array, optional
-        As for `fit_field_model`.
-    """
-    states = [np.asarray(rollout.states) for rollout in rollouts]
-    noise = noise_level(states)
-    misjudged = max(noise, declared) > NOISE_MISJUDGED * min(noise, declared)
-    if (
-        not noise
-        or not misjudged
-        or better_than < PREDICTED * share_of_noise(noise, states, target, weights)
-    ):
-        return None
-    found = fit_field_model(
-        rollouts,
-        target,
-        settings=settings,
-        noise=noise,
-        action_set=action_set,
-        knows_noise=True,
-        weights=weights,
-    )
-    if found is None or found.error > most or not found.error < better_than:
-        return None
-    known = with_clean([limited(rollout, action_set) for rollout in rollouts], noise)
-    with one_thread():
-        left = innovations(found.model, known, noise)
-    if left is None:
-        return None
-    short = [short_waves(own) for own in left]
-    if not is_white(short, _WHITE_LEVEL, _WHITE_TOLERANCE):
-        return None
-    size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
-    return (found, noise) if size <= _NOISE_EXCESS * noise else None
 
 
 def innovations(

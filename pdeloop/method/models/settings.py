@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from pdeloop.method.settings import Settings, setting
 
-FIRST_SUBSTEPS = 6
-"""Internal steps of the first pass of a fit."""
 COEFFICIENT_RIDGE = 1e-9
 """Ridge of the normal equations in normalised columns."""
 POINT_SAMPLES = 800
@@ -24,16 +22,10 @@ NOISE_MISJUDGED = 2.0
 different."""
 BETTER = 3.0
 """How many times smaller the E of a kind with more unknowns must be for it to be selected."""
-CLIP = 1.2
-"""Bound on z in powers above the third, relative to the largest measured value."""
 SENSED_NEWEST = 8
 """Maximum number of rollouts in a fit, the newest ones."""
 SENSED_REPRODUCED = 0.05
 """Maximum error of an equation that is used."""
-REPRODUCED_NOISY = 0.05
-"""Largest E at which a kind is selected with measurement noise: initial states are uncertain then."""
-DENSE = 512
-"""Largest state for the kinds whose cost grows with its square, and for models of neighbours."""
 SENSED_MOST = 32
 """Maximum number of point sensors between which a field is estimated."""
 

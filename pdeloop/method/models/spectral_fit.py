@@ -13,8 +13,8 @@ suffice without an initial guess: the field changes much within a sampling time,
 of a wrong equation already give a nearly right one. B and c are free at every wavenumber and are
 projected out first. Symbols are, by their number of unknowns: polynomials of ik with real
 coefficients (`poly`, and `front` with fewer terms), compared on low wavenumbers only, where a steep
-front has no influence; with the Hilbert transforms of the derivatives in L (`nonlocal`); L free at
-every wavenumber (`semi`); all free (`free`). A pass need not be a contraction where the field
+front has no influence; with a fifth derivative in L (`fifth`), or the Hilbert transforms of the others
+(`nonlocal`); free at every wavenumber (`free`). A pass need not be a contraction where the field
 changes fast, so the equation with the smallest residual of all passes is selected.
 
 References
@@ -34,18 +34,14 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Samples, Values, least_squares, orthonormal
-from pdeloop.method.models.settings import (
-    CLIP,
-    COEFFICIENT_RIDGE,
-    FIRST_SUBSTEPS,
-    FieldModelSettings,
-)
+from pdeloop.method.models.settings import COEFFICIENT_RIDGE, FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel, Spectrum
 from pdeloop.solver.polynomial_step import phi_functions
 
-_SYMBOL_RIDGE = 1e-7
-"""Ridge of a free symbol, relative to the mean square of its column."""
-
+FIRST_SUBSTEPS = 6
+"""Internal steps of the first pass of a fit."""
+CLIP = 1.2
+"""Bound on z in powers above the third, relative to the largest measured value."""
 ORDERS = (4, 2, 2, 1, 1, 1, 1)
 """Highest derivative in the symbols of z, z^2, ...; (ik)^3 of z^2 makes the first pass explode."""
 Symbols = tuple[Spectrum, Spectrum, Array]
@@ -68,8 +64,8 @@ class Form:
         for all further passes.
     hilbert : bool
         Whether L also has the Hilbert transforms of its derivatives.
-    free : {"none", "linear", "all"}
-        Symbols that are free at every wavenumber.
+    free : bool
+        Whether all symbols are free at every wavenumber.
     """
 
     name: str
@@ -77,11 +73,11 @@ class Form:
     linear_order: int = ORDERS[0]
     shares: tuple[int, ...] = (8, 8, 4)
     hilbert: bool = False
-    free: str = "none"
+    free: bool = False
 
     def compared(self, modes: int, turn: int | None = None) -> int:
         """Wavenumbers that are compared in a pass; without one, in the last."""
-        if self.free == "all":
+        if self.free:
             return modes
         last = len(self.shares) - 1
         return max(4, modes // self.shares[last if turn is None else min(turn, last)])
@@ -90,10 +86,8 @@ class Form:
     def unknowns(self) -> tuple[float, int]:
         """Those of every wavenumber, and the coefficients that all share."""
         shared = sum(order + 1 for order in ORDERS[1 : self.degree])
-        if self.free == "all":
+        if self.free:
             return float(self.degree), 0
-        if self.free == "linear":
-            return 1.0, shared
         return 0.0, shared + (self.linear_order + 1) * (2 if self.hilbert else 1)
 
 
@@ -161,30 +155,6 @@ def polynomial(data: Regression, form: Form, turn: int) -> Symbols:
     return linear, *_grouped(form, powers, found[count:], k)
 
 
-def free_linear(data: Regression, form: Form) -> Symbols:
-    """L free at every wavenumber, and polynomials of ik for the powers."""
-    k, compared = data.k, form.compared(len(data.k))
-    rests, y = [data.rest(W) for W in data.W], data.rest(data.y)
-    own = rests[0]
-    size = np.sum(np.abs(own) ** 2, axis=0)
-    size = size + _SYMBOL_RIDGE * np.mean(np.sum(np.abs(data.W[0]) ** 2, axis=0))
-    size = np.where(size > 0.0, size, 1.0)
-
-    def rest(values: Spectrum) -> Spectrum:
-        projected: Spectrum = values - own * (np.sum(np.conj(own) * values, axis=0) / size)
-        return projected
-
-    powers, low = _power_terms(form), slice(compared)
-    columns = np.stack([(rest(rests[p]) * k**j)[:, low].ravel() for p, j in powers], axis=1)
-    found = _real_least_squares(columns, rest(y)[:, low].ravel())
-    multipliers, polynomials = _grouped(form, powers, found, k)
-    left = y - np.einsum("pk,pnk->nk", polynomials.T @ multipliers, np.stack(rests[1:]))
-    linear = data.symbols[0] + np.sum(np.conj(own) * left, axis=0) / size
-    most = max(float(linear.real[: max(4, len(k) // 8)].max()), 0.0)
-    linear = np.minimum(linear.real, most) + 1j * linear.imag
-    return _unwound(linear, compared), multipliers, polynomials
-
-
 def all_free(data: Regression) -> Symbols:
     """All symbols free at every wavenumber, near the current ones where data do not determine them."""
     rests, y = np.stack([data.rest(W) for W in data.W]), data.rest(data.y)
@@ -219,21 +189,6 @@ def _grouped(
     return k ** orders[:, None], polynomials
 
 
-def _unwound(linear: Spectrum, known: int) -> Spectrum:
-    """L with multiples of 2 pi i such that it is continuous, from the wavenumber `known` on.
-
-    Between two samples a fast wave turns more than once, and from its two ends one cannot see how
-    often: a parabola through the wavenumbers below says it.
-    """
-    found, window = linear.copy(), min(8, known)
-    x = np.arange(-window, 0)
-    extrapolate = np.linalg.pinv(np.vander(x, 3))[2]  # the parabola at 0
-    for k in range(known, len(found)):
-        expected = extrapolate @ found[k - window : k].imag
-        found[k] += 2j * np.pi * np.round((expected - found[k].imag) / (2 * np.pi))
-    return found
-
-
 def _real_least_squares(A: Spectrum, y: Spectrum) -> Array:
     """Real coefficients of complex columns."""
     scale = np.sqrt(np.sum(np.abs(A) ** 2, axis=0))
@@ -264,8 +219,6 @@ def fit_spectral(
     samples = samples.thinned(_SAMPLES)
     largest = float(np.abs(samples.before).max())
     model = nothing(form, samples.before.shape[1], samples.actions.shape[1], largest)
-    if form.free == "linear":  # whose passes need a start
-        model = fit_spectral(samples, replace(form, free="none"), settings) or model
     # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
     best, least, tried = None, np.inf, model
     for turn in range(_PASSES + 1):
@@ -315,12 +268,8 @@ def nothing(form: Form, n_z: int, n_a: int, largest: float) -> SpectralModel:
 
 def solved(data: Regression, model: SpectralModel, form: Form, turn: int) -> SpectralModel | None:
     """The equation of a regression; None where it is not finite."""
-    if form.free == "all":
-        linear, multipliers, polynomials = all_free(data)
-    elif form.free == "linear":
-        linear, multipliers, polynomials = free_linear(data, form)
-    else:
-        linear, multipliers, polynomials = polynomial(data, form, turn)
+    found = all_free(data) if form.free else polynomial(data, form, turn)
+    linear, multipliers, polynomials = found
     if form.degree <= POWERS:
         multipliers, polynomials = polynomials.T @ multipliers, np.eye(form.degree - 1)
     modes, seen = len(linear), data.y.shape[1]
