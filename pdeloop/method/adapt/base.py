@@ -125,6 +125,19 @@ class Record:
         return self.states[: len(self.actions)]
 
 
+def of_law(records: Sequence[Record], law: Array) -> list[Record]:
+    """The rollouts of a law."""
+    return [record for record in records if np.array_equal(record.policy, law)]
+
+
+def by_law(records: Sequence[Record]) -> list[list[Record]]:
+    """The rollouts of each law, the first law first."""
+    found: dict[bytes, list[Record]] = {}
+    for record in records:
+        found.setdefault(record.policy.tobytes(), []).append(record)
+    return list(found.values())
+
+
 @dataclass(frozen=True, eq=False)
 class Context:
     """The problem as a model-based optimiser knows it.
@@ -404,3 +417,13 @@ def part_of(state: Mapping[str, NDArray[np.generic]], prefix: str) -> State:
     """The arrays with a prefix, without it."""
     names = [name for name in state if name.startswith(prefix)]
     return {name.removeprefix(prefix): state[name] for name in names}
+
+
+def numbers_of(
+    state: Mapping[str, NDArray[np.generic]], kinds: Mapping[str, str], *, finite: bool = True
+) -> dict[str, Any]:
+    """The single numbers and texts of these names in a state, by their NumPy kinds; or a ValueError."""
+    return {
+        name: checked_array(state, name, kind, (), finite=finite).item()
+        for name, kind in kinds.items()
+    }

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Context, Record, State, part_of
+from pdeloop.method.adapt.base import Context, Record, State, numbers_of, part_of
 from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop, ObservedLoop, ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
 from pdeloop.method.laws.feedforward import FeedForward
@@ -25,6 +24,8 @@ from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import FAR
 
 _MODEL = "model."
+_NUMBERS = {"error": "f", "components": "i", "whole": "b", "near": "f"}
+"""What is one number of a checkpoint, and its NumPy kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,24 +61,14 @@ class Belief:
     def state(self) -> State:
         """The model, its error and its components, as the arrays of a checkpoint."""
         arrays = {_MODEL + name: value for name, value in self.model.arrays().items()}
-        numbers = {"error": np.array(self.error), "components": np.array(self.components)}
-        if not self.whole:
-            numbers["whole"] = np.array(self.whole)
-        if self.near < np.inf:
-            numbers["near"] = np.array(self.near)
-        return numbers | arrays
+        return arrays | {name: np.array(getattr(self, name)) for name in _NUMBERS}
 
     @classmethod
     def of(cls, state: Mapping[str, NDArray[np.generic]]) -> Belief | None:
         """The belief in a checkpoint, None where it has none; ValueError for arrays of no model."""
         if "error" not in state:
             return None
-        model = model_of(part_of(state, _MODEL))
-        error = float(checked_array(state, "error", "f", ()))
-        components = int(checked_array(state, "components", "i", ()))
-        whole = "whole" not in state or bool(checked_array(state, "whole", "b", ()))
-        near = float(checked_array(state, "near", "f", ())) if "near" in state else np.inf
-        return cls(model, error, components, whole, near)
+        return cls(model_of(part_of(state, _MODEL)), **numbers_of(state, _NUMBERS, finite=False))
 
     def check(self, context: Context) -> None:
         """ValueError if the model has another plant's size, which compiled code does not check."""

@@ -32,8 +32,10 @@ from pdeloop.method.adapt.base import (
     RolloutResult,
     Row,
     State,
+    by_law,
     checked_policy,
     checked_theta,
+    of_law,
     require_positive,
     require_results,
 )
@@ -67,6 +69,7 @@ from pdeloop.method.adapt.verdict import (
     NAMES,
     NO_OTHER,
     NONE,
+    Verdict,
     beats_no_control,
     cheaper_law,
     choose,
@@ -312,9 +315,8 @@ class ModelBased(Optimizer):
     @property
     def _is_new(self) -> bool:
         """True if a model made the law, and no rollout has shown yet whether it costs as much."""
-        progress, known = self._progress, self._records.all()
-        made = progress.belief is not None and self._model_compares
-        return made and not any(np.array_equal(own.policy, progress.policy) for own in known)
+        made = self._progress.belief is not None and self._model_compares
+        return made and not of_law(self._records.all(), self._progress.policy)
 
     def _next_renewal(self) -> int:
         """Own rollouts after which the law is renewed next, unless it costs more than predicted."""
@@ -332,10 +334,8 @@ class ModelBased(Optimizer):
     @property
     def _repeats(self) -> bool:
         """True if a law's rollouts are all the same one: every episode begins alike, without noise."""
-        laws: dict[bytes, list[float]] = {}
-        for record in self._records.all():
-            laws.setdefault(record.policy.tobytes(), []).append(record.cost)
-        pairs = [own for own in laws.values() if len(own) > 1 and np.isfinite(own).all()]
+        laws = [[record.cost for record in own] for own in by_law(self._records.all())]
+        pairs = [own for own in laws if len(own) > 1 and np.isfinite(own).all()]
         if self._context.noise or not pairs or not begin_alike(self._measurements()):
             return False
         return all(np.ptp(own) <= _REPEATS * abs(own[0]) for own in pairs)
@@ -343,9 +343,7 @@ class ModelBased(Optimizer):
     @property
     def _rests(self) -> bool:
         """True if the last two laws cost hardly less than one before them, each rolled out once."""
-        costs = list(
-            {record.policy.tobytes(): record.cost for record in self._records.all()}.values()
-        )
+        costs = [own[-1].cost for own in by_law(self._records.all())]
         least = (1.0 - self._settings.least_gain) * min(costs[:-2], default=np.inf)
         return self._repeats and len(costs) > 2 and min(costs[-2:]) >= least
 
@@ -360,7 +358,7 @@ class ModelBased(Optimizer):
     def _turns_to_target(self, row: Row) -> bool:
         """Take the next law about the target, or the cheapest of all laws where none is left to try."""
         progress = self._progress
-        laws = list({own.policy.tobytes(): own for own in self._records.all()}.values())
+        laws = [own[-1] for own in by_law(self._records.all())]
         best = min(range(len(laws)), key=lambda i: laws[i].cost)
         before = sum(own.stamp < progress.rested for own in laws)
         law = None
@@ -379,8 +377,8 @@ class ModelBased(Optimizer):
     def _measured(self, added: Sequence[Record]) -> Row:
         """The mean cost of some rollouts, and the model's earlier prediction of it."""
         row: Row = {"role": self._progress.stage}
-        own = [r for r in added if np.array_equal(r.policy, self._progress.policy)]
-        added = own if self._progress.replayed else added
+        if self._progress.replayed:
+            added = of_law(added, self._progress.policy)
         if all(record.usable for record in added):
             row["cost"] = float(np.mean([record.cost for record in added]))
         predicted = self._predicted(added)
@@ -462,8 +460,7 @@ class ModelBased(Optimizer):
         """
         why = why or self._unpredicted
         progress, records = self._progress, self._records.all()
-        laws = {record.policy.tobytes(): record.policy for record in records}
-        best = best_on_same_fields(records, list(laws.values()), self._first)
+        best = best_on_same_fields(records, self._first)
         progress.replayed = True
         if progress.trust:
             good = np.array_equal(best, progress.policy)
@@ -546,13 +543,11 @@ class ModelBased(Optimizer):
             loop, fields = progress.belief.loop(self._context), self._fields()
             evidence = evidence_of(loop, laws, base, known, fields, progress.change)
         if evidence is None:
-            measured = any(np.array_equal(own.policy, laws[base]) for own in known)
-            base = base if measured else FIRST  # to which there is nothing to compare
+            base = base if of_law(known, laws[base]) else FIRST  # there is nothing to compare
             evidence = evidence_of_rollouts(laws, base, known)
         verdict = choose(evidence, base, self._settings.confidence)
         progress.policy = laws[verdict.chosen].copy()
-        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
-        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        row |= verdict.row
         return base
 
     _model_compares = True
@@ -580,12 +575,11 @@ class ModelBased(Optimizer):
             missed = str(row["reason"]).removeprefix(f"{NO_OTHER}: ")
             within = " (within chance)" if missed != row["reason"] else ""
             reason = f"{missed}{within}; {reason}"
-        row["reason"] = reason
         change = measured_change(known, law, laws[base])
         if change is None:
             change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))
-        row["chosen"], progress.policy = name, law.copy()
-        row["predicted_change"], row["deviation"] = change.value, change.error
+        row |= Verdict(name, change.value, change.error, reason).row
+        progress.policy = law.copy()
 
     def _rollouts(self) -> list[Record]:
         """The rollouts of laws, denoised."""

@@ -43,6 +43,8 @@ from pdeloop.method.adapt.base import (
     RolloutResult,
     Row,
     State,
+    numbers_of,
+    of_law,
     part_of,
     require_results,
 )
@@ -82,6 +84,8 @@ RESTS = 0.01
 of its mean distance from it."""
 _TRAINING, _JUDGING, _ENDED = "training", "judging", "ended"
 _OWN = "own."
+_NUMBERS = {"stage": "U", "tells": "i", "count": "i", "kept": "i", "share": "f"}
+"""What is one number or text of a checkpoint, and its NumPy kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,8 +369,7 @@ class ModelBasedPredictive(Optimizer):
         )
         if verdict.chosen == self.candidate:
             self._chosen = candidate.theta
-        row["chosen"], row["reason"] = verdict.chosen, verdict.reason
-        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        row |= verdict.row
 
     @property
     def _base_name(self) -> str:
@@ -396,7 +399,7 @@ class ModelBasedPredictive(Optimizer):
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
         excess += [np.inf] * (len(results) - len(usable))
-        rolled = [r for r in self._affine.records if np.array_equal(r.policy, policy)]
+        rolled = of_law(self._affine.records, policy)
         of_base = [
             record.cost - float(loop.costs(theta, loop.beginnings([record]))[0])
             for record in rolled
@@ -413,14 +416,8 @@ class ModelBasedPredictive(Optimizer):
     def state(self) -> State:
         """That of `ModelBased`, the stage, and the law that plans."""
         arrays: State = {_OWN + name: value for name, value in self._affine.state().items()}
-        arrays |= {
-            "stage": np.array(self._stage),
-            "tells": np.array(self._tells),
-            "count": np.array(self._count),
-            "kept": np.array(self._kept),
-            "share": np.array(self._share),
-            "plans": np.array(self._chosen is not None),
-        }
+        arrays |= {name: np.array(getattr(self, f"_{name}")) for name in _NUMBERS}
+        arrays["plans"] = np.array(self._chosen is not None)
         if self._candidate is not None:
             known = self._candidate
             arrays |= {"theta": known.theta, "costs": np.stack([known.costs, known.before])}
@@ -428,16 +425,14 @@ class ModelBasedPredictive(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
-        stage = str(checked_array(state, "stage", "U", ()))
-        if stage not in (_TRAINING, _JUDGING, _ENDED):
+        numbers = numbers_of(state, _NUMBERS, finite=False)
+        if (stage := numbers["stage"]) not in (_TRAINING, _JUDGING, _ENDED):
             raise ValueError(f"its stage is {stage!r}")
-        self._kept = int(checked_array(state, "kept", "i", ()))
-        self._share = float(checked_array(state, "share", "f", (), finite=False))
+        for name, number in numbers.items():
+            setattr(self, f"_{name}", number)
         self._affine = self._trained()
         self._affine.restore(part_of(state, _OWN))
-        self._stage, self._candidate = stage, None
-        self._tells = int(checked_array(state, "tells", "i", ()))
-        self._count = int(checked_array(state, "count", "i", ()))
+        self._candidate = None
         if "theta" in state:
             theta = checked_array(state, "theta", "f", (None,)).copy()
             self._check(theta)
@@ -526,8 +521,7 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
 
     def _of_base(self) -> list[Record]:
         """The rollouts of the law to stay with."""
-        policy = self._affine.policy
-        return [own for own in self._affine.records if np.array_equal(own.policy, policy)]
+        return of_law(self._affine.records, self._affine.policy)
 
     def _evidence(
         self,

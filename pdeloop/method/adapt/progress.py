@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import State
+from pdeloop.method.adapt.base import State, numbers_of
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.estimate import ZERO, Estimate
 from pdeloop.method.adapt.settings import FIRST_RENEWAL, ModelBasedSettings
@@ -23,6 +23,17 @@ RENEWING, JUDGING, ENDED = "renewing", "judging", "ended"
 LARGEST = 1e150
 """Largest change on fields that were left out."""
 _STAGES = (RENEWING, JUDGING, ENDED)
+_NUMBERS = {
+    "stage": "U",
+    "tells": "i",
+    "replayed": "b",
+    "trust": "f",
+    "none_is_close": "b",
+    "safe": "b",
+    "noise": "f",
+    "rested": "i",
+}
+"""What is one number or text of a checkpoint, and its NumPy kind."""
 
 
 @dataclass(eq=False)
@@ -78,19 +89,8 @@ class Progress:
 
     def state(self) -> State:
         """All of it, as the arrays of a checkpoint."""
-        arrays: State = {
-            "stage": np.array(self.stage),
-            "tells": np.array(self.tells),
-            "policy": self.policy.copy(),
-            "held_out": held_out(self.fraction, self.change),
-            "replayed": np.array(self.replayed),
-            "trust": np.array(self.trust),
-            "none_is_close": np.array(self.none_is_close),
-            "safe": np.array(self.safe),
-            "noise": np.array(self.noise),
-        }
-        if self.rested:
-            arrays["rested"] = np.array(self.rested)
+        arrays: State = {name: np.array(getattr(self, name)) for name in _NUMBERS}
+        arrays |= {"policy": self.policy.copy(), "held_out": held_out(self.fraction, self.change)}
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
         if self.belief is not None:
@@ -100,37 +100,24 @@ class Progress:
     @classmethod
     def of(cls, state: Mapping[str, NDArray[np.generic]], shape: tuple[int, ...]) -> Progress:
         """The progress in a checkpoint, whose laws have this shape; ValueError if there is none."""
-        stage = str(checked_array(state, "stage", "U", ()))
-        if stage not in _STAGES:
+        numbers = numbers_of(state, _NUMBERS)
+        if (stage := numbers["stage"]) not in _STAGES:
             raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        if (noise := numbers["noise"]) < 0.0:
+            raise ValueError(f"its noise is {noise:g}; expected 0 or more")
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
         fraction, change = fraction_and_change(state)
         return cls(
             checked_array(state, "policy", "f", shape).copy(),
-            stage=stage,
-            tells=int(checked_array(state, "tells", "i", ())),
             belief=Belief.of(state),
             improved=laws[0] if laws else None,
             parts=laws[1:],
             fraction=fraction,
             change=change,
-            replayed=bool(checked_array(state, "replayed", "b", ())),
-            trust=float(checked_array(state, "trust", "f", ())),
-            none_is_close=bool(checked_array(state, "none_is_close", "b", ())),
-            safe=bool(checked_array(state, "safe", "b", ())),
-            noise=noise_of(state),
-            rested=int(checked_array(state, "rested", "i", ())) if "rested" in state else 0,
+            **numbers,
         )
-
-
-def noise_of(state: Mapping[str, NDArray[np.generic]]) -> float:
-    """The noise that was found, 0: none; ValueError for a standard deviation that is negative."""
-    noise = float(checked_array(state, "noise", "f", ()))
-    if noise < 0.0:
-        raise ValueError(f"its noise is {noise:g}; expected 0 or more")
-    return noise
 
 
 def held_out(fraction: float, change: Estimate) -> Array:

@@ -33,7 +33,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Context, Record
+from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
@@ -52,18 +52,14 @@ GROWS, SHRINKS, LARGEST_TRUST = 0.5, 4.0, 1e3
 
 def best_measured(records: Sequence[Record], first: Array) -> Array:
     """The law with the least mean cost among those of at least `FEWEST` rollouts; else the first."""
-    costs: dict[bytes, list[float]] = {}
-    laws: dict[bytes, Array] = {}
-    for record in records:
-        laws.setdefault(record.policy.tobytes(), record.policy)
-        costs.setdefault(record.policy.tobytes(), []).append(record.cost)
-    means = {name: float(np.mean(own)) for name, own in costs.items() if len(own) >= FEWEST}
-    if not means or not np.isfinite(min(means.values())):
+    laws = [own for own in by_law(records) if len(own) >= FEWEST]
+    means = [float(np.mean([record.cost for record in own])) for own in laws]
+    if not np.isfinite(min(means, default=np.inf)):
         return first
-    return laws[min(means, key=lambda name: means[name])]
+    return laws[means.index(min(means))][0].policy
 
 
-def best_on_same_fields(records: Sequence[Record], laws: Sequence[Array], first: Array) -> Array:
+def best_on_same_fields(records: Sequence[Record], first: Array) -> Array:
     """The law that costs least relative to the first one on the fields of both.
 
     A law that diverged where the first one did not is no candidate; where the first one diverged and
@@ -71,7 +67,7 @@ def best_on_same_fields(records: Sequence[Record], laws: Sequence[Array], first:
     """
     base = costs_by_field(records, first)
     best, least = first, 0.0
-    for law in laws:
+    for law in (rolled[0].policy for rolled in by_law(records)):
         own = costs_by_field(records, law)
         common = [seed for seed in own if seed in base]
         if len(common) < FEWEST or np.array_equal(law, first):
@@ -90,11 +86,8 @@ def best_on_same_fields(records: Sequence[Record], laws: Sequence[Array], first:
 
 def costs_by_field(records: Sequence[Record], law: Array) -> dict[int, float]:
     """The costs of the rollouts of a law, by the seeds of their initial fields."""
-    return {
-        record.field_seed: record.cost
-        for record in records
-        if record.field_seed >= 0 and np.array_equal(record.policy, law)
-    }
+    own = of_law(records, law)
+    return {record.field_seed: record.cost for record in own if record.field_seed >= 0}
 
 
 def step(

@@ -169,8 +169,11 @@ class StepOptimizer(Optimizer):
             "rollouts": (self._tells + 1) * self.step_rollouts,
             "diverged": sum(not result.usable for result in results),
         }
-        if usable := [result.cost for result in results if result.usable]:
-            row["cost"] = float(np.mean(usable))
+        usable = [result.cost for result in results if result.usable]
+        with np.errstate(over="ignore"):
+            cost = float(np.mean(usable)) if usable else np.inf
+        if np.isfinite(cost):
+            row["cost"] = cost
         found = self.update(results)
         if not isinstance(found, Mapping):
             kind = type(found).__name__

@@ -23,23 +23,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import (
-    Context,
-    Optimizer,
-    Rollout,
-    RolloutResult,
-    Row,
-    State,
-    checked_theta,
-    require_positive,
-    require_results,
-    taken_theta,
-)
-from pdeloop.method.seeds import DIRECTION_STREAM, field_seed
+from pdeloop.method.adapt.base import Rollout, RolloutResult, Row, require_positive
+from pdeloop.method.adapt.step_optimizer import StepOptimizer
+from pdeloop.method.seeds import DIRECTION_STREAM
 from pdeloop.method.settings import Settings
 
 
@@ -62,7 +51,7 @@ class TwoPointSettings(Settings):
         require_positive(learning_rate=self.learning_rate, smoothing_radius=self.smoothing_radius)
 
 
-class TwoPoint(Optimizer):
+class TwoPoint(StepOptimizer):
     """Policy optimisation from costs alone.
 
     Parameters
@@ -78,30 +67,14 @@ class TwoPoint(Optimizer):
 
     name = "two_point"
     Settings = TwoPointSettings
-    iteration_rollouts = 2
+    step_rollouts = iteration_rollouts = 2
+    kept = ("learning_rate",)
     # Its learning rates were chosen for the gains of this identification.
     preferences: ClassVar[Mapping[str, Any]] = {"identification": "dmdc"}
 
-    def __init__(
-        self,
-        policy0: ArrayLike,
-        *,
-        seed: int,
-        rollouts: int,
-        settings: TwoPointSettings,
-        context: Context | None = None,
-    ) -> None:
-        require_positive(rollouts=rollouts)
-        self._policy = checked_theta(policy0)
-        self._seed = seed
-        self._steps = rollouts // 2
-        self._learning_rate = settings.learning_rate
-        self._radius = settings.smoothing_radius
-        self._tells = 0
-
-    @classmethod
-    def first_step(cls, settings: TwoPointSettings) -> int:
-        return 2
+    def __init__(self, policy0: ArrayLike, *, settings: TwoPointSettings, **others: Any) -> None:
+        super().__init__(policy0, settings=settings, **others)
+        self.learning_rate = settings.learning_rate
 
     @classmethod
     def settings_of(cls, values: Mapping[str, Any], given: Mapping[str, Any]) -> TwoPointSettings:
@@ -111,82 +84,39 @@ class TwoPoint(Optimizer):
             learning_rate=values[rate], smoothing_radius=values["smoothing_radius"]
         )
 
-    @property
-    def policy(self) -> Array:
-        """The current policy."""
-        return self._policy.copy()
-
-    @property
-    def tells(self) -> int:
-        """Steps that are over, two rollouts each."""
-        return self._tells
-
-    @property
-    def done(self) -> bool:
-        """True once the budget is used."""
-        return self._tells >= self._steps
-
-    def ask(self) -> list[Rollout]:
+    def rollouts(self) -> list[Rollout]:
         """The rollouts pi + r Theta and pi - r Theta on one field."""
-        if self.done:
-            return []
-        field, moved = self._field_seed(), self._radius * self._direction()
-        return [Rollout(self._policy + moved, field), Rollout(self._policy - moved, field)]
+        moved = self.settings.smoothing_radius * self._direction()
+        return [Rollout(self._policy + own, self.field_seed) for own in (moved, -moved)]
 
-    def tell(self, results: Sequence[RolloutResult]) -> Row:
+    def update(self, results: Sequence[RolloutResult]) -> Row:
         """Step along the estimate, or halve the learning rate."""
-        require_results(results, 0 if self.done else 2)
         row: Row = {
-            "rollouts": 2 * (self._tells + 1),
-            "iteration": self._tells + 1,
-            "field_seed": self._field_seed(),
-            "learning_rate": self._learning_rate,
-            "diverged": sum(not result.usable for result in results),
+            "iteration": self.tells + 1,
+            "field_seed": self.field_seed,
+            "learning_rate": float(self.learning_rate),
         }
         for key, result in zip(("cost_plus", "cost_minus"), results, strict=True):
             if result.usable:
                 row[key] = float(result.cost)
         row["updated"] = False
-        if not row["diverged"]:
+        if all(result.usable for result in results):
             plus, minus = (float(result.cost) for result in results)
             # Finite costs can still be so large that the step overflows.
             with np.errstate(over="ignore", invalid="ignore"):
-                estimate = gradient(plus, minus, self._direction(), self._radius)
-                policy = self._policy - self._learning_rate * estimate
+                radius = self.settings.smoothing_radius
+                estimate = gradient(plus, minus, self._direction(), radius)
+                policy = self._policy - self.learning_rate * estimate
                 norm = float(np.sqrt(np.sum(estimate * estimate)))
-            if np.isfinite(plus + minus):
-                row["cost"] = (plus + minus) / 2
             if np.isfinite(policy).all() and np.isfinite(norm):
-                self._policy = policy
+                self.policy = policy
                 row |= {"gradient_norm": norm, "updated": True}
         if not row["updated"]:
-            self._learning_rate *= 0.5
-        self._tells += 1
+            self.learning_rate *= 0.5
         return row
 
-    def state(self) -> State:
-        """The policy, the steps and the learning rate."""
-        return {
-            "policy": self._policy.copy(),
-            "tells": np.array(self._tells),
-            "learning_rate": np.array(self._learning_rate),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Continue from a checkpoint of an optimiser with the same arguments."""
-        policy = taken_theta(state, self._policy)
-        tells, learning_rate = (
-            checked_array(state, "tells", "i", ()),
-            checked_array(state, "learning_rate", "f", ()),
-        )
-        self._policy, self._tells = policy, int(tells)
-        self._learning_rate = float(learning_rate)
-
-    def _field_seed(self) -> int:
-        return field_seed(self._seed, self._tells)
-
     def _direction(self) -> Array:
-        return direction(self._seed, self._tells, self._policy.shape)
+        return direction(self._seed, self.tells, self._policy.shape)
 
 
 def direction(seed: int, iteration: int, shape: tuple[int, ...]) -> Array:

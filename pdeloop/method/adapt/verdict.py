@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Record
+from pdeloop.method.adapt.base import Record, Row, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
 
@@ -82,6 +82,16 @@ class Verdict:
     change: float
     deviation: float
     reason: str
+
+    @property
+    def row(self) -> Row:
+        """What the history says of it."""
+        return {
+            "chosen": self.chosen,
+            "reason": self.reason,
+            "predicted_change": self.change,
+            "deviation": self.deviation,
+        }
 
 
 def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
@@ -186,7 +196,7 @@ def evidence_of(
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}
     for name, law in laws.items():
-        own = [r for r in records if np.array_equal(r.policy, law)]
+        own = of_law(records, law)
         excess = _excess(loop, law, own)
         lost = name == base and own and not any(record.usable for record in own)
         if lost or (any(record.usable for record in own) and not np.isfinite(excess).any()):
@@ -215,10 +225,10 @@ def evidence_of_rollouts(
     costs: dict[str, dict[int, float]] = {}
     for name, law in laws.items():
         if name == base or not np.array_equal(law, laws[base]):
-            own = [r for r in records if np.array_equal(r.policy, law)]
             # A rollout whose field is not known is on one of its own.
             costs[name] = {
-                r.field_seed if r.field_seed >= 0 else -1 - i: r.cost for i, r in enumerate(own)
+                r.field_seed if r.field_seed >= 0 else -1 - i: r.cost
+                for i, r in enumerate(of_law(records, law))
             }
     evidence = {}
     for name, mine in costs.items():
@@ -264,11 +274,9 @@ def cheaper_law(
     -------
     law, its change against the chosen one, or None
     """
-    laws = {record.policy.tobytes(): record.policy for record in records}
-    laws.pop(chosen.tobytes(), None)
     found: tuple[Array, Estimate] | None = None
-    for law in laws.values():
-        if sum(np.array_equal(record.policy, law) for record in records) < 2:
+    for law in (own[0].policy for own in by_law(records) if len(own) > 1):
+        if np.array_equal(law, chosen):
             continue
         estimates = [measured_change(records, law, chosen)]
         if loop is not None:
@@ -286,8 +294,7 @@ def cheaper_law(
 def measured_change(records: Sequence[Record], law: Array, base: Array) -> Estimate | None:
     """The change of a law against another by their rollouts; None where either lacks finite ones."""
     evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records)
-    measured = any(np.array_equal(record.policy, base) for record in records)
-    return _change(evidence, "law", FIRST) if measured else None
+    return _change(evidence, "law", FIRST) if of_law(records, base) else None
 
 
 def _change(evidence: Mapping[str, Evidence], name: str, base: str) -> Estimate | None:
