@@ -24,7 +24,6 @@ Under its own law it is the rollout again.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -94,27 +93,19 @@ class ClosedLoopProblem:
 
     def policy(self, theta: Array, near: Array) -> Array:
         """[K_a K_b] of theta; among the K_b with the wanted b the one next to that of `near`."""
-        n_s = self.U.shape[1]
-        return self._changed(near, theta[:, :n_s], theta[:, n_s] - near[:, n_s:] @ self.s_r)
-
-    def _changed(self, policy: Array, K_a: Array, change: Array) -> Array:
-        """The policy with other gains K_a, and with b changed by (n_a,)."""
-        n_s, changed = self.U.shape[1], policy.copy()
-        changed[:, :n_s] = K_a
+        n_s, found = self.U.shape[1], near.copy()
+        found[:, :n_s] = theta[:, :n_s]
         if self.constant_feature:
-            changed[:, n_s:] += np.outer(change, self.s_r / float(np.sum(self.s_r * self.s_r)))
-        return changed
-
-    def mean_cost(self, states: Array, actions: Array) -> float:
-        """Mean stage cost of states (..., n_z) and the actions (..., n_a) that answer them."""
-        error = states - self.target
-        cost = self.state_weight * np.sum(error * error)
-        cost += self.action_weight * np.sum(actions * actions)
-        return float(cost) / max(math.prod(actions.shape[:-1]), 1)
+            change = theta[:, n_s] - near[:, n_s:] @ self.s_r
+            found[:, n_s:] += np.outer(change, self.s_r / float(np.sum(self.s_r * self.s_r)))
+        return found
 
     def cost_of(self, record: Record) -> float:
         """Mean stage cost of the recorded part of a rollout."""
-        return self.mean_cost(record.acted_from, record.actions)
+        error, actions = record.acted_from - self.target, record.actions
+        cost = self.state_weight * np.sum(error * error)
+        cost += self.action_weight * np.sum(actions * actions)
+        return float(cost) / max(len(actions), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +241,7 @@ class ClosedLoop(ClosedLoopProblem):
         return sweep_of(self.model, self.action_set, self.horizon, self.memory_input)
 
     @cached_property
-    def _stage(self) -> Cost:
+    def stage(self) -> Cost:
         """The cost, of the outputs unless it is another one."""
         if self.cost is not None:
             return self.cost
@@ -286,7 +277,7 @@ class ClosedLoop(ClosedLoopProblem):
     ) -> tuple[Array, Array, Array, Array]:
         """J of rows (M,), and its derivatives by [z; p] and a of each step, and by the last [z; p]."""
         n_z, T = self.model.n_z, self.horizon
-        z, cost = states[:, :-1, :n_z], self._stage
+        z, cost = states[:, :-1, :n_z], self.stage
         on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
         if self.cost is None:
             innovations = self._innovations(fields)
@@ -330,7 +321,7 @@ class ClosedLoop(ClosedLoopProblem):
 
         None for a law with memory, and where the model has none.
         """
-        cost, model = self._stage, self.model
+        cost, model = self.stage, self.model
         if len(self.memory_input) or model.n_z != len(self.U) or model.n_z > LARGEST:
             return None
         a, target = cost.action_target, self.target

@@ -63,6 +63,7 @@ from pdeloop.method.adapt.verdict import (
     Evidence,
     choose,
     evidence_of_pairs,
+    excess_of,
 )
 from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
@@ -297,15 +298,7 @@ class ModelBasedPredictive(Optimizer):
     def _plain(self, belief: Belief, policy: Array, fields: Array) -> Planner:
         """Plans of one step around a law."""
         context, settings, model = self._context, self._law.settings, belief.model
-        loop = belief.loop(context)
-        cost = context.cost or Cost(
-            model.n_z,
-            model.n_a,
-            context.horizon,
-            state_weight=loop.state_weight,
-            action_weight=loop.action_weight,
-            target=loop.target,
-        )
+        cost = belief.loop(context).stage
         return Planner(
             model,
             cost,
@@ -359,16 +352,12 @@ class ModelBasedPredictive(Optimizer):
 
     def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
-        candidate, belief = self._candidate, self._affine.belief
-        assert candidate is not None and belief is not None
+        assert self._candidate is not None
         base = self._base_name
-        verdict = choose(
-            self._evidence(candidate, belief, base, asked, results, row),
-            base,
-            self._settings.confidence,
-        )
+        evidence = self._evidence(self._candidate, base, asked, results, row)
+        verdict = choose(evidence, base, self._settings.confidence)
         if verdict.chosen == self.candidate:
-            self._chosen = candidate.theta
+            self._chosen = self._candidate.theta
         row |= verdict.row
 
     @property
@@ -380,14 +369,15 @@ class ModelBasedPredictive(Optimizer):
     def _evidence(
         self,
         candidate: Candidate,
-        belief: Belief,
         base: str,
         asked: Sequence[Rollout],
         results: Sequence[RolloutResult],
         row: Row,
     ) -> Mapping[str, Evidence]:
         """Of the law that plans and the one to stay with, from their rollouts."""
-        loop, policy = belief.loop(self._context), self._affine.policy
+        belief, policy = self._affine.belief, self._affine.policy
+        assert belief is not None
+        loop = belief.loop(self._context)
         theta = loop.theta(policy)
         excess, costs, before = list[float](), [candidate.costs], [candidate.before]
         usable = [r for r in results if r.usable and r.trajectory is not None]
@@ -399,14 +389,10 @@ class ModelBasedPredictive(Optimizer):
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
         excess += [np.inf] * (len(results) - len(usable))
-        rolled = of_law(self._affine.records, policy)
-        of_base = [
-            record.cost - float(loop.costs(theta, loop.beginnings([record]))[0])
-            for record in rolled
-        ]
+        of_base = excess_of(loop, policy, of_law(self._affine.records, policy))
         change = mean_change(np.concatenate(costs), np.concatenate(before))
         return {
-            base: Evidence(ZERO, np.array([e for e in of_base if not np.isnan(e)])),
+            base: Evidence(ZERO, of_base),
             self.candidate: Evidence(change, np.array(excess), (change,)),
         }
 
@@ -526,7 +512,6 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
     def _evidence(
         self,
         candidate: Candidate,
-        belief: Belief,
         base: str,
         asked: Sequence[Rollout],
         results: Sequence[RolloutResult],

@@ -197,7 +197,7 @@ def evidence_of(
     evidence = {}
     for name, law in laws.items():
         own = of_law(records, law)
-        excess = _excess(loop, law, own)
+        excess = excess_of(loop, law, own)
         lost = name == base and own and not any(record.usable for record in own)
         if lost or (any(record.usable for record in own) and not np.isfinite(excess).any()):
             return None
@@ -344,7 +344,7 @@ def evidence_against_none(
     return evidence
 
 
-def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
+def excess_of(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
     """Measured less model cost of the rollouts of a law; infinite where one diverged."""
     excess = []
     for record in own:

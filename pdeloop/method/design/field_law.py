@@ -338,20 +338,19 @@ def field_law(
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
         return report
     horizon = max(len(actions) for _, actions in trajectories)
-    if cost is None and point is not target:
-        cost = Cost(
-            len(target),
-            model.n_a,
-            horizon,
-            state_weight=state_weight,
-            action_weight=action_weight,
-            target=target,
-        )
+    stage = cost or Cost(
+        len(target),
+        model.n_a,
+        horizon,
+        state_weight=state_weight,
+        action_weight=action_weight,
+        target=target,
+    )
     try:
-        if cost is None:
+        if cost is None and point is target:
             K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
         else:
-            K, b = finite_horizon_of(A, B, drift, cost, point)
+            K, b = finite_horizon_of(A, B, drift, stage, point)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
         return report
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
@@ -375,11 +374,7 @@ def field_law(
             if len(states) < horizon:
                 return np.inf
             actions = action_set.applied(law(0, states[:horizon]))
-            if cost is not None:
-                total += sum_of(cost, states, actions)
-                continue
-            total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
-            total += action_weight * float(np.sum(actions**2))
+            total += sum_of(stage, states, actions)
         return total / (horizon * len(fields))
 
     worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
