@@ -376,26 +376,6 @@ def checked_theta(theta: ArrayLike) -> Array:
     return array
 
 
-def taken_theta(state: Mapping[str, NDArray[np.generic]], like: Array) -> Array:
-    """The array `policy` of a `state`, of the shape of `like`: older ones have gains as matrices."""
-    known = state.get("policy")
-    if known is not None and known.size == like.size:
-        state = {"policy": known.reshape(like.shape)}
-    return checked_array(state, "policy", "f", like.shape).copy()
-
-
-def checked_policy(policy: ArrayLike) -> Array:
-    """A finite copy of gains of shape (n_a, 2 n_s), or a ValueError."""
-    array = np.array(policy, dtype=np.float64, order="C")
-    if array.ndim != 2 or 0 in array.shape or array.shape[1] % 2:
-        raise ValueError(
-            f"a policy [K_a K_b] must have shape (n_a, 2 n_s), but its shape is {array.shape}."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError("a policy must be finite, but there is NaN or infinity in it.")
-    return array
-
-
 def require_positive(**values: float) -> None:
     """A ValueError that names the first value that is not positive and finite."""
     for name, value in values.items():

@@ -209,7 +209,13 @@ def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Ar
 
 
 def index_of_cheapest(costs: Array, weights: Array) -> int:
-    """The row of costs (laws, F) that `cheapest` chooses, the first of several alike."""
+    """The row of costs (laws, F) that `cheapest` chooses, the first of several alike.
+
+    >>> index_of_cheapest(np.array([[np.inf, np.inf], [np.inf, 9.0]]), np.ones(2))
+    1
+    >>> index_of_cheapest(np.array([[2.0, np.inf, 0.5], [np.inf, 9.0, 1.0]]), np.ones(3))
+    0
+    """
     lost = ~np.isfinite(costs) @ weights
     common = np.isfinite(costs[lost <= lost.min()]).all(axis=0)
     total = np.where(common, costs, 0.0) @ weights

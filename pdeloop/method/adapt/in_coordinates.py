@@ -29,6 +29,7 @@ from pdeloop.method.adapt.base import (
     Row,
     State,
     Trajectory,
+    part_of,
 )
 from pdeloop.method.adapt.trajectories import LowRankTrajectory
 from pdeloop.method.laws.base import Law
@@ -121,8 +122,7 @@ class InCoordinates(Optimizer):
         if len(rows) > CAPACITY:
             raise ValueError(f"'{_ROWS}' has {len(rows)} rows; expected at most {CAPACITY}")
         self.basis.rows = rows
-        names = [name for name in state if name.startswith(_OWN)]
-        self._own.restore({name.removeprefix(_OWN): state[name] for name in names})
+        self._own.restore(part_of(state, _OWN))
 
     def _seen(self, trajectory: Trajectory) -> Trajectory:
         """In coordinates, with the basis extended by new directions."""

@@ -33,7 +33,6 @@ from pdeloop.method.adapt.base import (
     Row,
     State,
     by_law,
-    checked_policy,
     checked_theta,
     of_law,
     require_positive,
@@ -97,6 +96,8 @@ _REPEATS = 1e-9
 """Relative difference of the costs of one law up to which its rollouts are the same one."""
 _TRIES = 8
 """Laws about the target after which no further one is tried if none of them costs less."""
+WELL_KNOWN = "more than {} fields would not change the law"
+"""Why rollouts are left."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
@@ -154,8 +155,7 @@ class ModelBased(Optimizer):
         self._settings = settings or ModelBasedSettings()
         self._context, self._seed, self._budget = context, seed, rollouts
         self._declared = context.noise
-        vector = isinstance(context.law, FeedForward | Observer)
-        self._first = checked_theta(policy0) if vector else checked_policy(policy0)
+        self._first = checked_theta(policy0)
         self._none = np.zeros_like(self._first)
         explored = [
             Record(self._none, np.inf, known.states, known.actions)
@@ -525,7 +525,7 @@ class ModelBased(Optimizer):
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
         base = self._decide(row, laws)
         self._look_back(row, self._compared(laws, base), base)
-        early = "" if self._progress.replayed else _known_well(len(self._fields()))
+        early = "" if self._progress.replayed else WELL_KNOWN.format(len(self._fields()))
         if self._repeats:
             early = "every episode begins alike, and the last two laws gained nothing"
         self._end(row, str(row["reason"]), early)
@@ -608,8 +608,3 @@ def _is_worse_than_predicted(row: Row) -> bool:
     """True if rollouts diverged, or cost far more than the model said."""
     cost = float(row.get("cost", np.inf))
     return not cost - float(row.get("predicted", cost)) <= _FAR_OFF * abs(cost)
-
-
-def _known_well(fields: int) -> str:
-    """Why rollouts are left."""
-    return f"more than {fields} fields would not change the law"

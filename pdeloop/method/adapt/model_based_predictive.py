@@ -129,7 +129,9 @@ class ModelBasedPredictive(Optimizer):
         self._settings = settings or ModelBasedSettings()
         self._shape = self._law.without.shape
         self._first = np.reshape(np.asarray(policy0, dtype=np.float64), self._shape)
-        measured = [self._matrix(record) for record in context.measured]
+        measured = [
+            replace(own, policy=np.reshape(own.policy, self._shape)) for own in context.measured
+        ]
         own = self._law.without
         law = None if isinstance(own, Affine) else own
         self._context = replace(context, measured=measured, law=law)
@@ -395,9 +397,6 @@ class ModelBasedPredictive(Optimizer):
             base: Evidence(ZERO, of_base),
             self.candidate: Evidence(change, np.array(excess), (change,)),
         }
-
-    def _matrix(self, record: Record) -> Record:
-        return replace(record, policy=np.reshape(record.policy, self._shape))
 
     def state(self) -> State:
         """That of `ModelBased`, the stage, and the law that plans."""

@@ -22,7 +22,6 @@ from pdeloop.method.adapt.base import (
     checked_theta,
     require_positive,
     require_results,
-    taken_theta,
 )
 from pdeloop.method.seeds import field_seed
 
@@ -205,7 +204,7 @@ class StepOptimizer(Optimizer):
         ValueError
             An array is missing, or has another shape or type.
         """
-        policy = taken_theta(state, self._policy)
+        policy = checked_array(state, "policy", "f", self._policy.shape).copy()
         tells = int(checked_array(state, "tells", "i", ()))
         own = {
             name: checked_array(state, name, "f", np.shape(getattr(self, name)))

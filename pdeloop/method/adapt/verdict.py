@@ -37,6 +37,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Row, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
+from pdeloop.method.adapt.improve import index_of_cheapest
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
 PREDICTIVE, NEURAL = "predictive", "neural"
@@ -147,32 +148,16 @@ def size_of(law: str, change: Estimate, other: str) -> str:
     return f"{law} costs {size} {more} than {other}"
 
 
-def is_cheaper(own: Array, other: Array) -> bool:
-    """True if a law diverges from fewer fields than another one, or from as many and costs less.
-
-    own, other: costs from the same fields, infinite where the law diverges; those from which neither
-    does are compared.
-
-    >>> is_cheaper(np.array([np.inf, 9.0]), np.array([np.inf, np.inf]))
-    True
-    >>> is_cheaper(np.array([np.inf, 9.0, 1.0]), np.array([2.0, np.inf, 0.5]))
-    False
-    """
-    came, back = np.isfinite(own), np.isfinite(other)
-    if came.sum() != back.sum():
-        return bool(came.sum() > back.sum())
-    both = came & back
-    return bool(own[both].sum() < other[both].sum())
-
-
 def beats_no_control(loop: ClosedLoop, first: Array, fields: Array) -> bool:
     """True if a law is cheaper than no control on the model; where that says nothing, if it is another.
 
     A first law that is not is nothing to stay near to.
     """
     none = loop.no_control
-    costs = [loop.costs(theta, fields) for theta in (first, none)]
-    return is_cheaper(*costs) if np.isfinite(costs).any() else not np.array_equal(first, none)
+    costs = np.array([loop.costs(theta, fields) for theta in (none, first)])
+    if not np.isfinite(costs).any():
+        return not np.array_equal(first, none)
+    return index_of_cheapest(costs, np.ones(costs.shape[1])) == 1
 
 
 def evidence_of(

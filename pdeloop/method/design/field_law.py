@@ -371,10 +371,11 @@ def field_law(
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0
         for states in states_under(judge, saturated(law, action_set), fields, horizon):
-            if len(states) < horizon:
+            if len(states) <= horizon:
                 return np.inf
             actions = action_set.applied(law(0, states[:horizon]))
-            total += sum_of(stage, states, actions)
+            total += float(stage.along(states[None, :horizon], actions[None], 0)[0][0])
+            total += float(stage.at_end(states[-1:])[0][0])
         return total / (horizon * len(fields))
 
     worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
@@ -437,16 +438,6 @@ def linearisation_point(
         return target, f"{where} is linearised there, where nothing was measured"
     nearest = int(np.argmin(np.linalg.norm((states - target) / units, axis=1)))
     return states[nearest], f"{where} is linearised at the measured state nearest to it"
-
-
-def sum_of(cost: Cost, states: Array, actions: Array) -> float:
-    """The stage costs of an episode, z_0 .. z_T and a_0 .. a_{T-1}, and the cost of its last state."""
-    total = np.zeros(1)
-    for k, a in enumerate(actions):
-        cost.add(total, states[k][None], a[None], k)
-    if len(states) > len(actions):
-        cost.add_terminal(total, states[-1][None])
-    return float(total[0])
 
 
 def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: int) -> list[Array]:
