@@ -218,6 +218,13 @@ class Context:
         """W of the state's part |W (z - z_r)|^2 of the cost; None: a multiple of the identity."""
         return None if self.cost is None else self.cost.state_weights
 
+    def cost_of(self, record: Record) -> float:
+        """Mean stage cost, of q, r and z_r, of the recorded part of a rollout."""
+        error, actions = record.acted_from - self.target, record.actions
+        cost = self.state_weight * np.sum(error * error)
+        cost += self.action_weight * np.sum(actions * actions)
+        return float(cost) / max(len(actions), 1)
+
     def actuators(self, n_a: int) -> Actuators:
         """What is declared of the n_a actuators."""
         centres = np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)

@@ -50,8 +50,10 @@ LARGEST = 512
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoopProblem:
-    """Laws a = K_a U^T z + b, and their cost.
+class ClosedLoop:
+    """A model of the plant under laws a = K_a U^T z + b, and their cost on it.
+
+    A class derived from it says how a law remembers, or what of a model's state is seen.
 
     Attributes
     ----------
@@ -65,6 +67,14 @@ class ClosedLoopProblem:
         T, the steps of an episode.
     action_set : ActionSet
         Admissible actions, the nearest of which is applied.
+    model : FieldModel
+    noise : float
+        Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
+        is the same in every simulation of as many fields.
+    cost : Cost or None
+        Another quadratic cost in place of that of q, r and z_r.
+    reach : float
+        Magnitude of a state beyond which a simulation counts as not finite.
     """
 
     U: Array
@@ -73,6 +83,10 @@ class ClosedLoopProblem:
     action_weight: float
     horizon: int
     action_set: ActionSet = ANY_ACTION
+    model: FieldModel = field(kw_only=True)
+    noise: float = field(default=0.0, kw_only=True)
+    cost: Cost | None = field(default=None, kw_only=True)
+    reach: float = field(default=np.inf, kw_only=True)
 
     @cached_property
     def s_r(self) -> Array:
@@ -99,37 +113,6 @@ class ClosedLoopProblem:
             change = theta[:, n_s] - near[:, n_s:] @ self.s_r
             found[:, n_s:] += np.outer(change, self.s_r / float(np.sum(self.s_r * self.s_r)))
         return found
-
-    def cost_of(self, record: Record) -> float:
-        """Mean stage cost of the recorded part of a rollout."""
-        error, actions = record.acted_from - self.target, record.actions
-        cost = self.state_weight * np.sum(error * error)
-        cost += self.action_weight * np.sum(actions * actions)
-        return float(cost) / max(len(actions), 1)
-
-
-@dataclass(frozen=True, eq=False)
-class ClosedLoop(ClosedLoopProblem):
-    """A model of the plant under such laws, and their cost on it.
-
-    A class derived from it says how a law remembers, or what of a model's state is seen.
-
-    Attributes
-    ----------
-    model : FieldModel
-    noise : float
-        Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
-        is the same in every simulation of as many fields.
-    cost : Cost or None
-        Another quadratic cost in place of that of q, r and z_r.
-    reach : float
-        Magnitude of a state beyond which a simulation counts as not finite.
-    """
-
-    model: FieldModel = field(kw_only=True)
-    noise: float = field(default=0.0, kw_only=True)
-    cost: Cost | None = field(default=None, kw_only=True)
-    reach: float = field(default=np.inf, kw_only=True)
 
     @property
     def constants(self) -> int:

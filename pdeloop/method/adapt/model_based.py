@@ -60,7 +60,7 @@ from pdeloop.method.adapt.replay import (
 )
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, ModelBasedSettings
-from pdeloop.method.adapt.trajectories import Records, cleaned
+from pdeloop.method.adapt.trajectories import Records
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
@@ -81,6 +81,7 @@ from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
+from pdeloop.method.models.noise_level import cleaned_states
 from pdeloop.method.seeds import field_seed
 from pdeloop.process.one_thread import one_thread
 
@@ -394,7 +395,10 @@ class ModelBased(Optimizer):
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""
         noise, measured = self._context.noise, self._measurements()
-        return cleaned(measured, noise, line=self._context.line) if noise else measured
+        if not noise:
+            return measured
+        clean = cleaned_states([r.states for r in measured], noise, line=self._context.line)
+        return [replace(own, states=states) for own, states in zip(measured, clean, strict=True)]
 
     def _measurements(self) -> list[Record]:
         """All rollouts as they were measured."""

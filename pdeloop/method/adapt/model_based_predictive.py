@@ -398,6 +398,9 @@ class ModelBasedPredictive(Optimizer):
             self.candidate: Evidence(change, np.array(excess), (change,)),
         }
 
+    def _matrix(self, record: Record) -> Record:
+        return replace(record, policy=np.reshape(record.policy, self._shape))
+
     def state(self) -> State:
         """That of `ModelBased`, the stage, and the law that plans."""
         arrays: State = {_OWN + name: value for name, value in self._affine.state().items()}

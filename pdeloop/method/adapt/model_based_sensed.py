@@ -79,7 +79,7 @@ class ModelBasedReadings(ModelBased):
         super()._renew(row)
         if self._progress.stage != RENEWING or not self._none_tells():
             return
-        fitted = to_be_fitted(self._context, self._measurements())[1]
+        fitted = to_be_fitted(self._context, self._measurements())
         if not any(own.policy.any() for own in fitted):
             self._progress.policy = self._none.copy()
             for name in OF_A_LAW:

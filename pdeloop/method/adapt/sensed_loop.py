@@ -15,7 +15,7 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
-from pdeloop.method.adapt.closed_loop import ClosedLoopProblem, ObservedLoop, Simulation
+from pdeloop.method.adapt.closed_loop import ObservedLoop, Simulation
 from pdeloop.method.adapt.estimated_loop import simulate_estimated
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.observer import Observer
@@ -95,30 +95,6 @@ def distance(record: Record, state_weight: float, action_weight: float, horizon:
     return found if found > 0.0 else np.nan
 
 
-def whole_rollouts(
-    problem: ClosedLoopProblem, records: Sequence[Record], largest_cost: float, newest: int
-) -> list[Record]:
-    """The newest whole rollouts, each once, and none whose readings went far away."""
-    whole = {
-        record.states.tobytes(): record
-        for record in records
-        if len(record.actions) == problem.horizon and problem.cost_of(record) <= largest_cost
-    }
-    return list(whole.values())[-newest:]
-
-
-def of_rollouts(
-    problem: ClosedLoopProblem, rollouts: Sequence[Record]
-) -> tuple[list[Array], list[Array], Array]:
-    """Readings, actions and `distance` of each rollout."""
-    weights = problem.state_weight, problem.action_weight, problem.horizon
-    return (
-        [record.acted_from for record in rollouts],
-        [record.actions for record in rollouts],
-        np.array([distance(record, *weights) for record in rollouts]),
-    )
-
-
 def can_be_sensed(context: Context) -> bool:
     """True if the states are one reading of each of a few sensors of one component on a ring.
 
@@ -128,15 +104,18 @@ def can_be_sensed(context: Context) -> bool:
     return alone and context.periodic and context.cost is None
 
 
-def to_be_fitted(
-    context: Context, records: Sequence[Record]
-) -> tuple[ClosedLoopProblem, list[Record]]:
-    """The problem between the sensors, and the rollouts in a fit; the first one is an exploration."""
-    problem = ClosedLoopProblem(
-        context.U, context.target, context.state_weight, context.action_weight, context.horizon
-    )
-    largest_cost = _LARGEST_COST * problem.cost_of(records[0])
-    return problem, whole_rollouts(problem, records, largest_cost, SENSED_NEWEST)
+def to_be_fitted(context: Context, records: Sequence[Record]) -> list[Record]:
+    """The newest whole rollouts, each once, and none whose readings went far away.
+
+    The first of the records is an exploration.
+    """
+    largest_cost = _LARGEST_COST * context.cost_of(records[0])
+    whole = {
+        record.states.tobytes(): record
+        for record in records
+        if len(record.actions) == context.horizon and context.cost_of(record) <= largest_cost
+    }
+    return list(whole.values())[-SENSED_NEWEST:]
 
 
 def sensed_from(
@@ -146,19 +125,19 @@ def sensed_from(
 
     before: the model of earlier rollouts, whose equation and spread the fit starts from.
     """
-    problem, chosen = to_be_fitted(context, records)
+    chosen = to_be_fitted(context, records)
     if not chosen:
         return None
+    weights = context.state_weight, context.action_weight, context.horizon
     actuators = context.actuators(records[0].actions.shape[1])
-    readings, actions, distances = of_rollouts(problem, chosen)
     found = fit_sensed(
-        readings,
-        actions,
+        [record.acted_from for record in chosen],
+        [record.actions for record in chosen],
         actuators,
         context.noise,
         start=None if before is None else (before.shared, before.spread),
         target=context.target,
-        distances=distances,
+        distances=np.array([distance(record, *weights) for record in chosen]),
         settings=context.field_models,
     )
     if found.error > SENSED_REPRODUCED:

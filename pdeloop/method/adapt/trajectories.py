@@ -1,15 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from pdeloop.messages.array_files import Arrays, checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory
-from pdeloop.method.models.noise_level import cleaned_states
 from pdeloop.method.reduce.snapshots import LARGE, factored
 from pdeloop.process.one_thread import one_thread
 
@@ -177,13 +174,3 @@ class Records:
         finite = np.isfinite(actions).all(axis=1)
         length = min(length, int(np.argmin(finite)) if not finite.all() else length)
         return states[:length], actions[: max(length - 1, 0)]
-
-
-def cleaned(records: Sequence[Record], noise: float, *, line: bool = True) -> list[Record]:
-    """Denoised rollouts.
-
-    line: whether the states are fields on one axis, of which initial ones are known best by their
-    spectra.
-    """
-    clean = cleaned_states([record.states for record in records], noise, line=line)
-    return [replace(own, states=states) for own, states in zip(records, clean, strict=True)]
