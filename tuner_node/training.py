@@ -30,7 +30,7 @@ from pdeloop.messages import model_rows
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import digest
 from pdeloop.messages.topics import CostColumn, StartColumn
-from pdeloop.method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
+from pdeloop.method.adapt import Context, Optimizer, Record, Rollout, Trajectory, registry
 from pdeloop.method.laws import Law
 from pdeloop.method.laws.registry import laws_of
 from tuner_node import event_rows, rollouts, void_exploration
@@ -406,7 +406,7 @@ class Training:
     def _asked(self) -> list[list[Rollout]]:
         """The rollouts that each optimiser asks for; its policies may be vectors."""
         return [
-            [] if optimizer.done else calls.ask(optimizer, law.size, extends=law.extends)
+            [] if optimizer.done else registry.ask(optimizer, law.size, extends=law.extends)
             for optimizer, law in zip(self.optimizers, self.laws(), strict=True)
         ]
 
@@ -424,7 +424,7 @@ class Training:
                 shaped = self._shaped(asked[0].policy)
                 self.first[m] = Rollout(shaped, asked[0].field_seed)
                 self.repeated[m] = [own[0].cost]
-            report = calls.tell(optimizer, own)
+            report = registry.tell(optimizer, own)
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
             whose = {"event": "adapted", "seed": self.settings.all_seeds[m]}

@@ -14,7 +14,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.frames import MAX_ID
 from pdeloop.messages.text import shown
-from pdeloop.method.adapt import Rollout, calls
+from pdeloop.method.adapt import Rollout, registry
 from pdeloop.method.adapt.trajectories import (
     is_kept,
     record_arrays,
@@ -63,7 +63,7 @@ def arrays_of(training: Training) -> Arrays:
         if (array := getattr(training, name)) is not None:
             arrays[name] = array
     for m, optimizer in enumerate(training.optimizers):
-        arrays |= {f"optimizer{m}.{key}": value for key, value in calls.state(optimizer).items()}
+        arrays |= {f"optimizer{m}.{key}": value for key, value in registry.state(optimizer).items()}
     return arrays
 
 
@@ -125,7 +125,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
     for m, optimizer in enumerate(training.optimizers):
         prefix = f"optimizer{m}."
         own = {key: value for key, value in arrays.items() if key.startswith(prefix)}
-        calls.restore(optimizer, {key.removeprefix(prefix): value for key, value in own.items()})
+        registry.restore(optimizer, {key.removeprefix(prefix): value for key, value in own.items()})
 
 
 def _check(training: Training) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.own_code import OwnCodeError
-from pdeloop.method.adapt import Rollout, RolloutResult, StepOptimizer, calls
+from pdeloop.method.adapt import Rollout, RolloutResult, StepOptimizer, registry
 from pdeloop.method.adapt.two_point import TwoPoint, TwoPointSettings
 
 POLICY = np.zeros((2, 3))
@@ -40,11 +40,11 @@ def asks(policy: Any) -> Own:
 
 
 def test_rollouts_and_reports_go_through_as_they_are() -> None:
-    (asked,) = calls.ask(Own(), SIZE)
+    (asked,) = registry.ask(Own(), SIZE)
     assert asked.policy is POLICY and asked.field_seed == 1
-    (flat,) = calls.ask(asks(POLICY.ravel()), SIZE)
+    (flat,) = registry.ask(asks(POLICY.ravel()), SIZE)
     assert flat.policy.shape == (SIZE,)
-    assert calls.tell(Own(update=lambda: {"own": 2.0}), [RolloutResult(1.0)])["own"] == 2.0
+    assert registry.tell(Own(update=lambda: {"own": 2.0}), [RolloutResult(1.0)])["own"] == 2.0
 
 
 def test_the_row_of_a_step_has_the_mean_cost_of_what_did_not_diverge_unless_told() -> None:
@@ -75,7 +75,7 @@ def test_the_row_of_a_step_has_the_mean_cost_of_what_did_not_diverge_unless_told
 )
 def test_what_it_asks_for_is_checked(optimizer: Own, words: str) -> None:
     with pytest.raises(OwnCodeError, match=words):
-        calls.ask(optimizer, SIZE)
+        registry.ask(optimizer, SIZE)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_what_it_asks_for_is_checked(optimizer: Own, words: str) -> None:
 )
 def test_what_it_reports_is_checked(update: Any, words: str) -> None:
     with pytest.raises(OwnCodeError, match=words):
-        calls.tell(Own(update=update), [RolloutResult(1.0)])
+        registry.tell(Own(update=update), [RolloutResult(1.0)])
 
 
 def test_a_report_may_hold_what_numpy_computes_and_is_kept_as_json() -> None:
@@ -110,7 +110,7 @@ def test_a_report_may_hold_what_numpy_computes_and_is_kept_as_json() -> None:
             "lost": np.inf,
         }
 
-    row = calls.tell(Own(update=report), [RolloutResult(1.0)])
+    row = registry.tell(Own(update=report), [RolloutResult(1.0)])
     assert json.loads(json.dumps(row)) == row
     expected = {"updated": True, "index": 1, "best": [2.0, 1.0], "cost": 1.0}
     assert row == {"rollouts": 1, "diverged": 0} | expected
@@ -123,11 +123,11 @@ def test_a_step_that_asks_for_other_than_its_rollouts_is_told_so(count: int) -> 
 
     asking = Two(rollouts=lambda: [Rollout(POLICY, 1)] * count)
     with pytest.raises(OwnCodeError, match=f"Two.rollouts returned {count}; .* which is 2"):
-        calls.ask(asking, SIZE)
+        registry.ask(asking, SIZE)
 
 
 def test_a_shipped_optimizer_says_itself_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="result"):
-        calls.tell(
+        registry.tell(
             TwoPoint(POLICY, seed=0, rollouts=4, settings=TwoPointSettings(learning_rate=0.1)), []
         )

@@ -2,14 +2,23 @@
 """Optimisers by name: an entry point, ours or another package's, or code of the user's.
 
 Which code may be run: `pdeloop.messages.own_code`.
+
+Of calls of an optimiser's methods return values are checked, and exceptions become one sentence; those
+that an optimiser of this package raises are passed on unchanged.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, distribution, entry_points
+from typing import Any
 
-from pdeloop.messages.own_code import OwnCode
-from pdeloop.method.adapt.base import Optimizer
+import numpy as np
+
+from pdeloop.messages.arrays import float_array
+from pdeloop.messages.own_code import OwnCode, OwnCodeError, called
+from pdeloop.method.adapt.base import Optimizer, Rollout, RolloutResult, Row, State
 
 GROUP = "pdeloop.optimizers"
 """The group of entry points by which an installed package offers optimisers."""
@@ -59,14 +68,104 @@ _DECLARED = ("name", "needs_trajectories", "iteration_rollouts", "preferences")
 
 def complete(name: str, found: object) -> type[Optimizer]:
     """Return the class that was found if it is a complete optimiser; else a ValueError."""
-    called = getattr(found, "__name__", repr(found))
+    kind = getattr(found, "__name__", repr(found))
     if not isinstance(found, type):
-        raise ValueError(f"optimizer {name!r}: {called} must be a class")
+        raise ValueError(f"optimizer {name!r}: {kind} must be a class")
     missing = [item for item in (*_MEMBERS, *_DECLARED) if not hasattr(found, item)]
     missing += sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
         raise ValueError(
-            f"optimizer {name!r}: {called} does not define {', '.join(missing)}; see "
+            f"optimizer {name!r}: {kind} does not define {', '.join(missing)}; see "
             "pdeloop.Optimizer"
         )
     return found
+
+
+_COUNTED = ("cost", "rollouts", "diverged")
+"""Keys of a report that others read as numbers."""
+
+
+def ask(optimizer: Optimizer, size: int, *, extends: bool = False) -> list[Rollout]:
+    """The rollouts that it asks for, their policies being `size` finite numbers; OwnCodeError.
+
+    extends: or more numbers (`Law.extends`).
+    """
+    name, asked = type(optimizer).__name__, _called(optimizer, "ask")
+    if not isinstance(asked, Sequence) or not all(isinstance(r, Rollout) for r in asked):
+        raise OwnCodeError(f"{name}.ask returned {_kinds(asked)}; expected a list of Rollout")
+    for rollout in asked:
+        try:
+            policy = float_array("it", rollout.policy)
+        except ValueError:
+            got = f"{type(rollout.policy).__name__}, which is not an array of real numbers"
+        else:
+            fits = policy.size == size or (extends and policy.size > size)
+            if fits and np.isfinite(policy).all():
+                continue
+            got = "NaN or infinity" if fits else f"an array of shape {policy.shape}"
+        raise OwnCodeError(f"{name}.ask: a policy is {got}; expected {size} finite numbers")
+    return list(asked)
+
+
+def tell(optimizer: Optimizer, results: list[RolloutResult]) -> Row:
+    """Tell it the results of its rollouts, and return its report as JSON takes it; OwnCodeError.
+
+    JSON has neither NaN nor infinity, so a user's are left out.
+    """
+    name, row = type(optimizer).__name__, _called(optimizer, "tell", results)
+    if not isinstance(row, Mapping):
+        raise OwnCodeError(f"{name}.tell returned {type(row).__name__}; expected a dict")
+    told: Row = {}
+    for key, given in row.items():
+        value = given.tolist() if isinstance(given, np.generic | np.ndarray) else given
+        if isinstance(value, float) and not np.isfinite(value) and not _shipped(optimizer):
+            continue
+        number = key in _COUNTED
+        if not (isinstance(key, str) and (_is_number(value) if number else _is_json(value))):
+            expected = "a number" if number else "a text as key, and numbers, texts or lists"
+            raise OwnCodeError(
+                f"{name}.tell returned {type(given).__name__} as {key!r}; expected {expected}"
+            )
+        told[key] = value
+    return told
+
+
+def state(optimizer: Optimizer) -> State:
+    """Everything that `restore` needs; OwnCodeError."""
+    kept: State = _called(optimizer, "state")
+    return kept
+
+
+def restore(optimizer: Optimizer, kept: State) -> None:
+    """Continue where `kept` was taken; OwnCodeError."""
+    _called(optimizer, "restore", kept)
+
+
+def _called(optimizer: Optimizer, method: str, *given: Any) -> Any:
+    function: Callable[..., Any] = getattr(optimizer, method)
+    if _shipped(optimizer):
+        return function(*given)
+    kind = type(optimizer)
+    return called(f"{kind.__name__}.{method}", function, *given, module=kind.__module__)
+
+
+def _shipped(optimizer: Optimizer) -> bool:
+    return type(optimizer).__module__.startswith("pdeloop.method.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _kinds(asked: Any) -> str:
+    if isinstance(asked, Sequence) and not isinstance(asked, str):
+        return f"a list with {', '.join(sorted({type(item).__name__ for item in asked}))}"
+    return type(asked).__name__

@@ -1,7 +1,6 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-
 import numpy as np
 
 from pdeloop.messages.array_files import Arrays, checked_array
