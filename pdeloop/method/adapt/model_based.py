@@ -600,12 +600,12 @@ class ModelBased(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
-        n_z, shape = len(self._context.U), self._first.shape
+        sizes, shape = (len(self._context.U), self._before[0].actions.shape[1]), self._first.shape
         self._progress = Progress.of(state, shape)
         self._take_noise(self._progress.noise)
         if self._progress.belief is not None:
             self._progress.belief.check(self._context)
-        self._records.restore(state, n_z, shape, self._context.exploration.actions.shape[1])
+        self._records.restore(state, *sizes, shape)
 
 
 def _is_worse_than_predicted(row: Row) -> bool:

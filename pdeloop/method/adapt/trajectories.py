@@ -5,7 +5,7 @@ import numpy as np
 
 from pdeloop.messages.array_files import Arrays, checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory
+from pdeloop.method.adapt.base import Record, Rollout, RolloutResult, State, Trajectory, numbers_of
 from pdeloop.method.reduce.snapshots import LARGE, factored
 from pdeloop.process.one_thread import one_thread
 
@@ -101,12 +101,16 @@ class Records:
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
-        self._records: dict[int, Record] = {}
-        self.count = 0
+        self._records: list[Record] = []
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._records)
 
     def all(self) -> list[Record]:
         """The rollouts, oldest first."""
-        return [self._records[stamp] for stamp in sorted(self._records)]
+        return self._records.copy()
 
     def add(self, rollout: Rollout, result: RolloutResult) -> Record:
         """Remember a rollout."""
@@ -115,36 +119,23 @@ class Records:
         record = Record(
             np.array(rollout.policy), cost, states, actions, self.count, rollout.field_seed
         )
-        self._records[record.stamp] = record
-        self.count += 1
+        self._records.append(record)
         return record
 
     def state(self) -> State:
         """The remembered rollouts as arrays."""
-        arrays: State = {
-            "stamps": np.array(sorted(self._records), dtype=np.int64),
-            "count": np.array(self.count),
-            "limit": np.array(self._limit),
-        }
-        for record in self._records.values():
+        arrays: State = {"count": np.array(self.count), "limit": np.array(self._limit)}
+        for record in self._records:
             arrays |= record_arrays(f"record{record.stamp}", record)
         return arrays
 
-    def restore(
-        self, arrays: Arrays, n_z: int, shape: tuple[int, ...], n_a: int | None = None
-    ) -> None:
-        """Restore the content of a `state`; ValueError if it is not one.
-
-        shape: of the policies, whose rows are as many as actuators if n_a does not say how many.
-        """
-        n_a = shape[0] if n_a is None else n_a
-        count, limit = (
-            checked_array(arrays, "count", "i", ()),
-            checked_array(arrays, "limit", "f", ()),
-        )
-        stamps = checked_array(arrays, "stamps", "i", (None,)).tolist()
-        self._records = {s: taken_record(arrays, f"record{s}", n_z, n_a, shape, s) for s in stamps}
-        self.count, self._limit = int(count), float(limit)
+    def restore(self, arrays: Arrays, n_z: int, n_a: int, shape: tuple[int, ...]) -> None:
+        """Restore the content of a `state`, with policies of this shape; ValueError if it is none."""
+        count, limit = numbers_of(arrays, {"count": "i", "limit": "f"}).values()
+        self._records = [
+            taken_record(arrays, f"record{n}", n_z, n_a, shape, n) for n in range(count)
+        ]
+        self._limit = limit
 
     def validated_samples(self, result: RolloutResult) -> tuple[Array, Array]:
         """The states and actions that can be learned from, or a ValueError."""
