@@ -34,7 +34,6 @@ from tests.support.estimated import (
     T,
     fields,
     filter_of,
-    loop_of,
     rows_of,
 )
 from tests.support.small import same_bits

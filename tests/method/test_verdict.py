@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt import Record
+from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
 from pdeloop.method.adapt.renewal import choose_fraction, held_out_fraction
 from pdeloop.method.adapt.settings import ModelBasedSettings
@@ -29,6 +30,7 @@ class Costs:
     """A loop whose costs from field i under the law theta are given by a function."""
 
     replays = False
+    predicted: Any = ClosedLoop.predicted
 
     def __init__(self, cost: Callable[[float, int], float]) -> None:
         self._cost = cost

@@ -105,14 +105,6 @@ class Belief:
             return FeedForwardLoop(*problem, **on, law=context.law)
         return ClosedLoop(*problem, **on)
 
-    def predicted_costs(self, context: Context, records: Sequence[Record]) -> list[float]:
-        """The costs of rollouts that the model predicts from their initial fields."""
-        loop = self.loop(context)
-        return [
-            float(loop.costs(loop.theta(record.policy), loop.beginnings([record]))[0])
-            for record in records
-        ]
-
 
 def believe(
     context: Context, records: Sequence[Record], accepted: float, first: str = ""
@@ -130,7 +122,7 @@ def believe(
     first : str
         The kind that is tried first, the one selected before; empty: none.
     """
-    if _reads(context):
+    if context.sensors and isinstance(context.law, Observer):
         return _of_readings(context, records)
     selection = Selection(
         target=context.target,
@@ -156,11 +148,6 @@ def believe(
         found.noise,
         accepted=found.predicts,
     )
-
-
-def _reads(context: Context) -> bool:
-    """True if the law estimates the state from few readings."""
-    return bool(context.sensors) and isinstance(context.law, Observer)
 
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:

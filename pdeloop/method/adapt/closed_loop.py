@@ -162,6 +162,10 @@ class ClosedLoop:
         """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
         return self.simulate(theta, fields).costs
 
+    def predicted(self, record: Record) -> float:
+        """J of a rollout from where it began."""
+        return float(self.costs(self.theta(record.policy), self.beginnings([record]))[0])
+
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         """Roll theta (n_a + n_p, n_s + n_p + constants) out from the fields (F, n_z)."""
         n_z, n_a = self.model.n_z, self.model.n_a

@@ -389,8 +389,10 @@ class ModelBased(Optimizer):
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
         """The costs of rollouts on the last model; none without one."""
-        belief = self._progress.belief
-        return [] if belief is None else belief.predicted_costs(self._context, added)
+        if self._progress.belief is None:
+            return []
+        loop = self._progress.belief.loop(self._context)
+        return [loop.predicted(record) for record in added]
 
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""

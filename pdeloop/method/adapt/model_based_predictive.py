@@ -391,7 +391,7 @@ class ModelBasedPredictive(Optimizer):
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
         excess += [np.inf] * (len(results) - len(usable))
-        of_base = excess_of(loop, policy, of_law(self._affine.records, policy))
+        of_base = excess_of(loop, of_law(self._affine.records, policy))
         change = mean_change(np.concatenate(costs), np.concatenate(before))
         return {
             base: Evidence(ZERO, of_base),

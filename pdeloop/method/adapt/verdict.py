@@ -182,7 +182,7 @@ def evidence_of(
     evidence = {}
     for name, law in laws.items():
         own = of_law(records, law)
-        excess = excess_of(loop, law, own)
+        excess = excess_of(loop, own)
         lost = name == base and own and not any(record.usable for record in own)
         if lost or (any(record.usable for record in own) and not np.isfinite(excess).any()):
             return None
@@ -329,15 +329,15 @@ def evidence_against_none(
     return evidence
 
 
-def excess_of(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
+def excess_of(loop: ClosedLoop, own: Sequence[Record]) -> Array:
     """Measured less model cost of the rollouts of a law; infinite where one diverged."""
     excess = []
     for record in own:
-        model = loop.costs(loop.theta(law), loop.beginnings([record]))[0]
+        model = loop.predicted(record)
         if not record.usable:
             excess.append(np.inf)
         elif np.isfinite(model):  # a model that overflows carries no information on the rollout
-            excess.append(record.cost - float(model))
+            excess.append(record.cost - model)
     return np.array(excess)
 
 
