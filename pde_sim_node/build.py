@@ -16,7 +16,7 @@ from pde_sim_node.plants.loading import PHYSICAL, Made, make, physical_of
 from pde_sim_node.plants.stateful_plant import plant_of
 from pdeloop.messages.actuators import extents
 from pdeloop.messages.cost import Cost
-from pdeloop.messages.parameters import INSTRUMENTS
+from pdeloop.messages.parameters import INSTRUMENTS, table
 from pdeloop.messages.spec import ParameterError
 
 _GRID = (
@@ -73,6 +73,9 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     own[EXTENTS] = _declared_actuators(plant, values)
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
+        for spec in table():
+            if spec.name in own:
+                spec.check(own[spec.name], f"{spec.name} of {values['plant']}")
         return plant, {**own, **given}
     names = ["grid", "cost"]
     names += [] if values.get(EXTENTS) else [EXTENTS]

@@ -96,6 +96,11 @@ class DynamicsPlant(BatchPlant):
             declared = getattr(own, name)
             weights[name] = given[name] if np.ndim(declared) == 0 else declared
             if np.ndim(weights[name]) == 0:
+                if name == WEIGHTS[0] and not weights[name] and own.terminal_weight is not None:
+                    raise ValueError(
+                        f"{name} is 0; with a terminal_weight give it a small positive number, by "
+                        "which models are judged on the way there"
+                    )
                 positive(name, weights[name])
         target = float_array("target", own.target)
         shape = (len(grid.components), *grid.shape)

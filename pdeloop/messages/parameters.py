@@ -137,7 +137,7 @@ PROBLEM = _section(
     Spec("horizon", 300, 1, 1_000_000, nodes="PCTV").means("steps T of an episode"),
     Spec("state_weight", 1.0, positive=True, nodes="PCTV").means("q of Q = q I in the stage cost"),
     Spec("action_weight", 1.0, positive=True, nodes="PCTV").means("r of R = r I in the stage cost"),
-    Spec("divergence_bound", 1e3, positive=True, maximum=1e6).means(
+    Spec("divergence_bound", 1e3, positive=True, maximum=1e100).means(
         "magnitude of the field beyond which an environment has diverged"
     ),
     Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(

@@ -243,6 +243,10 @@ def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
         ({"action_low": 1.0, "action_high": 0.0}, "action_low must be at most action_high"),
         ({"action_low": 1.0, "zero_mean": True}, "no action between .* has mean zero"),
         ({"action_weight": 0.0}, "action_weight must be positive"),
+        (
+            {"state_weight": 0.0},
+            "state_weight is 0; with a terminal_weight give it a small positive",
+        ),
     ],
 )
 def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str) -> None:
@@ -250,6 +254,18 @@ def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str)
     vars(servo).update(changes)
     with pytest.raises(ValueError, match=told):
         DynamicsPlant(servo)
+
+
+def test_what_a_plant_declares_is_read_back_or_refused_at_the_start() -> None:
+    servo = Servo()
+    servo.divergence_bound = 1e9  # of pascals
+    run = pdeloop.train(plant=servo, rollouts=6, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS)
+    assert run.values["divergence_bound"] == 1e9
+    servo.horizon, servo.target = 2_000_000, 0.0
+    with pytest.raises(
+        ParameterError, match=r"horizon of .* is 2000000; expected a whole number from 1"
+    ):
+        pdeloop.problem(plant=servo)
 
 
 def test_actions_are_moved_to_the_nearest_ones_that_are_allowed_and_cost_what_acts() -> None:
