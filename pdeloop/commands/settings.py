@@ -73,7 +73,7 @@ def read_settings(texts: Iterable[str]) -> dict[str, Any]:
             found[PHYSICAL + name.removeprefix(OF_AN_FMU)] = _value(value)
             continue
         if name.startswith(PHYSICAL):
-            found[name] = _number(name, value)
+            found[name] = {"true": True, "false": False}.get(value, _value(value))
             continue
         if name.startswith(SETTINGS):  # the method knows what the value has to be
             found[name] = assignment(f"{name}={value}")[1]
@@ -107,10 +107,3 @@ def _value(text: str) -> float | str | list[float] | list[str]:
     except ValueError:
         return parts if len(parts) > 1 else text
     return numbers if len(numbers) > 1 else numbers[0]
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ParameterError(f"--set {name} is {shown(text)}; expected a number") from None

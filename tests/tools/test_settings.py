@@ -51,7 +51,6 @@ def test_every_parameter_can_be_set_to_its_default_or_has_a_flag(spec: object) -
         (["horizon=1.5"], "expected a whole number"),
         (["horizon=0"], "expected a whole number of at least 1|from 1"),
         (["horizon=3", "horizon=4"], "given twice"),
-        (["physical.viscosity=thick"], "expected a number"),
         (["identification=magic"], "expected one of"),
         (["publish_clock=maybe"], "expected true or false"),
         (["out=x"], "give --out"),
@@ -61,6 +60,15 @@ def test_what_cannot_be_set_is_refused(texts: list[str], words: str) -> None:
     with pytest.raises(ParameterError, match=words) as failed:
         read_settings(texts)
     assert "\n" not in str(failed.value)
+
+
+def test_what_a_plant_takes_may_be_a_text() -> None:
+    texts = ["physical.chemistry=Chen2020", "physical.rate=1.5", "physical.warm=true"]
+    assert read_settings(texts) == {
+        "physical.chemistry": "Chen2020",
+        "physical.rate": 1.5,
+        "physical.warm": True,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +90,8 @@ def test_train_takes_parameters_without_a_flag(
     refused(capsys, "add --view", "train", str(SMALL), "--set", "view_rate=5", *out)
     bad = ("--set", "physical.viscositi=1")
     refused(capsys, "viscositi", "train", str(SMALL), *bad, *out)
+    bad = ("--set", "physical.viscosity=thick")
+    refused(capsys, "expected a number", "train", str(SMALL), *bad, *out)
     assert not (tmp_path / "run").exists()
 
 
