@@ -37,7 +37,7 @@ from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
-from pdeloop.method.design.lqt import track
+from pdeloop.method.design.lqt import Gains, track
 from pdeloop.method.models.base import Measured, Samples
 from pdeloop.method.models.choice import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
@@ -63,10 +63,10 @@ def best_on_same_fields(records: Sequence[Record], first: Array) -> Array:
     """The law that costs least relative to the first one on the fields of both.
 
     A law that diverged where the first one did not is no candidate; where the first one diverged and
-    another did not, that one is better.
+    others did not, the cheapest of these is better.
     """
     base = costs_by_field(records, first)
-    best, least = first, 0.0
+    best, least, cheapest = first, 0.0, np.inf
     for law in (rolled[0].policy for rolled in by_law(records)):
         own = costs_by_field(records, law)
         common = [seed for seed in own if seed in base]
@@ -79,8 +79,9 @@ def best_on_same_fields(records: Sequence[Record], first: Array) -> Array:
         both = ~lost & ~other
         saved = float(np.mean(theirs[both] - mine[both])) if both.any() else 0.0
         saved = np.inf if (other & ~lost).any() and saved >= 0.0 else saved
-        if saved > least:
-            best, least = law, saved
+        mean = float(np.mean(mine[~lost])) if (~lost).any() else np.inf
+        if saved > least or (saved == least == np.inf and mean < cheapest):
+            best, least, cheapest = law, saved, mean
     return best
 
 
@@ -132,25 +133,47 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
         return None
     if W is not None and np.linalg.matrix_rank(np.diag(W) if W.ndim == 1 else W) < len(context.U):
         return None
+    K = _tracking(context, records, products=True)
+    return None if K is None else np.hstack([K.K_a, -K.K_a])
+
+
+def designed_again(context: Context, records: Sequence[Record]) -> Array | None:
+    """[K_a K_b] of LQ tracking on x' = A x + B a + d, by regression of all that was measured.
+
+    After explorations that hardly move a plant, as with a dead zone, a first law diverges;
+    what that does tells more. None where no law stabilises A.
+    """
+    gains = _tracking(context, records, products=False)
+    if gains is None:
+        return None
+    s_r = context.U.T @ context.target
+    return gains.policy_for(s_r) if s_r.any() else gains.policy  # which has no constant part
+
+
+def _tracking(context: Context, records: Sequence[Record], *, products: bool) -> Gains | None:
+    """LQ tracking on A and B of a regression, of x with products, or of s with a constant term d."""
     U, n_s = context.U, context.U.shape[1]
     rollouts = [Measured(record.states, record.actions) for record in records]
     samples = Samples.of([limited(rollout, context.action_set) for rollout in rollouts])
     rows, columns = np.triu_indices(n_s)
-    a = samples.actions
-    if len(samples) < n_s + a.shape[1] + len(rows):
-        return None
-    x, after = ((states - context.target) @ U for states in (samples.before, samples.after))
+    a, n = samples.actions, n_s + samples.actions.shape[1]
+    origin = context.target if products else 0.0
+    x, after = ((states - origin) @ U for states in (samples.before, samples.after))
     unit = float(np.sqrt(np.mean(x**2, axis=0).max())) or 1.0
     x, after = x / unit, after / unit
-    features = np.hstack([x, a, x[:, rows] * x[:, columns]])
-    ridge = np.full(features.shape[1], _PRODUCT_RIDGE)
-    ridge[: n_s + a.shape[1]] = _LINEAR_RIDGE
+    more = x[:, rows] * x[:, columns] if products else np.ones((len(x), 1))
+    features = np.hstack([x, a, more])
+    if len(samples) < features.shape[1]:
+        return None
+    ridge = np.full(features.shape[1], _PRODUCT_RIDGE if products else 0.0)
+    ridge[:n] = _LINEAR_RIDGE
     gram = features.T @ features / len(x) + np.diag(ridge)
     try:
         found = np.linalg.solve(gram, features.T @ after / len(x))
-        model = ReducedModel(found[:n_s].T, unit * found[n_s : n_s + a.shape[1]].T, U)
+        d = np.zeros(n_s) if products else unit * found[n]
+        model = ReducedModel(found[:n_s].T, unit * found[n_s:n].T, U, d=d)
         q, r = context.state_weight, context.action_weight
-        K = track(model, state_weight=q, action_weight=r, cost=cost).K_a
+        gains = track(model, state_weight=q, action_weight=r, cost=context.cost)
     except (np.linalg.LinAlgError, ValueError):
         return None
-    return np.hstack([K, -K]) if np.isfinite(K).all() else None
+    return gains if np.isfinite(gains.policy).all() else None
