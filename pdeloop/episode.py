@@ -182,7 +182,8 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike | Gains) -> Law:
     --------
     >>> import pdeloop
     >>> problem = pdeloop.problem("burgers")
-    >>> plant, model = problem.plant(), pdeloop.identify(problem.explore(0), n_s=4)
+    >>> plant = problem.plant()
+    >>> model = pdeloop.identify(problem.explore(0), n_s=4, constant=None)  # as in a training
     >>> gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
     >>> law = pdeloop.projected_law(plant, model.U, gains)
     >>> pdeloop.rollout(plant, law, [0, 1, 2]).costs.mean.round(1)

@@ -324,7 +324,7 @@ def identify_data(
     seen = shifted(found.trajectories, used)
     constant = regression.has_offset(seen)
 
-    def by(own: Mapping[str, Any]) -> Identified:
+    def by(own: Mapping[str, Any], *, simulations: bool = False) -> Identified:
         return _identified(
             found.trajectories,
             found.target,
@@ -336,6 +336,7 @@ def identify_data(
             delays=used,
             validation=validation,
             constant=constant,
+            simulations=simulations,
         )
 
     first = by(given)
@@ -358,7 +359,7 @@ def _or_subspace(
     """
     own = {name: value for name, value in given.items() if name != "dmdc_rank"}
     try:
-        other = by({**own, "identification": "subspace"})
+        other = by({**own, "identification": "subspace"}, simulations=True)
         (*_, known), (*_, found) = errors = [
             held_out_errors(one.refit, trajectories) for one in (first, other) if one.refit
         ]
@@ -441,6 +442,7 @@ def _identified(
     delays: Delays = (),
     validation: Mapping[str, Measurements] = MappingProxyType({}),
     constant: bool | None = None,
+    simulations: bool = False,
 ) -> Identified:
     n_z = trajectories[0][0].shape[1]
     known = {**recorded, **given}
@@ -503,9 +505,13 @@ def _identified(
     model: ModelRows | ReducedModel
     field: FieldLaw | None = None
     innovations: InnovationModel | None = None
-    if of_past and constant is not None:  # of a log
+    if of_past and simulations:
         innovations = subspace_model(
-            trajectories, order=order or 0, channels=channels, constant=constant, simulations=True
+            trajectories,
+            order=order or 0,
+            channels=channels,
+            constant=bool(constant),
+            simulations=True,
         )
     if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
@@ -531,7 +537,7 @@ def _identified(
         )
     late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
     aligned = shifted(logged, early) if delays else trajectories
-    refit = partial(_refitted, model, method, p, sum(late), innovations)
+    refit = partial(_refitted, model, method, p, sum(late), innovations, simulations)
     return Identified(
         model,
         sources,
@@ -570,6 +576,7 @@ def _refitted(
     p: int,
     memory: int,
     innovations: InnovationModel | None,
+    simulations: bool,
     trajectories: list[Trajectory],
 ) -> InnovationModel:
     """That of other data, by the same method, of the same sizes; memory: of the inputs' dead time."""
@@ -577,7 +584,7 @@ def _refitted(
     if innovations is not None:
         order, past = len(innovations.A), innovations.past
         return subspace_model(
-            trajectories, order=order, past=past, constant=constant, simulations=True
+            trajectories, order=order, past=past, constant=constant, simulations=simulations
         )
     U = model.U[:, : model.U.shape[1] - memory]
     with one_thread():

@@ -64,7 +64,7 @@ def theta(own: Predictive, **changed: object) -> np.ndarray:
         steps=10,
         terminal=True,
     )
-    return own.theta_of(GAINS, replace(made, **changed))  # type: ignore[arg-type]
+    return own.theta_of(own.without.theta_start, replace(made, **changed))  # type: ignore[arg-type]
 
 
 def actions_of(own: Law, theta: np.ndarray, states: np.ndarray = STATES) -> np.ndarray:
@@ -119,7 +119,7 @@ def test_what_theta_holds_is_the_planner_and_zeros_at_its_end_mean_nothing(
 ) -> None:
     own = law(cost)
     whole = theta(own)
-    assert own.is_extended(whole) and not own.plans(own.theta_start)
+    assert own.is_extended(whole) and not own.is_extended(own.theta_start)
     found = own.planner(own.parts(whole))
     z, v = STATES[:2], RNG.standard_normal((2, 10, N_A))
     expected = replace(found, model=spectral()).costs(v, z, 0)
