@@ -24,6 +24,8 @@ from pdeloop.process.one_thread import one_thread
 SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
 """Attributes that a problem may override; weights only where they are numbers."""
 WEIGHTS = ("state_weight", "action_weight")
+FAR = 1e9
+"""Magnitude of requested actions beyond all bounds, which tells of those of `actuated`."""
 
 
 class DynamicsPlant(BatchPlant):
@@ -70,6 +72,8 @@ class DynamicsPlant(BatchPlant):
             self.action_set = ActionSet(self.n_a, *bounds, rate=dynamics.action_rate)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
+        if self.actuated and not self.action_set.bounded:
+            self.action_set = self._clipped_to() or self.action_set
         self.supports = None if dynamics.supports is None else self._checked_supports()
         self._mean: Array | None = None
 
@@ -210,6 +214,24 @@ class DynamicsPlant(BatchPlant):
         if held.shape != actions.shape or not np.isfinite(held).all():
             raise OwnCodeError(f"{self.name}.actuated must return {self.n_a} finite numbers")
         return held
+
+    def _clipped_to(self) -> ActionSet | None:
+        """The bounds that `actuated` clips each action to; None if it does anything else."""
+        try:
+            ends = self.applied(np.full((2, self.n_a), [[-FAR], [FAR]]))
+            if not (ends[0] < ends[1]).all():
+                return None
+            bounds = np.abs(ends) < FAR
+            low, high = np.where(bounds, ends, np.copysign(np.inf, ends))
+            least, most = np.where(bounds, ends, np.copysign(1.0, ends))
+            rng = np.random.default_rng(0)
+            tried = [least + rng.uniform(-1.0, 2.0, (32, self.n_a)) * (most - least)]
+            tried += [10.0**power * rng.normal(size=(8, self.n_a)) for power in range(-6, 7)]
+            asked, known = np.concatenate(tried), ActionSet(self.n_a, low, high)
+            alike = np.allclose(self.applied(asked), known.project(asked), rtol=1e-12, atol=0.0)
+        except OwnCodeError:  # a training says so where it matters
+            return None
+        return known if alike else None
 
     def _advanced(
         self, states: Array, actions: Array, totals: Array, step: int, environments: Any

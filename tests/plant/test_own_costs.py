@@ -317,6 +317,28 @@ def test_a_class_says_itself_what_its_actuators_take() -> None:
     )
 
 
+class Limited(Servo):
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return np.minimum(np.maximum(a, [0.0, -2.0]), [4.0, np.inf])
+
+
+class Coupled(Servo):
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return a / max(1.0, float(np.abs(a).sum()))
+
+
+class Stepped(Servo):
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return np.clip(np.round(a, 1), 0.0, 4.0)
+
+
+def test_the_bounds_of_actuators_that_clip_are_those_of_the_actions() -> None:
+    found = DynamicsPlant(Limited()).action_set
+    assert found.low.tolist() == [0.0, -2.0] and found.high.tolist() == [4.0, np.inf]
+    for other in (Halved(), Coupled(), Stepped(), Servo()):
+        assert not DynamicsPlant(other).action_set.bounded
+
+
 class Heated(Dynamics):
     """Two heaters of 0 to 4, of a state that has to be warm."""
 
@@ -339,6 +361,22 @@ def test_what_is_recorded_of_bounded_actuators_is_what_acts_from_mid_range_on() 
     np.testing.assert_allclose(states[1:], acted, atol=1e-12)
     assert np.abs(actions.mean(axis=0) - 2.0).max() < 0.25
     assert np.abs(actions.std(axis=0) - 0.5).max() < 0.12
+
+
+class Clipped(Heated):
+    """The same with bounds that only the plant knows."""
+
+    action_low, action_high = None, None
+
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return np.clip(a, 0.0, 4.0)
+
+
+def test_models_are_of_the_actions_that_actuators_apply() -> None:
+    declared, own = (pdeloop.problem(plant=plant()) for plant in (Heated, Clipped))
+    assert own.values["action_bounds"] == declared.values["action_bounds"]
+    for a, b in zip(own.explore(0), declared.explore(0), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_law_of_bounded_actuators_asks_for_no_more_than_they_take() -> None:

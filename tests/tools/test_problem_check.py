@@ -174,7 +174,7 @@ class Bounded(Around):
     """The same with a saturation of its own, at a third of the exploration's standard deviation."""
 
     def actuated(self, a: np.ndarray) -> np.ndarray:
-        return np.clip(a, -0.1, 0.1)
+        return 0.1 * np.tanh(10.0 * a)
 
 
 class Heated(Around):
