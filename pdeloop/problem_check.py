@@ -304,9 +304,9 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding("exploration", True, told, note=True)
         return
     episode = Trajectory(first.states[:, 0], first.actions[:, 0])
-    remembers = training.settings.law.filtered or bool(values["sensors"])
+    known = settings.action_set, training.settings.law, training.settings.sensors
     try:
-        remarks = check_excitation(episode, 0, settings.action_set, remembers)
+        remarks = check_excitation(episode, 0, *known)
     except ValueError as error:
         yield Finding("exploration", False, str(error))
         return

@@ -11,11 +11,14 @@ import numpy as np
 from pde_sim_node.build import complete
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.own_code import OwnCodeError
+from pdeloop.messages.parameters import LAW
 from pdeloop.messages.problem import find_problem
 from pdeloop.messages.spec import flatten
 from pdeloop.method.models.settings import SENSED_MOST
+from pdeloop.method.reduce.input_delay import LATEST
 from tuner_node.build import few_sensors
 from tuner_node.optimizer_parameters import training_parameters
 
@@ -30,8 +33,13 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
     """
     given = flatten(options)
     plant, values = complete(training_parameters(name, given), compiled=False)
-    if plant.cost.target.ndim > 1 or _needs_offset(plant):  # which the plant itself may say
+    constants = plant.cost.target.ndim > 1 or _needs_offset(plant)  # which the plant itself may say
+    if constants:
         values |= training_parameters(name, given, constants=True)
+    late = training_parameters(name, given, constants=constants, late=True)
+    other = late[LAW.name] != values[LAW.name] and not values["model"]
+    if other and _acts_late(plant, values):
+        values |= late
     resting, limits = plant.cost.action_target, (plant.action_set.low, plant.action_set.high)
     limited = any(np.isfinite(limit).any() for limit in limits)
     if limited and resting.any() and not values["exploration_mean"]:
@@ -58,6 +66,32 @@ def _needs_offset(plant: Plant) -> bool:
     except OwnCodeError:  # a training says so where it matters
         return False
     return bool(np.abs(after).max() > RESTS * true.divergence_bound)
+
+
+def _acts_late(plant: Plant, values: Mapping[str, Any]) -> bool:
+    """Whether an action changes no state in the step that it is held in, but in a later one.
+
+    Of a plant with a state of its own, from one initial state, with actions of the explored size.
+    """
+    true, admissible = getattr(plant, "plant", plant), ActionSet.of(values)
+    if true.settable:
+        return False
+    size = np.sqrt(values["exploration_variance"] or admissible.exploration_variance)
+    tried = admissible.explored(size * np.eye(1 + plant.n_a, plant.n_a, k=-1))
+    moved = np.zeros(plant.n_a, dtype=np.bool_)
+    try:
+        true.reset(np.zeros(len(tried), dtype=np.int64))
+        for k in range(min(1 + LATEST, plant.horizon)):
+            states = true.step(tried if k == 0 else tried[[0] * len(tried)])
+            now = (states[1:] != states[0]).any(axis=1)
+            if k and (now & ~moved).any():
+                return True
+            moved |= now
+            if moved.all():
+                break
+    except OwnCodeError:
+        pass
+    return False
 
 
 def _is_order_sought(

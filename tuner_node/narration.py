@@ -86,7 +86,7 @@ class Narration:
                 lines.append(
                     f"  seed {row['seed']}: another law could save {share} more on the model"
                 )
-        elif event == "excitation":
+        elif event in ("excitation", "late"):
             lines.append(f"  seed {row['seed']}: {row['remark']}")
         elif event == "diverged":
             lines.append(_diverged(row))

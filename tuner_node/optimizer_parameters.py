@@ -56,24 +56,25 @@ def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
 
 
 def training_parameters(
-    name: str, options: Mapping[str, Any], *, constants: bool = False
+    name: str, options: Mapping[str, Any], *, constants: bool = False, late: bool = False
 ) -> dict[str, Any]:
     """Like `load_parameters`, with the optimiser's preferred defaults and all settings.
 
     options: by dotted names, or nested, as optimizer_settings={"fields": 5}; constants: whether the
-    plant needs a law with constant parts of its own, where that is known.
+    plant needs a law with constant parts of its own, late: whether its actions act late, where that is
+    known.
     """
     own = flatten(options)
-    preferred = partial(_preferred, options=own, constants=constants)
+    preferred = partial(_preferred, options=own, constants=constants, late=late)
     return with_settings(load_parameters(name, own, preferred))
 
 
 def _preferred(
-    given: Mapping[str, Any], options: Mapping[str, Any], constants: bool
+    given: Mapping[str, Any], options: Mapping[str, Any], constants: bool, late: bool
 ) -> dict[str, Any]:
     """The given parameters with the defaults that the optimiser prefers.
 
-    The law too may be one of few sensors, or with constant parts.
+    The law too may be one of few sensors, with the last actions, or with constant parts.
 
     A model of the whole field that a problem's file asks for, and the options do not, gives way to one
     of few readings. The optimiser's name may be written as the command line writes words: two-point.
@@ -89,6 +90,8 @@ def _preferred(
     few_now = few and _number(given, "sensor_delays") <= 1
     if (few_now or (few and constants)) and kind.law_of_sensors:
         preferences[LAW.name] = kind.law_of_sensors
+    elif kind.law_with_actions and late and not few:
+        preferences[LAW.name] = kind.law_with_actions
     elif kind.law_with_constants and constants:
         preferences[LAW.name] = kind.law_with_constants
     if few_now and given.get(LAW.name) in kind.laws_of_sensors:

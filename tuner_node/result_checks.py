@@ -5,6 +5,7 @@ from typing import Any
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.method.adapt import Trajectory
+from pdeloop.method.laws import Affine, Law
 from pdeloop.method.reduce.identifiability import examine_excitation
 from pdeloop.method.reduce.input_delay import study_delays
 from tuner_node.batch import BatchResult
@@ -29,12 +30,14 @@ def check_excitation(
     explored: Trajectory,
     seed: int,
     action_set: ActionSet = ANY_ACTION,
-    remembers: bool = False,
+    law: type[Law] = Affine,
+    sensors: int = 0,
 ) -> list[dict[str, Any]]:
     """History rows about what an exploration hardly determines, whatever drew its actions.
 
     NotIdentifiableError if the effects of its inputs cannot be told apart; of actions with a mean of
-    zero, those of their differences. remembers: whether the law has a memory of its actions.
+    zero, those of their differences. law, sensors: those of the training. Readings of few sensors are
+    late by themselves.
     """
     actions = explored.actions[: len(explored.states) - 1]
     if action_set.zero_mean:
@@ -43,10 +46,15 @@ def check_excitation(
     found.require()
     remarks = [*found.remarks]
     delays = study_delays([(explored.states, actions)])
-    if not remembers and max(delays.best) > 0:
-        steps = " and ".join(map(str, dict.fromkeys(delays.best)))
+    late = f"the actions act {' and '.join(map(str, dict.fromkeys(delays.best)))} steps late"
+    acts_late = max(delays.best) > 0 and not sensors
+    if acts_late and not law.filtered:
         remarks.append(
-            f"the actions act {steps} steps late ({delays.gain:.3g} times smaller errors), which the "
+            f"{late} ({delays.gain:.3g} times smaller errors), which the "
             "law does not know: train with --law observer, whose state has the last actions"
         )
-    return [{"event": "excitation", "seed": seed, "remark": remark} for remark in remarks]
+    rows = [{"event": "excitation", "seed": seed, "remark": remark} for remark in remarks]
+    if acts_late and law.filtered:
+        told = f"{late}, so the law '{law.name}' has the last ones in its state"
+        rows.append({"event": "late", "seed": seed, "remark": told})
+    return rows

@@ -181,8 +181,8 @@ class Training:
                     first, *further = islice(seen, together)
                     seed = self.settings.all_seeds[m]
                     settings = self.settings
-                    remembers = settings.law.filtered or bool(settings.sensors)
-                    remarks += check_excitation(first, seed, settings.action_set, remembers)
+                    known = settings.action_set, settings.law, settings.sensors
+                    remarks += check_excitation(first, seed, *known)
                     self.explorations[m], self.further[m] = first, further
                 self.target = result.target
             # A controller that knows no common exploration gives a model of each: the first is taken.

@@ -276,6 +276,8 @@ class Optimizer(Protocol):
     law_with_constants: ClassVar[str] = ""
     """The law preferred where the target changes from step to step, or is 0 and not where the plant
     rests; empty: as without."""
+    law_with_actions: ClassVar[str] = ""
+    """The law preferred where actions act late, which remembers them; empty: as without."""
     law_of_sensors: ClassVar[str] = ""
     """The law preferred where the state is that of few sensors; empty: as without."""
     laws_of_sensors: ClassVar[Mapping[str, str]] = {}

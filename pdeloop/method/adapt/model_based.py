@@ -141,6 +141,7 @@ class ModelBased(Optimizer):
     judges_first_law = True
     explorations = 2
     law_with_constants = "feedforward"
+    law_with_actions = "observer"
     law_of_sensors = "extended_kalman"  # measured: python -m benchmarks few_sensors
     laws_of_sensors: ClassVar = {"predictive": "predictive_kalman", "auto": "auto_kalman"}
 
