@@ -15,7 +15,8 @@ from pdeloop import rollout
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import model_based
-from pdeloop.method.adapt.base import Context, Record, Trajectory
+from pdeloop.method.adapt.base import Context, Record, Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.replay import best_on_same_fields, designed_again, law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel
@@ -102,6 +103,25 @@ def test_where_the_first_law_diverges_the_cheapest_of_the_others_is_the_best() -
         for seed in (1, 2)
     ]
     assert best_on_same_fields(rolled, np.zeros((1, 4)))[0, 0] == 2.0
+
+
+@pytest.mark.parametrize("diverged", [False, True])
+def test_the_final_law_is_compared_with_one_that_comes_to_an_end(diverged: bool) -> None:
+    first, last = np.ones((1, 4)), np.full((1, 4), 2.0)
+    record = _record(0)
+    optimizer = model_based.ModelBased(first, seed=0, rollouts=20, context=_context(record))
+    seen = RolloutResult(1.0, diverged, Trajectory(record.states, record.actions))
+    for seed, law in ((1, first), (2, first), (1, last), (2, last)):
+        optimizer._records.add(
+            Rollout(law, seed), seen if law is first else replace(seen, diverged=False)
+        )
+    progress = optimizer._progress
+    progress.replayed, progress.stage, progress.policy = True, JUDGING, last
+    asked = optimizer.ask()
+    others = [r for r in asked if not np.array_equal(r.policy, last)]
+    fields = {r.field_seed for r in asked} - {r.field_seed for r in others}
+    assert others and len(fields) <= 1
+    assert all(np.array_equal(r.policy, 0.0 * first if diverged else first) for r in others)
 
 
 @pytest.mark.filterwarnings("ignore::pdeloop.IdentifiabilityWarning")

@@ -152,6 +152,23 @@ def test_where_the_first_law_always_diverges_the_cheapest_of_the_others_is_taken
     assert choose(evidence_of_rollouts(known, FIRST, seen), FIRST, 1.0).chosen == ADAPTED
 
 
+def test_where_the_first_law_diverges_others_are_compared_on_the_same_fields() -> None:
+    laws = {name: np.full((1, 1), float(i)) for i, name in enumerate((FIRST, ADAPTED, NONE))}
+    costs = {
+        FIRST: {0: np.inf, 1: np.inf},
+        ADAPTED: {0: 3.0, 1: 2.0, 2: 9.0, 3: 8.0},  # 2 and 3 are dear with any law
+        NONE: {0: 5.0, 1: 4.2},
+    }
+    seen = [
+        Record(laws[name], cost, np.ones((1, 1)), np.ones((0, 1)), field_seed=field)
+        for name, own in costs.items()
+        for field, cost in own.items()
+    ]
+    found = evidence_of_rollouts(laws, FIRST, seen)
+    assert found[ADAPTED].change.value == pytest.approx(-2.1) and found[NONE].change == ZERO
+    assert choose(found, FIRST, 1.0).chosen == ADAPTED
+
+
 def test_fields_from_which_both_laws_diverge_are_left_out_of_their_difference() -> None:
     costs = {FIRST: np.array([np.inf, 3.0, 4.0]), ADAPTED: np.array([np.inf, 2.0, 2.0])}
     found = evidence_of_pairs(costs, FIRST)[ADAPTED]

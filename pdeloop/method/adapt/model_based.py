@@ -265,7 +265,8 @@ class ModelBased(Optimizer):
     def _on_known_fields(self) -> list[Rollout]:
         """Rollouts of a step along measured ones, on fields of the first law.
 
-        No control follows once, and the final law comes to fresh fields together with the first one.
+        No control follows once, and the final law comes to fresh fields together with the first one, or
+        with no control where all rollouts of that diverged.
         """
         progress, judging = self._progress, self._schedule.judging
         known = list(costs_by_field(self._records.all(), self._first))
@@ -280,10 +281,12 @@ class ModelBased(Optimizer):
                 asked += [Rollout(self._none.copy(), seed) for seed in known[:free]]
             return asked
         asked, fresh = self._on_new(known, progress.policy)[:judging], self._records.count
+        lost = not any(own.usable for own in of_law(self._records.all(), self._first))
+        other = self._none if lost else self._first
         while len(asked) < judging:
             asked.append(self._rollout(progress.policy, fresh))
-            if len(asked) < judging and not np.array_equal(progress.policy, self._first):
-                asked.append(self._rollout(self._first, fresh))
+            if len(asked) < judging and not np.array_equal(progress.policy, other):
+                asked.append(self._rollout(other, fresh))
             fresh += 1
         return asked
 

@@ -205,7 +205,8 @@ def evidence_of_rollouts(
     """The evidence of rollouts alone, except for `base` only for laws that were measured.
 
     It is the mean difference on the initial fields that a law and the base share if there are two or
-    more, else the difference of their means; of the mean to 0 where the base has no finite cost.
+    more, else the difference of their means. Where the base has no finite cost, no control takes its
+    place, and without that 0.
     """
     costs: dict[str, dict[int, float]] = {}
     for name, law in laws.items():
@@ -215,6 +216,9 @@ def evidence_of_rollouts(
                 r.field_seed if r.field_seed >= 0 else -1 - i: r.cost
                 for i, r in enumerate(of_law(records, law))
             }
+    stay = costs[base]
+    if stay and NONE in costs and np.isinf([*stay.values()]).all():
+        stay = costs[NONE]
     evidence = {}
     for name, mine in costs.items():
         values = np.array(list(mine.values()))
@@ -222,7 +226,7 @@ def evidence_of_rollouts(
         if name == base:
             evidence[name] = Evidence(ZERO, lost)
         elif len(values):
-            evidence[name] = Evidence(_difference(mine, costs[base]), lost)
+            evidence[name] = Evidence(_difference(mine, stay), lost)
     return evidence
 
 
