@@ -119,6 +119,16 @@ def test_the_order_and_the_past_are_those_of_the_least_error_on_held_out_measure
     assert len(few.A) == N and few.U.shape == (1, 1) and few.past >= N
 
 
+def test_a_past_that_is_given_keeps_the_order_on_fewer_data() -> None:
+    """A past may be as long as the log from which it was chosen allows, but not its parts."""
+    turn = 0.98 * np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+    a, y = np.random.default_rng(4).standard_normal((300, 1)), np.zeros((301, 2))
+    for k in range(300):
+        y[k + 1] = turn @ y[k] + [0.0, a[k, 0]]
+    model = subspace_model([(y, a)], order=2, past=36, constant=True, simulations=True)
+    np.testing.assert_allclose(np.abs(np.linalg.eigvals(model.A)), 0.98, atol=1e-3)
+
+
 def test_waves_that_hardly_decay_get_as_many_states_and_a_long_past() -> None:
     """Thirty oscillators, which no model of 48 states predicts."""
     rng, angles = np.random.default_rng(3), np.linspace(0.1, 3.0, 30)

@@ -153,13 +153,14 @@ def subspace_model(
     with one_thread():
         few, affine = 0 < order <= MANY, constant and simulations
         pasts: Sequence[int] = (past,) if past else PASTS if few else PASTS + LONGER
-        if simulations and not past:
+        free = simulations and not past
+        if free:
             pasts = PASTS_OF_LOGS
         # The data may not determine as many states as were asked for.
         asked_for: list[tuple[int, ...]] = [(n,) for n in range(order, 0, -1)]
         for asked in asked_for or [ORDERS_OF_LOGS if simulations else ORDERS]:
             tried = [(p, n) for p in pasts for n in asked if _determined(p, n, known)]
-            if simulations:
+            if free:
                 tried = [(p, n) for p, n in tried if _narrow(p, n, known)]
             if tried:
                 break
