@@ -195,13 +195,12 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
         after_gap[1:] = np.diff(times) > GAP * step
     found = findings(values, first | after_gap, rows, log.channels, step or 1.0)
     spoilt = _missing(values, first, n_z)
+    dropped = list[int]()
     if remedies.cut:
         for one in found:
             spoilt = spoilt | one.spoilt
         first = first | after_gap | np.r_[False, spoilt[:-1]]
-        if spoilt.any():
-            k, count = int(np.argmax(spoilt)), int(spoilt.sum())
-            remarks.append(f"left out {count} rows, the first of them row {rows[k]}")
+        dropped = rows[spoilt].tolist()
         values, times, rows, first = values[~spoilt], times[~spoilt], rows[~spoilt], first[~spoilt]
         first[:1] = True
     elif spoilt.any():
@@ -211,7 +210,11 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     parts = [slice(a, b) for a, b in pairwise(bounds)]
     single = [int(rows[part.start]) for part in parts if part.stop - part.start == 1]
     parts = [part for part in parts if part.stop - part.start > 1]
-    if single and not remedies.cut:
+    if remedies.cut:
+        own = (dropped, ""), (single, " that stand alone between gaps")
+        left = [f"{len(k)} rows{what}, the first of them row {k[0]}" for k, what in own if k]
+        remarks += [f"left out {', and '.join(left)}"] if left else []
+    elif single:
         remarks.append(
             f"left out row {listed([str(row) for row in single])}: t increases neither before nor "
             "after it"

@@ -190,6 +190,16 @@ def test_jitter_is_told_and_resampled(tmp_path: Path) -> None:
         read_measurements(path, resample=0.1)
 
 
+def test_rows_of_another_step_that_cut_leaves_out_are_told(tmp_path: Path) -> None:
+    """The second half was logged at every third step: none of its rows has a neighbour."""
+    kept = np.r_[:150, 150:ROWS:3]
+    path = write(tmp_path / "log.csv", Z[kept], U[kept], T[kept])
+    found = read_measurements(path, cut=True)
+    assert [len(a) for _, a in found.trajectories] == [150]
+    told = "left out 49 rows that stand alone between gaps, the first of them row 153"
+    assert found.remarks == (told,)
+
+
 def test_missing_rows_are_cut_at_and_never_interpolated_over(tmp_path: Path) -> None:
     there = np.delete(np.arange(ROWS), [100, 101, 250])
     path = write(tmp_path / "own.csv", Z[there], U[there], T[there])
