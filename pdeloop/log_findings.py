@@ -39,6 +39,10 @@ SPIKE = 5.0
 """Size of a jump and of the one back, relative to the 98th percentile of all."""
 EXPLAINED = 0.02
 """Part of usual steps that a regression misses of them at least."""
+DRIFT = 50.0
+"""Variances by which a trend in time lowers the squares of residuals, from which the plant drifts."""
+PAST = 4
+"""Rows of states and inputs beside which that trend counts."""
 OFFSET = 20.0
 """Standard deviations between 0 and the mean of a channel with a large offset."""
 ONE = 1e-7
@@ -239,6 +243,7 @@ def findings(
         )
     result += [Finding(text, nothing) for text in _offsets(values, channels)]
     result += [Finding(text, nothing) for text in _twins(values, rows, channels)]
+    result += [Finding(text, nothing) for text in _drifts(states, inputs, first, channels)]
     return result
 
 
@@ -328,6 +333,35 @@ def _jumps(states: Array, inputs: Array, first: Flags) -> Flags:
     near_by = np.maximum(np.r_[0.0, size[:-1]], np.r_[size[1:], 0.0])
     found[:] = (size > SPIKE) & (size > SPIKE * near_by)
     return found
+
+
+def _drifts(states: Array, inputs: Array, first: Flags, channels: Channels) -> list[str]:
+    """States whose rest moves with time, as of a machine that wears or of a disturbance that grows.
+
+    Steps are explained by a linear regression on `PAST` rows, without and with a trend; one trajectory.
+    """
+    z, u = states, inputs[: len(states) - 1]
+    width = PAST * (z.shape[1] + u.shape[1]) + 2
+    if first[1:].any() or not (np.isfinite(z).all() and np.isfinite(u).all()) or len(u) < 5 * width:
+        return []
+    k = np.arange(PAST - 1, len(u))
+    known = np.hstack([np.ones((len(k), 1)), *(x[k - lag] for x in (z, u) for lag in range(PAST))])
+    trend = k / len(u) - 0.5
+    trend = trend - known @ linalg.lstsq(known, trend)[0]
+    found = linalg.lstsq(known, z[k + 1])[0]
+    missed = z[k + 1] - known @ found
+    gained = (trend @ missed) ** 2 / (trend @ trend)
+    least = EXPLAINED**2 * np.sum((z[k + 1] - z[k]) ** 2, axis=0)
+    left = np.maximum(np.sum(missed**2, axis=0) - gained, least)
+    own = np.flatnonzero(gained * (len(k) - width) > DRIFT * left)
+    if not own.size:
+        return []
+    names = listed([channels.state(i) for i in own.tolist()])
+    drift, them = ("drifts", "it") if own.size == 1 else ("drift", "them")
+    return [
+        f"{names} {drift} through the log, and not by an input, which a model takes for slow modes and "
+        f"wrong gains: give what drives {them} as an input, or take the trend out"
+    ]
 
 
 def _frozen(x: Array, runs: _Runs, held: Flags) -> Flags:

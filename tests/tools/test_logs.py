@@ -190,6 +190,17 @@ def test_jitter_is_told_and_resampled(tmp_path: Path) -> None:
         read_measurements(path, resample=0.1)
 
 
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_a_disturbance_that_grows_is_told(tmp_path: Path, drift: float) -> None:
+    z, u = log(seed=3)
+    ramp = np.zeros_like(z)
+    for k in range(ROWS - 1):
+        ramp[k + 1] = A @ ramp[k] + drift * np.array([0.4, 0.0, 0.0]) * k / ROWS
+    found = read_measurements(write(tmp_path / "log.csv", z + ramp, u)).remarks
+    told = [text for text in found if "through the log, and not by an input" in text]
+    assert len(told) == (drift > 0.0) and all(text.startswith("z1 ") for text in told)
+
+
 def test_rows_of_another_step_that_cut_leaves_out_are_told(tmp_path: Path) -> None:
     """The second half was logged at every third step: none of its rows has a neighbour."""
     kept = np.r_[:150, 150:ROWS:3]
