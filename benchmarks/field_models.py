@@ -21,10 +21,9 @@ from benchmarks.families import plants
 from benchmarks.families.cases import CASES, Case
 from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array
-from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.design.lqt import finite_horizon
 from pdeloop.method.models import FittedModel, Measured, Selection, affine_law
-from pdeloop.method.models.base import Law, saturated
-from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.base import Law, errors, saturated
 
 __all__ = ["run", "text"]
 

@@ -21,7 +21,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.method.adapt.model_based_predictive import rests
-from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.design.lqt import finite_horizon
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 

@@ -32,8 +32,8 @@ from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, Channels
 from pdeloop.method.reduce.identifiability import Identifiability, examine
 from pdeloop.method.reduce.input_delay import shifted, study_delays
-from pdeloop.method.reduce.order import study_orders
 from pdeloop.method.reduce.reduced_model import DEFAULTS, IdentificationSettings, ReducedModel
+from pdeloop.method.reduce.regression import study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
@@ -52,7 +52,7 @@ class DesignSettings:
     n_a : int
         Actuators.
     reduced_order : int
-        n_s of "field" and "regression"; 0: as `order.study_orders` suggests.
+        n_s of "field" and "regression"; 0: as `study_orders` suggests.
     state_weight, action_weight : float
         Of the stage cost.
     action_set : ActionSet
@@ -149,7 +149,7 @@ def identify(
     method : {"regression", "dmdc"}
         Least squares in reduced coordinates, or truncated DMDc.
     n_s : int
-        Its order; 0: the suggested one (`order.study_orders`).
+        Its order; 0: the suggested one (`study_orders`).
     p : int
         Rank of "dmdc"; 0: n_s + n_a.
     channels : Channels

@@ -40,15 +40,15 @@ if TYPE_CHECKING:
     from pdeloop.method.adapt.base import Rollout as Rollout
     from pdeloop.method.adapt.base import RolloutResult as RolloutResult
     from pdeloop.method.adapt.step_optimizer import StepOptimizer as StepOptimizer
-    from pdeloop.method.design.finite_horizon import track_horizon as track_horizon
     from pdeloop.method.design.lqt import track as track
+    from pdeloop.method.design.lqt import track_horizon as track_horizon
     from pdeloop.method.laws.base import Law as Law
     from pdeloop.method.reduce.identifiability import (
         IdentifiabilityWarning as IdentifiabilityWarning,
     )
     from pdeloop.method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
-    from pdeloop.method.reduce.order import study_orders as study_orders
     from pdeloop.method.reduce.reduced_model import ReducedModel as ReducedModel
+    from pdeloop.method.reduce.regression import study_orders as study_orders
     from pdeloop.method.settings import Settings as Settings
     from pdeloop.method.settings import setting as setting
     from pdeloop.plots import plot_behaviour as plot_behaviour
@@ -62,10 +62,9 @@ if TYPE_CHECKING:
 _NAMES = {
     "pdeloop.method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
     "pdeloop.method.adapt": ("Optimizer", "Rollout", "RolloutResult", "StepOptimizer"),
-    "pdeloop.method.design.lqt": ("track",),
-    "pdeloop.method.design.finite_horizon": ("track_horizon",),
+    "pdeloop.method.design.lqt": ("track", "track_horizon"),
     "pdeloop.method.laws.base": ("Law",),
-    "pdeloop.method.reduce.order": ("study_orders",),
+    "pdeloop.method.reduce.regression": ("study_orders",),
     "pdeloop.method.reduce.reduced_model": ("ReducedModel",),
     "pdeloop.method.settings": ("Settings", "setting"),
     "pdeloop.messages.grid": ("Axis", "Grid"),

@@ -36,8 +36,8 @@ from pdeloop.method.reduce.identifiability import (
     require_effects,
 )
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
-from pdeloop.method.reduce.order import OrderStudy, study_orders
 from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
+from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import Residuals, fit_percent, largest_pole, residuals, stability
 from pdeloop.process.one_thread import one_thread

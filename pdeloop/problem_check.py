@@ -29,7 +29,7 @@ from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.messages.parameters import INSTRUMENTS
 from pdeloop.method.adapt import Trajectory
 from pdeloop.method.laws.registry import law_kind, laws_of
-from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.regression import study_orders
 from pdeloop.unstable_modes import REACHED, controllability, named_waves, observability
 from tuner_node.build import build_training, few_sensors, remarks_on
 from tuner_node.optimizer_parameters import kind_of

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pdeloop.method.models.noise_level import contradicting_noise, rows_of, share_of_noise
+from pdeloop.method.models.noise import contradicting_noise, rows_of, share_of_noise
 from pdeloop.method.models.selection import PREDICTED
 from tuner_node.training import Training
 

@@ -32,7 +32,7 @@ from pdeloop.episode import Law, rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.finite_horizon import cost_to_go, finite_horizon_of
+from pdeloop.method.design.lqt import cost_to_go, finite_horizon_of
 
 STEPS = 20
 """Of a plan."""

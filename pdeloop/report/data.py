@@ -25,7 +25,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws.registry import law_kind, laws_of
-from pdeloop.method.reduce.order import OrderStudy, study_orders
+from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
 from pdeloop.study.results import MOST, STUDY_FILE, reading

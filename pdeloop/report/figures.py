@@ -16,7 +16,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Axis, Part
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.reduce.order import OrderStudy
+from pdeloop.method.reduce.regression import OrderStudy
 from pdeloop.report import planes
 from pdeloop.report.data import ProblemData
 from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text

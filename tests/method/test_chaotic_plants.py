@@ -15,11 +15,10 @@ from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.renewal import Renewal, renew_from_states
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.models import FieldModel, FittedModel, Measured
-from pdeloop.method.models.choice import Accuracy
+from pdeloop.method.models.base import errors
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
 from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.prediction import errors
-from pdeloop.method.models.selection import Selection
+from pdeloop.method.models.selection import Accuracy, Selection
 from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
 from tests.support.small import same_bits
 

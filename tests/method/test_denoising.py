@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models.noise_level import denoised
+from pdeloop.method.models.noise import denoised
 
 SIGMA = 0.1
 

@@ -15,7 +15,7 @@ from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.method.design.lqt import track_horizon
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.models.linear import LinearModel
 

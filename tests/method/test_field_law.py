@@ -20,11 +20,10 @@ from pdeloop.method.design.field_law import (
     linearisation_point,
     states_under,
 )
-from pdeloop.method.design.finite_horizon import finite_horizon
-from pdeloop.method.design.lqt import DesignError
+from pdeloop.method.design.lqt import DesignError, finite_horizon
 from pdeloop.method.models import affine_law
-from pdeloop.method.models.choice import Accuracy, FittedModel
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.selection import Accuracy, FittedModel
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import IdentificationSettings, ReducedModel
 from tests.support.small import FEW_FITS

@@ -15,10 +15,9 @@ from benchmarks.families import equations, plants
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured
-from pdeloop.method.models.base import Samples
-from pdeloop.method.models.choice import NEAR_RIDGES, kinds_of
+from pdeloop.method.models.base import Samples, errors
 from pdeloop.method.models.linear import fit_linear
-from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.selection import NEAR_RIDGES, kinds_of
 from tests.support.fitted import fit_field_model
 from tests.support.plants import plant_of
 

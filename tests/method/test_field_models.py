@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import read_only
 from pdeloop.method.models import Measured, affine_law
+from pdeloop.method.models.base import errors, pieces, predicted
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
     FiniteDifferenceModel,
@@ -23,7 +24,6 @@ from pdeloop.method.models.finite_difference import (
 )
 from pdeloop.method.models.finite_difference_kernels import advance
 from pdeloop.method.models.linear import LinearModel, add_products
-from pdeloop.method.models.prediction import errors, pieces, predicted
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.sweep import sweep_of
 from pdeloop.solver import polynomial as compiled

@@ -18,8 +18,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import Channels
 from pdeloop.method.reduce.identifiability import CLOSE, NotIdentifiableError, examine
-from pdeloop.method.reduce.order import study_orders
-from pdeloop.method.reduce.regression import exact_regression
+from pdeloop.method.reduce.regression import exact_regression, study_orders
 
 N_Z, N_A, STEPS = 5, 3, 120
 A = np.diag([0.9, 0.8, 0.85, 0.95, 0.7]) + 0.1 * np.eye(N_Z, k=1) - 0.05 * np.eye(N_Z, k=-2)

@@ -8,8 +8,7 @@ import pytest
 
 from pdeloop.method.models import Measured
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.projected import ProjectedModel
+from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from tests.support.fitted import fit_field_model
 
 N_Z, R, N_A = 3000, 5, 2

@@ -14,10 +14,8 @@ from pdeloop.method.models.finite_difference import (
     features_of,
     neighbour_features,
 )
-from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.linear import LinearModel, ProjectedModel, ReadingsModel
 from pdeloop.method.models.polynomial import PolynomialModel
-from pdeloop.method.models.projected import ProjectedModel
-from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import (
     Actuators,
     SensedModel,

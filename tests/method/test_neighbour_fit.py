@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.models import FieldModelSettings, finite_difference_fit
-from pdeloop.method.models.base import Samples
-from pdeloop.method.models.choice import NEAR_NEEDED, kinds_of
-from pdeloop.method.models.finite_difference_fit import fit_neighbours
-from pdeloop.method.models.prediction import errors
+from pdeloop.method.models import FieldModelSettings, finite_difference
+from pdeloop.method.models.base import Samples, errors
+from pdeloop.method.models.finite_difference import fit_neighbours
+from pdeloop.method.models.selection import NEAR_NEEDED, kinds_of
 from tests.support.fitted import fit_field_model
 from tests.support.ordinary import rolled_out
 
@@ -20,7 +19,7 @@ SETTINGS = FieldModelSettings(folds=2)
 
 @pytest.fixture(autouse=True)
 def shorter_steps(monkeypatch):
-    monkeypatch.setattr(finite_difference_fit, "_NEAR_REACH", 0.2)
+    monkeypatch.setattr(finite_difference, "_NEAR_REACH", 0.2)
 
 
 B = np.repeat(np.eye(3), 4, axis=0)
@@ -118,7 +117,7 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
 
     The layers': both values, and two products in each.
     """
-    monkeypatch.setattr(finite_difference_fit, "_NEAR_SAMPLES", 50)
+    monkeypatch.setattr(finite_difference, "_NEAR_SAMPLES", 50)
     n_z, start = components * N_X, 1.0 if rate is species else 0.0
     rollouts = explored(rate, 4, n_z, variance=variance, start=start)
     model = fit_neighbours(

@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Measured, Samples
-from pdeloop.method.models.choice import FORMS, with_clean
-from pdeloop.method.models.noise_level import smoothed
-from pdeloop.method.models.noisy_fit import filtered, fit_noisy, significant
-from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.base import Measured, Samples, errors
+from pdeloop.method.models.noise import filtered, fit_noisy, significant, smoothed
+from pdeloop.method.models.selection import FORMS, with_clean
 from pdeloop.method.models.settings import FieldModelSettings
-from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.models.spectral_fit import fit_spectral
+from pdeloop.method.models.spectral import SpectralModel, fit_spectral
 from tests.support.fitted import fit_field_model
 
 POINTS, ACTUATORS, STEPS, NOISE = 64, 4, 60, 0.2

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.regression import study_orders
 from tests.support.linear_system import linear_system, trajectory
 
 Array = np.ndarray

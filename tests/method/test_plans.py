@@ -13,7 +13,7 @@ from scipy.optimize import LinearConstraint, minimize
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.design.lqt import finite_horizon
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel

@@ -21,7 +21,7 @@ from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of, evidence_o
 from pdeloop.method.design.lqg import law_of_innovations
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.readings import ReadingsModel
+from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.reduce.subspace import subspace_model
 
 N, N_Y, N_A, T, SIGMA, ORDER = 5, 2, 2, 40, 0.1, 5

@@ -24,8 +24,8 @@ from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.method.design.lqg import noise_of
 from pdeloop.method.laws.registry import OWN_LAWS, law_kind
 from pdeloop.method.models import FieldModelSettings, Measured
-from pdeloop.method.reduce.order import study_orders
 from pdeloop.method.reduce.reduced_model import IdentificationSettings
+from pdeloop.method.reduce.regression import study_orders
 from pdeloop.method.settings import Settings, setting
 from tests.support.fitted import fit_field_model
 from tests.support.interpreter import ROOT

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.models import Measured, projected
+from pdeloop.method.models import Measured, linear
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
     Feature,
     FiniteDifferenceModel,
     features_of,
 )
-from pdeloop.method.models.projected import ProjectedModel, coarse_points
+from pdeloop.method.models.linear import ProjectedModel, coarse_points
 from tests.support.fitted import fit_field_model
 
 NY, NX, N_A = 6, 8, 2
@@ -112,7 +112,7 @@ def test_a_reacting_plate_between_walls_is_predicted(
     """Well enough to be believed, as no linear model is; every second point suffices for that."""
     believed = ModelBasedSettings().believed
     ny, nx = 12, 16
-    monkeypatch.setattr(projected, "_COARSE_POINTS", points)
+    monkeypatch.setattr(linear, "_COARSE_POINTS", points)
     found = fit_field_model(plate(ny, nx, 6), np.zeros(ny * nx), line=False, shape=(ny, nx))
     assert found is not None and found.error <= believed
     assert found.model.kind.startswith("x") and found.model.n_z == ny * nx

@@ -9,14 +9,18 @@ import pytest
 from pdeloop.method.models import (
     FieldModelSettings,
     Measured,
-    finite_difference_fit,
+    finite_difference,
 )
-from pdeloop.method.models.base import Samples
-from pdeloop.method.models.choice import SPARSE, kinds_of
+from pdeloop.method.models.base import Samples, errors
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
-from pdeloop.method.models.finite_difference_fit import chosen, fit_sparse, products
-from pdeloop.method.models.prediction import errors
+from pdeloop.method.models.finite_difference import (
+    Feature,
+    FiniteDifferenceModel,
+    chosen,
+    fit_sparse,
+    products,
+)
+from pdeloop.method.models.selection import SPARSE, kinds_of
 from tests.support.fitted import fit_field_model
 from tests.support.ordinary import rolled_out
 
@@ -25,7 +29,7 @@ SETTINGS = FieldModelSettings(folds=2)
 
 @pytest.fixture(autouse=True)
 def shorter_steps(monkeypatch):
-    monkeypatch.setattr(finite_difference_fit, "_NEAR_REACH", 0.2)
+    monkeypatch.setattr(finite_difference, "_NEAR_REACH", 0.2)
 
 
 N_Z, DT, LATE = 9, 0.1, 3

@@ -11,8 +11,7 @@ from scipy import linalg
 
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.design.finite_horizon import finite_horizon, finite_horizon_of, track_horizon
-from pdeloop.method.design.lqt import track
+from pdeloop.method.design.lqt import finite_horizon, finite_horizon_of, track, track_horizon
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
 

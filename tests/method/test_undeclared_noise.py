@@ -16,7 +16,7 @@ from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.model_rows import pack
 from pdeloop.method.models import Measured
 from pdeloop.method.models import selection as of_models
-from pdeloop.method.models.noise_level import correlations, is_white, noise_level, short_waves
+from pdeloop.method.models.noise import correlations, is_white, noise_level, short_waves
 from pdeloop.method.models.selection import Selection
 from tests.support.small import same_bits
 from tuner_node.build import build_training

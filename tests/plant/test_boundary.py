@@ -12,7 +12,7 @@ import pdeloop
 from benchmarks.backstepping import reaction_gain, transport_gain
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
-from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.method.design.lqt import track_horizon
 
 
 def test_what_is_given_at_the_end_is_carried_at_unit_speed_at_first_order() -> None:

@@ -9,7 +9,7 @@ import pytest
 import pdeloop
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.cavity import Cavity
-from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.method.design.lqt import track_horizon
 
 NU = 0.05
 

@@ -13,7 +13,7 @@ from pde_sim_node.build import build_plant
 from pdeloop.bags.verify import verify
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
-from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.method.design.lqt import track_horizon
 from tests.support.recorded_here import record_run
 from tests.support.small import FEW_FITS, SMALL, same_bits
 

@@ -15,7 +15,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
-from pdeloop.method.design.finite_horizon import finite_horizon_of, track_horizon
+from pdeloop.method.design.lqt import finite_horizon_of, track_horizon
 from pdeloop.method.laws import FeedForward, Law, Observer
 from pdeloop.method.laws.registry import laws_of
 from tests.support.small import FEW_FITS

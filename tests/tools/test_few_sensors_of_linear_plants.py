@@ -13,7 +13,7 @@ from scipy.linalg import expm
 import pdeloop
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.measured_cost import measured_cost
-from pdeloop.method.design.finite_horizon import track_horizon
+from pdeloop.method.design.lqt import track_horizon
 from pdeloop.report.data import gather
 
 pytestmark = pytest.mark.filterwarnings("ignore::pdeloop.TrainingWarning")

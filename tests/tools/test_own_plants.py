@@ -24,7 +24,7 @@ from pdeloop.cli import main
 from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.problem import load_parameters
-from pdeloop.method.models import choice as kinds
+from pdeloop.method.models import selection as kinds
 from tests.support.interpreter import ROOT, python
 from tests.support.small import FEW_FITS, same_bits
 

@@ -17,7 +17,7 @@ import pdeloop
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.colour_scale import DARK
 from pdeloop.messages.controllers import CONTROLLERS
-from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.regression import study_orders
 from pdeloop.report.dark import BACK, INK, darken
 from pdeloop.report.data import gather, of_run
 from pdeloop.report.learning import bars

@@ -11,7 +11,7 @@ import pytest
 from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.model_rows import unpack
 from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn
-from pdeloop.method.reduce.order import study_orders
+from pdeloop.method.reduce.regression import study_orders
 from tests.support.small import CHECKED, FEW_STEPS, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import Batch, BatchResult

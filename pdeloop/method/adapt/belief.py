@@ -18,7 +18,7 @@ from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models import FieldModel, Measured, affine_law
 from pdeloop.method.models.files import model_of
-from pdeloop.method.models.readings import ReadingsModel, fit_readings
+from pdeloop.method.models.linear import ReadingsModel, fit_readings
 from pdeloop.method.models.selection import Selection
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import FAR

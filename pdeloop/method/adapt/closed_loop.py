@@ -18,7 +18,7 @@ gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
 The memory of a law with an observer (`ObservedLoop`) is the prediction p of the reduced state, and its
 theta is [D K b; G F c], with columns of b and c for each step where the target moves. On a model of
 the readings (`ReplayedLoop`) it replays measured innovations: an initial field is a row [x_0, e_0, ..,
-e_{T-1}] (`pdeloop.method.models.readings`), where a rollout began, and what in it no model predicted.
+e_{T-1}] (`pdeloop.method.models.linear`), where a rollout began, and what in it no model predicted.
 Under its own law it is the rollout again.
 """
 
@@ -37,12 +37,11 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
-from pdeloop.method.design.finite_horizon import finite_horizon_of
-from pdeloop.method.design.lqt import DesignError, track_outputs
+from pdeloop.method.design.lqt import DesignError, finite_horizon_of, track_outputs
 from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models import FieldModel
-from pdeloop.method.models.readings import ReadingsModel
+from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
 LARGEST = 512

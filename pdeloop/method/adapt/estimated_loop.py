@@ -23,7 +23,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import ClosedLoop, Simulation
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.design.finite_horizon import finite_horizon
+from pdeloop.method.design.lqt import finite_horizon
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import WAVES, SensedFilter, SensedModel, coefficients_of
 from pdeloop.method.models.settings import FieldModelSettings

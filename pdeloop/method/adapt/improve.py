@@ -25,7 +25,7 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import LARGEST, ClosedLoop
 from pdeloop.method.adapt.settings import ImprovementSettings
-from pdeloop.method.design.finite_horizon import action_curvature
+from pdeloop.method.design.lqt import action_curvature
 
 _MEMORY = 40
 """Gradient differences that L-BFGS keeps."""

@@ -82,7 +82,7 @@ from pdeloop.method.laws.feedforward import FeedForward
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
-from pdeloop.method.models.noise_level import cleaned_states
+from pdeloop.method.models.noise import cleaned_states
 from pdeloop.method.seeds import field_seed
 from pdeloop.process.one_thread import one_thread
 

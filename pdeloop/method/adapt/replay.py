@@ -39,7 +39,7 @@ from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
 from pdeloop.method.design.lqt import Gains, track
 from pdeloop.method.models.base import Measured, Samples
-from pdeloop.method.models.choice import limited
+from pdeloop.method.models.selection import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
 FEWEST = 2

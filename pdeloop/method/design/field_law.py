@@ -38,8 +38,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.finite_horizon import finite_horizon, finite_horizon_of
-from pdeloop.method.design.lqt import target_gain
+from pdeloop.method.design.lqt import finite_horizon, finite_horizon_of, target_gain
 from pdeloop.method.models import (
     FieldModel,
     FieldModelSettings,
@@ -47,22 +46,21 @@ from pdeloop.method.models import (
     Measured,
     affine_law,
 )
-from pdeloop.method.models.base import Law, Samples, saturated
-from pdeloop.method.models.choice import (
+from pdeloop.method.models.base import Law, Samples, predicted, saturated, usable
+from pdeloop.method.models.base import pieces as cut
+from pdeloop.method.models.linear import LinearModel, ProjectedModel
+from pdeloop.method.models.noise import smoothed
+from pdeloop.method.models.selection import (
     UNKNOWN,
     Accuracy,
     Scale,
+    Selected,
+    Selection,
     accuracy_of,
     limited,
     scale_of,
     turns,
 )
-from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.noise_level import smoothed
-from pdeloop.method.models.prediction import pieces as cut
-from pdeloop.method.models.prediction import predicted, usable
-from pdeloop.method.models.projected import ProjectedModel
-from pdeloop.method.models.selection import Selected, Selection
 from pdeloop.method.models.settings import BETTER
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.design.finite_horizon import tracking_offsets
+from pdeloop.method.design.lqt import tracking_offsets
 from pdeloop.method.laws.base import Law, Parts, at_step
 
 

@@ -45,7 +45,7 @@ from scipy import linalg
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.finite_horizon import cost_to_go, finite_horizon_of
+from pdeloop.method.design.lqt import cost_to_go, finite_horizon_of
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 

@@ -2,8 +2,7 @@
 """Models of the whole field of a plant, identified from its rollouts."""
 
 from pdeloop.method.models.base import FieldModel, Measured, affine_law
-from pdeloop.method.models.choice import FittedModel
-from pdeloop.method.models.selection import Selection
+from pdeloop.method.models.selection import FittedModel, Selection
 from pdeloop.method.models.settings import FieldModelSettings
 
 __all__ = [

@@ -15,10 +15,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.method.models.base import Arrays, FieldModel, text_of
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel
-from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.linear import LinearModel, ProjectedModel, ReadingsModel
 from pdeloop.method.models.polynomial import PolynomialModel
-from pdeloop.method.models.projected import ProjectedModel
-from pdeloop.method.models.readings import ReadingsModel
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.spectral import SpectralModel
 

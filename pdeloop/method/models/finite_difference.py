@@ -14,13 +14,42 @@ that are no difference of any monomial, such as those of chains and rings of osc
 
 Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
 its numbers, has products of any of them.
+
+In a fit, as in `fit_spectral`, a sampling time is integrated with the current equation and bent to end
+in the measured state; the change z_{k+1} - z_k is then linear in the coefficients, each with the mean
+of its feature on the way. Coefficients are the sum of one that all points share and a part of each
+point's own, which a ridge holds at zero where the data say nothing of it.
+
+Of states that are values of cells, not fields, the features are all monomials of a few neighbours
+to begin with (`fit_neighbours`). Of states that are neither, as of networks whose parts act on each
+other in no order, there are far too many products to be fitted together: for each number those are
+chosen, one by one, that explain most of what a model linear in states and actions leaves over of
+its change, as long as each halves that (`fit_sparse`, orthogonal matching pursuit). No differential
+equation keeps what happened some samples ago, such as inputs that act late: of a state that holds
+it, the map z_{k+1} - z_k of the same terms is fitted. Three things differ in both, as such plants
+are often chaotic, so that a small error of a step is a large one of a rollout:
+
+- After two passes, others regress what the model's own steps miss. The error of the means along its
+  paths has no effect on where they end: of a plant without noise the coefficients are exact.
+- Monomials that explain nothing are then left out, one by one, as long as the residual stays what it
+  is. A simulation takes as long as there are monomials, and what is left out cannot mislead a law that
+  goes beyond the data.
+- Plants of other kinds, of which these products do not explain nearly all of a step, end the fit after
+  the first passes, which take a hundredth of the work.
+
+References
+----------
+Brunton, Proctor, Kutz, "Discovering governing equations from data by sparse identification of
+nonlinear dynamical systems", PNAS 113(15), 2016. Miller, "Subset Selection in Regression", 2nd ed.,
+Chapman & Hall 2002, chapter 3 (backward elimination). Pati, Rezaiifar, Krishnaprasad, "Orthogonal
+matching pursuit", Asilomar Conference, 1993.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import ClassVar, NamedTuple, Self
@@ -32,8 +61,11 @@ from pdeloop.messages.arrays import Array, read_only
 from pdeloop.messages.text import shown
 from pdeloop.method.models.base import (
     Arrays,
+    Samples,
     StoredModel,
     checked_substeps,
+    least_squares,
+    orthonormal,
     shaped,
     text_of,
 )
@@ -42,6 +74,11 @@ from pdeloop.method.models.finite_difference_kernels import (
     advance,
     mean_features,
     pull_back,
+)
+from pdeloop.method.models.settings import (
+    COEFFICIENT_RIDGE,
+    POINT_SAMPLES,
+    SPARSE_TERMS,
 )
 
 
@@ -207,3 +244,388 @@ class FiniteDifferenceModel(StoredModel):
 
 def _filled(numbers: Sequence[int], value: int) -> list[int]:
     return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
+
+
+_POINT_PASSES = 4
+"""How often an equation of finite differences is refitted along the paths of the last fit."""
+_POINT_SUBSTEPS = 32
+"""Maximum number of internal steps per sampling time."""
+_POINT_REACH = 2.5
+"""Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
+
+
+def largest_rate(order: int) -> float:
+    """The largest rate of a difference on a unit grid; order: 0, 1, 2, and on as of the model."""
+    return 4.0 if order and order % 2 == 0 else 1.0
+
+
+def fit_finite_difference(
+    samples: Samples,
+    *,
+    kind: str,
+    components: int = 1,
+    ridge: float | None = None,
+    shape: tuple[int, ...] = (),
+) -> FiniteDifferenceModel | None:
+    """The equation, or None where half of the samples overflow the first ones.
+
+    ridge: of the points' own parts in normalised columns; None: they have none; shape: points of each
+    axis, where there are several.
+    """
+    samples = samples.thinned(POINT_SAMPLES)
+    features = features_of(components, len(shape) or 1)
+    size = largest_of(samples)
+    model, fitted = nothing(kind, features, samples, components, shape), None
+    for _ in range(_POINT_PASSES):
+        data = Regression.along(model, samples)
+        if data is None:
+            break
+        found = data.solved(coefficients(data.columns(), ridge), model)
+        if found is None:
+            break
+        substeps = substeps_of(found, size, _POINT_REACH)
+        model = fitted = replace(found, substeps=substeps)
+    return fitted
+
+
+def nothing(
+    kind: str,
+    features: tuple[Feature, ...],
+    samples: Samples,
+    components: int,
+    shape: tuple[int, ...] = (),
+) -> FiniteDifferenceModel:
+    """The equation of which nothing is known: a field stays as it is."""
+    n_z, n_a = samples.before.shape[1], samples.actions.shape[1]
+    C = np.zeros((len(features), components, n_z // components))
+    return FiniteDifferenceModel(kind, features, C, np.zeros((n_z, n_a)), np.zeros(n_z), 8, shape)
+
+
+def largest_of(samples: Samples) -> float:
+    """The size of a field, for which internal steps are counted."""
+    return float(np.quantile(np.abs(samples.before).max(axis=1), 0.9))
+
+
+def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
+    """Enough internal steps for a field of that size, of `reach` over its fastest rate each.
+
+    None for a map.
+    """
+    if not model.substeps:
+        return 0
+    growth = np.array(
+        [len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j, _ in model.features]
+    )
+    rate = float((np.abs(model.coefficients) * growth[:, None, None]).sum(axis=0).max())
+    return int(np.clip(np.ceil(rate / reach), 2, _POINT_SUBSTEPS))
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The normal equations of each point, free of the inputs, in columns X with a sum of squares of 1.
+
+    Attributes
+    ----------
+    gram, moment : (n_x, F, F) and (n_x, F, components) arrays
+        X^T X and X^T y.
+    square : float
+        The sum of y^2 over all points.
+    scale : (F,) array
+        By which the columns were divided.
+    """
+
+    gram: Array
+    moment: Array
+    square: float
+    scale: Array
+
+    def unexplained(self, C: Array) -> float:
+        """The share of the sum of y^2 that coefficients (n_x, F, components) do not explain."""
+        if not self.square > 0.0:
+            return 0.0
+        c = C * self.scale[:, None]
+        rest = self.square - float(np.sum(c * (2.0 * self.moment - self.gram @ c)))
+        return max(rest, 0.0) / self.square
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """What a pass regresses.
+
+    Attributes
+    ----------
+    X : (n_x, N, F) array
+        Means of the features, weighted.
+    y : (n_x, N, components) array
+        The change to be explained.
+    common : (N, n_a + 1) array
+        The inputs and 1.
+    miss : float
+        Root of the mean square of what the steps of the model missed.
+    """
+
+    X: Array
+    y: Array
+    common: Array
+    miss: float
+
+    @classmethod
+    def along(
+        cls, model: FiniteDifferenceModel, samples: Samples, *, missed: bool = False
+    ) -> Regression | None:
+        """That of the model's paths, or None where half of the samples overflow it.
+
+        missed: explain what the model's own steps miss, apart from what it explains already. Where it
+        is best, an error of the means then has no effect on it.
+        """
+        components, n_x = model.coefficients.shape[1:]
+        root = samples.weights()
+        means, miss = model.means(samples.before, samples.actions, samples.after)
+        ok = np.isfinite(means).all(axis=(1, 2)) & np.isfinite(miss).all(axis=1)
+        if 2 * ok.sum() < len(samples):
+            return None
+        means, miss, actions, root = means[ok], miss[ok], samples.actions[ok], root[ok]
+        if missed:
+            own = np.einsum("nfx,fcx->ncx", means, model.coefficients).reshape(miss.shape)
+            change = (miss + own + actions @ model.B.T + model.constant) * root[:, None]
+        else:
+            change = (samples.after - samples.before)[ok] * root[:, None]
+        return cls(
+            (means * root[:, None, None]).transpose(2, 0, 1),
+            change.reshape(-1, components, n_x).transpose(2, 0, 1),
+            np.hstack([actions, np.ones((len(actions), 1))]) * root[:, None],
+            float(np.sqrt(np.mean((miss * root[:, None]) ** 2))),
+        )
+
+    def columns(self) -> Columns:
+        """The normal equations without the inputs."""
+        basis = orthonormal(self.common)
+        X, y = (values - basis @ (basis.T @ values) for values in (self.X, self.y))
+        scale = np.sqrt(np.sum(X**2, axis=(0, 1)))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        X = X / scale
+        transposed = X.transpose(0, 2, 1)
+        return Columns(transposed @ X, transposed @ y, float(np.sum(y**2)), scale)
+
+    def solved(self, C: Array, model: FiniteDifferenceModel) -> FiniteDifferenceModel | None:
+        """The equation with coefficients (n_x, F, components); None where it is not finite."""
+        n_x, _, components = self.y.shape
+        left = (self.y - self.X @ C).transpose(1, 0, 2).reshape(len(self.common), -1)
+        inputs = least_squares(self.common, left)
+        if not (np.isfinite(C).all() and np.isfinite(inputs).all()):
+            return None
+        inputs = inputs.reshape(-1, n_x, components).transpose(2, 1, 0).reshape(model.n_z, -1)
+        return replace(
+            model,
+            coefficients=np.ascontiguousarray(C.transpose(1, 2, 0)),
+            B=np.ascontiguousarray(inputs[:, :-1]),
+            constant=np.ascontiguousarray(inputs[:, -1]),
+        )
+
+
+def coefficients(columns: Columns, ridge: float | None) -> Array:
+    """Coefficients of every point, (n_x, F, components)."""
+    gram, moment, scale = columns.gram, columns.moment, columns.scale
+    eye = np.eye(len(scale))
+    shared = np.linalg.solve(gram.sum(axis=0) + COEFFICIENT_RIDGE * eye, moment.sum(axis=0))
+    found = np.broadcast_to(shared, moment.shape)
+    if ridge is not None:
+        own = np.linalg.solve(gram + ridge / len(gram) * eye, moment - gram @ shared)
+        found = found + own
+    every: Array = found / scale[:, None]
+    return every
+
+
+_NEAR_SAMPLES = 400
+"""Maximum number of data steps in a fit of products."""
+_NEAR_REACH = 0.5
+"""Fastest rate of such a model times its internal step."""
+_NEAR_SCREENED = 0.1
+"""Share of the change that may be unexplained along straight paths between samples."""
+_NEAR_HOPELESS = 0.05
+"""Share of the change that may be unexplained along the paths of the first fit."""
+_NEAR_SUBSTEPS = 8
+"""Maximum number of internal steps of the paths of a fit."""
+_NEAR_PASSES = 8
+"""Further passes of a model of neighbours, on what its steps miss."""
+_NEAR_SETTLED = 0.1
+"""Relative change of what its steps miss at which the passes end."""
+_NEAR_DROPPED = 0.5
+"""Share by which its residual may grow when products are left out."""
+_NEAR_NEGLIGIBLE = 1e-12
+"""Squared error that counts as none, as a share of the squared change."""
+
+
+def fit_neighbours(
+    samples: Samples,
+    *,
+    kind: str,
+    components: int = 1,
+    ridge: float | None = None,
+) -> FiniteDifferenceModel | None:
+    """The equation, or None where the plant is of another kind.
+
+    Of several components second neighbours, with half as many terms again, are tried where the first
+    ones do not describe the plant.
+
+    ridge: of the points' own parts in normalised columns; None: all points share their coefficients.
+    """
+    samples = samples.thinned(_NEAR_SAMPLES)
+    for reach in (1, 2) if components > 1 else (2,):
+        features = neighbour_features(components, reach)
+        empty = replace(nothing(kind, features, samples, components), substeps=1)
+        found = fitted(empty, samples, ridge)
+        if found is not None:
+            return found
+    return None
+
+
+def fitted(
+    model: FiniteDifferenceModel,
+    samples: Samples,
+    ridge: float | None,
+) -> FiniteDifferenceModel | None:
+    """The equation of the terms of an empty one, which has substeps of its own then, or None."""
+    size = largest_of(samples)
+    for most in (_NEAR_SCREENED, _NEAR_HOPELESS):
+        data = Regression.along(model, samples)
+        if data is None:
+            return None
+        columns = data.columns()
+        C = coefficients(columns, ridge)
+        found = data.solved(C, model)
+        if found is None or not columns.unexplained(C) <= most**2:
+            return None  # the plant is of another kind
+        # Means that are roughly right are enough for what follows.
+        substeps = substeps_of(found, size, _NEAR_REACH)
+        model = replace(found, substeps=min(substeps, _NEAR_SUBSTEPS))
+    every = _passes(model, samples, ridge)
+    if every is None:
+        return None
+    missed = Regression.along(every, samples, missed=True)
+    if missed is None:
+        return every
+    kept = explaining(missed.columns(), ridge is None)
+    fewer = replace(
+        every,
+        features=tuple(every.features[f] for f in kept),
+        coefficients=np.ascontiguousarray(every.coefficients[kept]),
+    )
+    return _passes(fewer, samples, ridge) or every
+
+
+def _passes(
+    model: FiniteDifferenceModel,
+    samples: Samples,
+    ridge: float | None,
+) -> FiniteDifferenceModel | None:
+    """The best equation of passes that regress what steps miss."""
+    size = largest_of(samples)
+    best, least = None, np.inf
+    for _ in range(_NEAR_PASSES + 1):
+        data = Regression.along(model, samples, missed=True)
+        if data is None or not data.miss < least:
+            break
+        settled = data.miss > (1.0 - _NEAR_SETTLED) * least
+        best, least = model, data.miss
+        if settled:
+            break
+        found = data.solved(coefficients(data.columns(), ridge), model)
+        if found is None:
+            break
+        substeps = substeps_of(found, size, _NEAR_REACH)
+        model = replace(found, substeps=substeps)
+    return best
+
+
+def explaining(columns: Columns, shared: bool) -> list[int]:
+    """The features without which the residual is clearly larger, left out one by one."""
+    gram, moment = columns.gram, columns.moment
+    if shared:
+        gram, moment = gram.sum(axis=0)[None], moment.sum(axis=0)[None]
+    size = COEFFICIENT_RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None]
+    inverse = np.linalg.inv(gram + size * np.eye(gram.shape[1]))
+    w = inverse @ moment
+    residual = max(columns.square - float(np.sum(moment * w)), 0.0)
+    most = _NEAR_DROPPED * residual + _NEAR_NEGLIGIBLE * columns.square
+    kept = list(range(gram.shape[1]))
+    lost = 0.0
+    while len(kept) > 1:
+        diagonal = np.diagonal(inverse, axis1=1, axis2=2)
+        own = np.sum(np.sum(w**2, axis=2) / diagonal, axis=0)
+        f = int(np.argmin(own))
+        if lost + own[f] > most:
+            break
+        lost += float(own[f])
+        ratio = inverse[:, :, f] / diagonal[:, f, None]
+        w = np.delete(w - ratio[:, :, None] * w[:, f, None, :], f, axis=1)
+        inverse = inverse - ratio[:, :, None] * inverse[:, f, None, :]
+        inverse = np.delete(np.delete(inverse, f, axis=1), f, axis=2)
+        del kept[f]
+    return kept
+
+
+_SPARSE_PRODUCTS = 2500
+"""Number of products above which products of three different numbers are not tried."""
+_SPARSE_LEFT = 0.5
+"""Share of the remaining squared change that another product may leave."""
+
+Product = tuple[int, ...]
+"""The numbers of a state that are multiplied."""
+_ROUNDING = 1e-7
+"""Size of what a linear model leaves over of a product that is one itself, relative to the product."""
+
+
+def fit_sparse(samples: Samples, *, kind: str, is_map: bool) -> FiniteDifferenceModel | None:
+    """The equation or the map, or None where no product is found, or the plant is of another kind."""
+    samples = samples.thinned(_NEAR_SAMPLES)
+    found = chosen(samples)
+    if not found:
+        return None
+    n_z = samples.before.shape[1]
+    features = tuple(Feature(factors) for factors in [*((i,) for i in range(n_z)), *found])
+    empty = nothing(kind, features, samples, n_z)
+    return fitted(replace(empty, substeps=0 if is_map else 1), samples, None)
+
+
+def products(n_z: int, most: int) -> list[Product]:
+    """Those of two numbers and of three, or if they are more than `most`, of three with a square."""
+    two: list[Product] = list(combinations_with_replacement(range(n_z), 2))
+    three: list[Product] = list(combinations_with_replacement(range(n_z), 3))
+    if len(two) + len(three) > most:
+        three = [own for own in three if len(set(own)) < 3]
+    return two + three
+
+
+def chosen(samples: Samples) -> list[Product]:
+    """The products that some number's change is explained by, in the order of `products`."""
+    candidates = products(samples.before.shape[1], _SPARSE_PRODUCTS)
+    size = np.sqrt(np.mean(samples.before**2, axis=0))
+    z = samples.before / np.where(size > 0.0, size, 1.0)
+    root = samples.weights()[:, None]
+    linear = orthonormal(np.hstack([np.ones((len(z), 1)), z, samples.actions]) * root)
+    X = np.stack([np.prod(z[:, own], axis=1) for own in candidates], axis=1) * root
+    before = np.linalg.norm(X, axis=0)
+    X, y = (
+        values - linear @ (linear.T @ values)
+        for values in (X, (samples.after - samples.before) * root)
+    )
+    left = np.linalg.norm(X, axis=0)
+    X = X / np.where(left > _ROUNDING * before, left, np.inf)
+    found = {p for change in y.T for p in _pursued(X, change)}
+    return [candidates[p] for p in sorted(found)]
+
+
+def _pursued(X: Array, y: Array) -> list[int]:
+    """The columns of X, each of length 1 or 0, that explain y."""
+    kept: list[int] = []
+    rest = y
+    while len(kept) < SPARSE_TERMS:
+        likely = int(np.argmax(np.abs(rest @ X)))
+        together = X[:, [*kept, likely]]
+        left = y - together @ np.linalg.lstsq(together, y)[0]
+        if likely in kept or not left @ left < _SPARSE_LEFT * (rest @ rest):
+            break
+        kept.append(likely)
+        rest = left
+    return kept

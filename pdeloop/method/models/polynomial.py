@@ -29,9 +29,17 @@ from scipy import linalg
 
 from pdeloop.jit.cache import cached_njit
 from pdeloop.messages.arrays import Array, read_only
-from pdeloop.method.models.base import Arrays, Measured, Samples, StoredModel
+from pdeloop.method.models.base import (
+    Arrays,
+    Measured,
+    Samples,
+    StoredModel,
+    errors,
+    pieces,
+    predicted,
+    usable,
+)
 from pdeloop.method.models.linear import add_products
-from pdeloop.method.models.prediction import errors, pieces, predicted, usable
 from pdeloop.method.reduce.reduced_model import turns
 
 LARGEST_STATE = 256

@@ -53,8 +53,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Arrays, numbers_of, shaped
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
-from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.models.spectral_fit import ORDERS, fewer_of, substeps_of
+from pdeloop.method.models.spectral import ORDERS, SpectralModel, fewer_of, substeps_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 
 FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
