@@ -19,7 +19,7 @@ from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.spectral import SpectralModel
-from pdeloop.method.models.sweep import ModelSweep, SpectralSweep
+from pdeloop.method.models.sweep import SpectralSweep, Sweep
 
 N_Z, N_A, T = 16, 2, 30
 
@@ -99,7 +99,7 @@ def test_a_spectral_model_is_compiled_and_gives_what_its_steps_give() -> None:
     model, rng = spectral(), np.random.default_rng(4)
     own, other = planner(model), planner(model)
     assert isinstance(own._sweep, SpectralSweep)
-    other.__dict__["_sweep"] = ModelSweep(model, other.action_set, np.zeros((0, N_A)))
+    other.__dict__["_sweep"] = Sweep(model, other.action_set, np.zeros((0, N_A)))
     z, v = rng.standard_normal((2, N_Z)), rng.standard_normal((2, 12, N_A))
     for found, expected in zip(own.gradient(v, z, 3), other.gradient(v, z, 3), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)

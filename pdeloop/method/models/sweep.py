@@ -30,7 +30,6 @@ static law of a larger plant).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -45,14 +44,20 @@ MOST_TAPE = 2**27
 """Bytes of the tapes of all threads; a simulation that needs more for one is not compiled."""
 
 
-class Sweep(Protocol):
-    """A model under a feedback; n_p = len(B) numbers of memory."""
+class Sweep:
+    """A model under a feedback, step by step, all rows together; n_p = len(B) numbers of memory."""
+
+    def __init__(self, model: FieldModel, action_set: ActionSet, B: Array) -> None:
+        self._model, self._set, self._B = model, action_set, B
+        self._states = self._actions = np.empty((0, 0, 0))
+        self._before = action_set.start
 
     def each(self, count: int, work: Callable[[Sweep, slice], None]) -> None:
         """Call `work` with the rows that go together, until all of `count` are done.
 
         And with what rolls them: `roll_back` is of its last `roll`.
         """
+        work(self, slice(0, count))
 
     def roll(
         self,
@@ -70,71 +75,6 @@ class Sweep(Protocol):
         b (n_a + n_p,); e (M, H, n_z) or None; kept: whether `roll_back` will follow. What is not finite
         is NaN or infinite from then on.
         """
-
-    def roll_back(
-        self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
-    ) -> Array:
-        """Derivatives (M, H, n_a + n_p) by v.
-
-        requested: r, or what counts in its place for P', (M, H, n_a); on_states (M, H, n_z + n_p);
-        on_actions (M, H, n_a); eta (M, n_z + n_p): by the last states.
-        """
-
-
-def sweep_of(
-    model: FieldModel, action_set: ActionSet, horizon: int, B: Array | None = None
-) -> Sweep:
-    """Compiled where the model is a spectral one, each row by itself; else step by step.
-
-    horizon: most steps; B (n_p, n_a), or None: there is no memory.
-    """
-    B = np.zeros((0, model.n_a)) if B is None else B
-    separate = not (action_set.zero_mean or action_set.rated)
-    if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
-        plan = model.compiled.plan
-        tape = 64 * int(plan["steps"]) * int(plan["fine"]["m"]) * max(horizon, 1)
-        if tape <= MOST_TAPE:
-            return SpectralSweep(model, action_set, max(horizon, 1), B, MOST_TAPE // tape)
-    return ModelSweep(model, action_set, B)
-
-
-def rolled(
-    sweep: Sweep, n_a: int, start: Array, v: Array, K: Array, b: Array, e: Array | None = None
-) -> tuple[Array, Array, Array]:
-    """`Sweep.roll` of any number of rows, which no `roll_back` follows."""
-    M, H, _ = v.shape
-    states, requested, a = np.empty((M, H + 1, len(K.T))), np.empty(v.shape), np.empty((M, H, n_a))
-
-    def work(own: Sweep, rows: slice) -> None:
-        with np.errstate(all="ignore"):  # it holds for a thread
-            given = start[rows], v[rows], K, b, None if e is None else e[rows]
-            states[rows], requested[rows], a[rows] = own.roll(*given, kept=False)
-
-    sweep.each(M, work)
-    return states, requested, a
-
-
-class ModelSweep:
-    """Of any model, step by step, all rows together."""
-
-    def __init__(self, model: FieldModel, action_set: ActionSet, B: Array) -> None:
-        self._model, self._set, self._B = model, action_set, B
-        self._states = self._actions = np.empty((0, 0, 0))
-        self._before = action_set.start
-
-    def each(self, count: int, work: Callable[[Sweep, slice], None]) -> None:
-        work(self, slice(0, count))
-
-    def roll(
-        self,
-        start: Array,
-        v: Array,
-        K: Array,
-        b: Array,
-        e: Array | None = None,
-        *,
-        kept: bool = True,
-    ) -> tuple[Array, Array, Array]:
         (M, H, _), n_a, n_z = v.shape, self._B.shape[1], self._model.n_z
         states, requested = np.empty((M, H + 1, len(K.T))), np.empty(v.shape)
         actions, lost = np.empty((M, H, n_a)), np.full(M, H + 1)
@@ -159,6 +99,11 @@ class ModelSweep:
     def roll_back(
         self, requested: Array, on_states: Array, on_actions: Array, K: Array, eta: Array
     ) -> Array:
+        """Derivatives (M, H, n_a + n_p) by v.
+
+        requested: r, or what counts in its place for P', (M, H, n_a); on_states (M, H, n_z + n_p);
+        on_actions (M, H, n_a); eta (M, n_z + n_p): by the last states.
+        """
         n_a, n_z = self._B.shape[1], self._model.n_z
         found, later = np.empty((*on_actions.shape[:2], len(K))), np.zeros(n_a)
         for k in reversed(range(found.shape[1])):
@@ -180,17 +125,17 @@ class ModelSweep:
         return found
 
 
-class SpectralSweep:
+class SpectralSweep(Sweep):
     """Of a spectral model, compiled, row by row, in the threads of the solver: so many at most."""
 
     def __init__(
         self, model: SpectralModel, action_set: ActionSet, horizon: int, B: Array, threads: int
     ) -> None:
+        super().__init__(model, action_set, B)
         self._made = model, action_set, horizon, B, 1
         self._threads = threads
         self._compiled = PolynomialSweep(model.steps, model.fewer[:, 0], horizon)
         self._others = list[SpectralSweep]()
-        self._B = B
         self._bounds = np.stack(
             [np.broadcast_to(x, model.n_a) for x in (action_set.low, action_set.high)]
         )
@@ -232,3 +177,36 @@ class SpectralSweep:
         free = ((requested >= self._bounds[0]) & (requested <= self._bounds[1])).astype(np.float64)
         given = free[0], on_states[0], on_actions[0], K, eta[0]
         return self._compiled.roll_back(*given, B=self._B)[None]
+
+
+def sweep_of(
+    model: FieldModel, action_set: ActionSet, horizon: int, B: Array | None = None
+) -> Sweep:
+    """Compiled where the model is a spectral one, each row by itself; else step by step.
+
+    horizon: most steps; B (n_p, n_a), or None: there is no memory.
+    """
+    B = np.zeros((0, model.n_a)) if B is None else B
+    separate = not (action_set.zero_mean or action_set.rated)
+    if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:
+        plan = model.compiled.plan
+        tape = 64 * int(plan["steps"]) * int(plan["fine"]["m"]) * max(horizon, 1)
+        if tape <= MOST_TAPE:
+            return SpectralSweep(model, action_set, max(horizon, 1), B, MOST_TAPE // tape)
+    return Sweep(model, action_set, B)
+
+
+def rolled(
+    sweep: Sweep, n_a: int, start: Array, v: Array, K: Array, b: Array, e: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """`Sweep.roll` of any number of rows, which no `roll_back` follows."""
+    M, H, _ = v.shape
+    states, requested, a = np.empty((M, H + 1, len(K.T))), np.empty(v.shape), np.empty((M, H, n_a))
+
+    def work(own: Sweep, rows: slice) -> None:
+        with np.errstate(all="ignore"):  # it holds for a thread
+            given = start[rows], v[rows], K, b, None if e is None else e[rows]
+            states[rows], requested[rows], a[rows] = own.roll(*given, kept=False)
+
+    sweep.each(M, work)
+    return states, requested, a
