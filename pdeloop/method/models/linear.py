@@ -42,7 +42,7 @@ from pdeloop.method.models.base import Arrays, FieldModel, Samples, StoredModel,
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, fit_finite_difference
 from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 from pdeloop.method.reduce.reduced_model import Trajectory
-from pdeloop.method.reduce.subspace import InnovationModel, likeliest_start, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,15 +103,20 @@ def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | No
     columns = columns - mean
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale[:n_z] = np.sqrt(np.mean(scale[:n_z] ** 2))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    columns = columns / scale
-    gram = columns.T @ columns / len(samples) + ridge * np.eye(len(scale))
-    moment = columns.T @ (change - moved) / len(samples)
-    found = np.linalg.solve(gram, moment) / scale[:, None]
+    found = _ridged(columns, change - moved, scale, ridge)
     if not np.isfinite(found).all():
         return None
     A, B, constant = np.eye(n_z) + found[:n_z].T, found[n_z:].T, moved - mean @ found
     return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))
+
+
+def _ridged(columns: Array, values: Array, scale: Array, ridge: float) -> Array:
+    """The coefficients of columns, divided by their scales, that explain values best."""
+    scale = np.where(scale > 0.0, scale, 1.0)
+    columns = columns / scale
+    gram = columns.T @ columns / len(columns) + ridge * np.eye(len(scale))
+    found: Array = np.linalg.solve(gram, columns.T @ values / len(columns)) / scale[:, None]
+    return found
 
 
 def fit_convolution(
@@ -249,11 +254,7 @@ def fit_low_rank(samples: Samples, *, kind: str, most: int) -> ProjectedModel | 
     V = np.linalg.qr(few.T @ mixtures[:, : min(kept, largest)])[0]
     x, after = samples.before @ V, samples.after @ V
     columns = np.hstack([x, samples.actions, np.ones((len(x), 1))])
-    scale = np.sqrt(np.mean(columns**2, axis=0))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    columns = columns / scale
-    gram = columns.T @ columns / len(x) + _LOW_RANK_RIDGE * np.eye(len(scale))
-    found = np.linalg.solve(gram, columns.T @ after / len(x)) / scale[:, None]
+    found = _ridged(columns, after, np.sqrt(np.mean(columns**2, axis=0)), _LOW_RANK_RIDGE)
     if not np.isfinite(found).all():
         return None
     r = V.shape[1]
@@ -348,15 +349,8 @@ class ReadingsModel(LinearModel):
 
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""
-        v = readings[: len(actions)] @ self.U
-        first = likeliest_start(
-            self.A, self.B, self.C, self.G, self.innovations, v[:FOREMOST], actions
-        )
-        x, e = first, np.empty_like(v)
-        for k in range(len(v)):
-            e[k] = v[k] - self.C @ x
-            x = self.A @ x + self.B @ actions[k] + self.G @ e[k]
-        return first, e
+        own = InnovationModel(self.A, self.B, self.C, self.G, self.U, self.innovations, past=0)
+        return own.replay(readings[: len(actions)] @ self.U, actions, FOREMOST)
 
     def foreseen(self, first: Array, actions: Array) -> Array:
         """U^T y_k (L, r) from x_0, without innovations."""

@@ -267,7 +267,7 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
     for j in range(n_a):
         if j in still:
             continue
-        weights, left = _explained(unit[:, own], unit[:, j])
+        weights, left = explained(unit[:, own], unit[:, j])
         if not _rounding(left, y[:, j], sizes[j]):
             own.append(j)
             continue
@@ -291,7 +291,7 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
     fed: dict[int, None] = {}
     for place, j in enumerate(own):
         others = [i for i in range(len(own)) if i != place]
-        weights, rest_of_it = _explained(left[:, others], left[:, place])
+        weights, rest_of_it = explained(left[:, others], left[:, place])
         independence[j] = linalg.norm(rest_of_it)
         if _rounding(rest_of_it, y[:, j], sizes[j]):
             shares = np.abs(weights) * linalg.norm(left[:, others], axis=0)
@@ -301,12 +301,12 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
     return independence, faults
 
 
-def _explained(columns: Array, column: Array) -> tuple[Array, Array]:
-    """Weights of the columns that explain another one best, and its residual."""
+def explained(columns: Array, values: Array) -> tuple[Array, Array]:
+    """Weights of the columns that explain other ones best, by least squares, and what is left."""
     if not columns.shape[1]:
-        return np.empty(0), column
-    weights = linalg.lstsq(columns, column)[0]
-    return weights, column - columns @ weights
+        return np.empty(0), values
+    weights = linalg.lstsq(columns, values)[0]
+    return weights, values - columns @ weights
 
 
 def _state_basis(z: Array, s: Array, drift: bool, n_a: int) -> Array:

@@ -35,7 +35,7 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
-from pdeloop.method.reduce.reduced_model import Trajectory, repeated
+from pdeloop.method.reduce.reduced_model import Trajectory, distinct
 from pdeloop.process.one_thread import one_thread
 
 EARLIEST, LATEST = -10, 10
@@ -160,12 +160,7 @@ def study_delays(
     used : tuple of int
         The delay of each input that others are compared with; 0 by default.
     """
-    copies = repeated(trajectories)
-    known = [
-        (np.asarray(z, np.float64), np.asarray(a, np.float64))
-        for number, (z, a) in enumerate(trajectories)
-        if number not in copies
-    ]
+    known = distinct(trajectories)
     n_a = known[0][1].shape[1]
     used = used or (0,) * n_a
     longest = max(len(a) for _, a in known)

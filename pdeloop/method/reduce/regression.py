@@ -54,6 +54,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.channels import NUMBERED, Channels, cut_off, scaled
 from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
 from pdeloop.method.reduce.reduced_model import (
@@ -170,7 +171,7 @@ def needs_constant(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], n_s: int
         if n < 1:
             return False
         without, with_it = (
-            float(np.sum(_missed(fit(data, U[:, :n], constant), held) ** 2))
+            float(np.sum(residuals(fit(data, U[:, :n], constant), held) ** 2))
             for constant in (False, True)
         )
         rounding = ROUNDED * float(np.sum(held.after**2))
@@ -190,10 +191,11 @@ def has_offset(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> bool:
     return bool(n > 0 and steps * d @ d > NEGLIGIBLE * np.sum(data.after**2))
 
 
-def _missed(model: ReducedModel, data: Steps) -> Array:
-    """Residuals of single steps in reduced coordinates."""
-    once = data.before @ model.U @ model.A.T + data.inputs @ model.B.T + model.d
-    return data.after @ model.U - once
+def residuals(model: ReducedModel | ModelRows, data: Steps) -> Array:
+    """s_{k+1} - A s_k - B a_k - d of single steps in reduced coordinates, a row each."""
+    s, after = data.before @ model.U, data.after @ model.U
+    found: Array = after - s @ model.A.T - data.inputs @ model.B.T
+    return found if model.d is None else found - model.d
 
 
 def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
@@ -231,25 +233,10 @@ def truncated_dmdc(
     n_s: int,
     channels: Channels = NUMBERED,
 ) -> ReducedModel:
-    """Identify a reduced model from trajectories of one plant, whose steps are pooled.
+    """Identify a reduced model by the paper's method; parameters and errors as for `exact_regression`.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
-    p : int
-        Directions of [Z; Y] that are kept, n_s <= p <= min(n_z + n_a, N). Too small loses the
-        effect of the actuators; too large fits noise.
-    n_s : int
-        Modes of the reduced state.
-    channels : Channels
-        Names of states and inputs in error messages.
-
-    Raises
-    ------
-    ValueError
-        Shapes that do not fit, NaN or infinity, more directions asked for than the trajectories
-        hold, or inputs whose effects cannot be told apart.
+    p: directions of [Z; Y] that are kept, n_s <= p <= min(n_z + n_a, N); ValueError for more than the
+    trajectories hold. Too small loses the effect of the actuators; too large fits noise.
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape

@@ -41,7 +41,7 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels
-from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
+from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps, explained
 from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
@@ -110,6 +110,32 @@ class InnovationModel:
     error: float = np.nan
     d: Array | None = None
     tried: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def drift(self) -> Array:
+        """d, or zeros."""
+        return np.zeros(len(self.A)) if self.d is None else self.d
+
+    def replay(self, v: Array, actions: Array, foremost: int) -> tuple[Array, Array]:
+        """The likeliest x_0 (n,) of measurements v_k = U^T z_k (m, r), and their innovations (m, r).
+
+        x_0 ~ N(0, I), as states are scaled, of the foremost measurements.
+        """
+        L = linalg.cholesky(self.innovations, lower=True)
+        x, moved = np.zeros(len(self.A)), np.eye(len(self.A))
+        rows, wanted = [np.eye(len(self.A))], [np.zeros(len(self.A))]
+        for measured, a in zip(v[:foremost], actions, strict=False):
+            rows.append(linalg.solve_triangular(L, self.C @ moved, lower=True))
+            wanted.append(linalg.solve_triangular(L, measured - self.C @ x, lower=True))
+            x = self.A @ x + self.B @ a + self.G @ (measured - self.C @ x) + self.drift
+            moved = self.A @ moved - self.G @ (self.C @ moved)
+        first: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
+        x, e = first, np.empty_like(v)
+        for k, measured in enumerate(v):
+            e[k] = measured - self.C @ x
+            if k < len(actions):
+                x = self.A @ x + self.B @ actions[k] + self.G @ e[k] + self.drift
+        return first, e
 
 
 def subspace_model(
@@ -270,29 +296,6 @@ def _relative(wrong: Array, moved: Array) -> Array:
     return found
 
 
-def likeliest_start(
-    A: Array,
-    B: Array,
-    C: Array,
-    G: Array,
-    innovations: Array,
-    v: Array,
-    actions: Array,
-    d: Array | float = 0.0,
-) -> Array:
-    """The likeliest x_0 ~ N(0, I), as states are scaled, of measurements v_k = U^T z_k (m, r)."""
-    L = linalg.cholesky(innovations, lower=True)
-    x, moved = np.zeros(len(A)), np.eye(len(A))
-    rows, wanted = [np.eye(len(A))], [np.zeros(len(A))]
-    for measured, a in zip(v, actions, strict=False):
-        rows.append(linalg.solve_triangular(L, C @ moved, lower=True))
-        wanted.append(linalg.solve_triangular(L, measured - C @ x, lower=True))
-        x = A @ x + B @ a + G @ (measured - C @ x) + d
-        moved = A @ moved - G @ (C @ moved)
-    found: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
-    return found
-
-
 def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
     """At least as many as there are folds, of one trajectory its quarters."""
     return list(known) if len(known) >= FOLDS else pieces(known, FOLDS)
@@ -307,18 +310,12 @@ def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     begin = min(max(PASTS), len(a) // 2)
     y = z @ model.U
     outside = z - y @ model.U.T
-    d = 0.0 if model.d is None else model.d
-    x = likeliest_start(
-        model.A, model.B, model.C, model.G, model.innovations, y[: max(begin, 1)], a, d
-    )
+    _, e = model.replay(y, a, max(begin, 1))
     wrong = moved = 0.0
-    for k in range(len(a)):
-        x = model.A @ x + model.B @ a[k] + model.G @ (y[k] - model.C @ x) + d
-        if k >= begin:
-            e = y[k + 1] - model.C @ x
-            wrong += float(e @ e) + float(outside[k + 1] @ outside[k + 1])
-            change = z[k + 1] - z[k]
-            moved += float(change @ change)
+    for k in range(begin + 1, len(z)):
+        wrong += float(e[k] @ e[k]) + float(outside[k] @ outside[k])
+        change = z[k] - z[k - 1]
+        moved += float(change @ change)
     return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
 
 
@@ -334,8 +331,8 @@ def free_errors(model: InnovationModel, z: Array, a: Array, units: Array) -> Arr
     (2, 2), each number of z in units of its own. Errors begin with the x_0 of least squares, and are
     divided by the share of the numbers that it leaves free.
     """
-    d = np.zeros(len(model.A)) if model.d is None else model.d
-    v, C, inputs = z @ model.U, model.U @ model.C / units[:, None], a @ model.B.T + d
+    v, C = z @ model.U, model.U @ model.C / units[:, None]
+    inputs = a @ model.B.T + model.drift
     seen = z / units
     wrong = [
         _from_any_start(A, C, own, seen)
@@ -463,12 +460,14 @@ def _fitted(
     kept = states.shape[1]
     # What begins or ends away from the mean drifts on average, so the means are not enough.
     one = np.ones((len(y), int(constant)))
-    C, e = _regressed(np.hstack([states, one]), y)
+    C, e = explained(np.hstack([states, one]), y)
+    C = C.T
     before, next_ = states[~last], states[1:][~last[:-1]]
     inputs = predictor.inputs
     if check:
         examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
-    joint, w = _regressed(np.hstack([before, inputs, one[: len(next_)]]), next_)
+    joint, w = explained(np.hstack([before, inputs, one[: len(next_)]]), next_)
+    joint = joint.T
     A, B, d = joint[:, :kept], joint[:, kept : kept + inputs.shape[1]], None
     if constant:
         C, shift = C[:, :kept], linalg.pinv(C[:, :kept]) @ C[:, kept]
@@ -517,9 +516,3 @@ def _future(past: Array, markov: Array, p: int, r: int) -> tuple[Array, Array, A
         rows[j * r : (j + 1) * r, j * block :] = markov[:, : (p - j) * block]
     left, s, _ = linalg.svd(rows @ past.T / np.sqrt(len(past)), full_matrices=False)
     return past @ rows.T, left, s
-
-
-def _regressed(X: Array, y: Array) -> tuple[Array, Array]:
-    """Coefficients (of y, of X) by least squares, and residuals."""
-    found = linalg.lstsq(X, y)[0]
-    return found.T, y - X @ found
