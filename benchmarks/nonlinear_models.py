@@ -17,6 +17,7 @@ from benchmarks.estimators import Experiment
 from pde_sim_node.plant import Plant
 from pdeloop.episode import Law
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
 from pdeloop.method.design.lqt import output_law
 from pdeloop.method.reduce.reduced_model import leading_modes
 
@@ -87,8 +88,7 @@ def tracking(plant: Plant, values: Mapping[str, Any], data: Sequence[Experiment]
     pairs = [(e @ U / S, each.actions) for e, each in zip(errors, data, strict=True)]
     A, B, d = linearised(fit(pairs), order, plant.n_a)
     weights = {name: values[name] for name in ("state_weight", "action_weight")}
-    rest = np.zeros(len(U))
-    K, b = output_law(A, B, U * S, rest, **weights, d=d, or_no_control=True)
+    K, b = output_law(A, B, U * S, Cost(len(U), plant.n_a, 1, **weights), d, or_no_control=True)
 
     def law(k: int, states: Array) -> Array:
         actions: Array = ((states - plant.target) @ U / S) @ K.T + b

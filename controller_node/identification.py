@@ -263,11 +263,10 @@ def designed(
         The data allow or determine no model of this order, or the model no stabilising gains and,
         for "field", that of the whole field no law.
     """
-    weights: dict[str, Any] = {
-        "state_weight": settings.state_weight,
-        "action_weight": settings.action_weight,
-        "cost": Cost.parse(settings.measured_cost),
-    }
+    weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
+    given = Cost.parse(settings.measured_cost)
+    # Steady gains do not depend on the horizon.
+    cost = given or Cost(target.size, settings.n_a, 1, target=target, **weights)
     filtered = law_kind(settings.law, settings.constants).filtered
     if delays := tuple(settings.input_delay):
         inner = designed(
@@ -287,7 +286,7 @@ def designed(
                 "a plant with dead time needs a law that remembers its actions, as 'observer' "
                 f"does, but the law is '{settings.law}'"
             )
-        rows = with_dead_time(inner.rows, delays, target, **weights, or_no_control=or_no_control)
+        rows = with_dead_time(inner.rows, delays, cost, or_no_control=or_no_control)
         return replace(inner, rows=rows)
     n_a = settings.n_a
     free = settings.action_set.free(n_a)  # of mean zero, only differences show an effect
@@ -306,7 +305,7 @@ def designed(
         )
         found_model = replace(found_model, B=found_model.B @ free.T)
         return Designed(
-            lqg.law_of_innovations(found_model, target, **weights, or_no_control=or_no_control),
+            lqg.law_of_innovations(found_model, target, cost, or_no_control=or_no_control),
             innovations=found_model,
         )
     truncated = settings.identification == "dmdc"
@@ -322,7 +321,7 @@ def designed(
     model = replace(model, B=model.B @ free.T)
     unsolved: DesignError | None = None
     try:
-        gains = lqt.track(model, **weights)
+        gains = lqt.track(model, cost=given, **weights)
         K_a, K_b = gains.K_a, gains.K_b
     except DesignError as error:
         if settings.identification != "field" and not or_no_control:
@@ -340,11 +339,13 @@ def designed(
         return Designed(
             lqg.with_filter(rows, trajectories, settings=settings.method) if filtered else rows
         )
+    horizon = max(len(a) for _, a in (*trajectories, *further))
     with one_thread():  # as in the identification itself
         found = field_law(
             [*trajectories, *further],
             target,
             rows,
+            given or Cost(target.size, n_a, horizon, target=target, **weights),
             action_set=settings.action_set,
             noise=settings.measurement_noise,
             settings=settings.method,
@@ -354,7 +355,6 @@ def designed(
             order=0
             if settings.reduced_order
             else max(model.n_s, min(max(2 * n_a, SMALL), target.size)),
-            **weights,
         )
     if unsolved is not None:
         # A law over the horizon needs no stabilising gains.

@@ -33,6 +33,10 @@ N_Z, N_A, STEPS = 24, 3, 64
 Q, R = 1.0, 2.0
 
 
+def cost_to(target: Array) -> Cost:
+    return Cost(N_Z, N_A, STEPS, state_weight=Q, action_weight=R, target=target)
+
+
 def plant() -> SpectralModel:
     """Waves up to the third grow until a cubic holds them; the actuators are blocks of the domain."""
     waves = np.arange(N_Z // 2 + 1)
@@ -60,7 +64,7 @@ def law(true: SpectralModel, target: Array) -> ModelRows:
     trajectories = [episode(true)]
     other = designed(trajectories, target, settings("regression")).rows
     none = replace(other, K_a=0.0 * other.K_a, K_b=0.0 * other.K_b)
-    found = field_law(trajectories, target, none, state_weight=Q, action_weight=R)
+    found = field_law(trajectories, target, none, cost_to(target))
     assert found.better and found.rows is not None
     return found.rows
 
@@ -98,7 +102,7 @@ def test_is_the_law_of_the_true_plant_linearised_at_the_target(size: float) -> N
 def test_gives_way_to_a_law_that_costs_no_more() -> None:
     true, target = plant(), np.zeros(N_Z)
     best = law(true, target)
-    again = field_law([episode(true)], target, best, state_weight=Q, action_weight=R)
+    again = field_law([episode(true)], target, best, cost_to(target))
     assert again.rows is not None and not again.better
 
 
@@ -110,9 +114,9 @@ def test_actions_that_saturate_are_known_as_such() -> None:
     for a in np.clip(asked, -limit, limit):
         states.append(true.step(states[-1][None], a[None])[0])
     other = designed([(np.array(states), asked)], target, settings("regression")).rows
-    given = [(np.array(states), asked)], target, other
-    found = field_law(*given, state_weight=Q, action_weight=R, action_set=ActionSet(limit=limit))
-    without = field_law(*given, state_weight=Q, action_weight=R)
+    given = [(np.array(states), asked)], target, other, cost_to(target)
+    found = field_law(*given, action_set=ActionSet(limit=limit))
+    without = field_law(*given)
     assert found.fitted is not None and found.fitted.error < 1e-4
     assert without.fitted is None or without.fitted.error > 100 * found.fitted.error
     np.testing.assert_allclose(found.fitted.model.B, true.B, atol=0.02 * np.abs(true.B).max())
@@ -194,7 +198,7 @@ def test_the_regression_is_that_of_the_first_exploration() -> None:
 def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
     true, target = plant(), np.zeros(N_Z)
     regression = designed([episode(true)], target, settings("regression")).rows
-    found = field_law([episode(true)], target, regression, state_weight=Q, action_weight=R)
+    found = field_law([episode(true)], target, regression, cost_to(target))
     assert found.rows is not None and found.fitted is not None
     for rows, predicted in ((found.rows, found.cost), (regression, found.other_cost)):
         z, total = episode(true)[0][:1], 0.0
@@ -299,7 +303,7 @@ def test_every_accepted_model_judges_every_law() -> None:
     log = [(z + 0.01 * rng.standard_normal(z.shape), a) for z, a in rod_log(3)]
     how = DesignSettings(2, 4, 1.0, 0.001, identification="field")
     other = designed(log, FAR, replace(how, identification="regression")).rows
-    found = field_law(log, FAR, other, state_weight=1.0, action_weight=0.001)
+    found = field_law(log, FAR, other, Cost(4, 2, 120, action_weight=0.001, target=FAR))
     assert found.fitted is not None and found.rows is not None
     assert found.judges == (found.fitted.model.kind, "regression")
     assert np.isfinite([found.cost, found.other_cost]).all()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqg import with_dead_time
 from pdeloop.method.design.lqt import track
@@ -118,7 +119,7 @@ def test_the_law_of_a_dead_time_is_that_of_the_predicted_state(n: int) -> None:
     none, target = np.zeros((2, 4)), np.array([2.0, 1.5, 1.5, 2.0])
     weights: dict[str, Any] = {"state_weight": 1.0, "action_weight": 0.01}
     rows = ModelRows(A, B, np.eye(4), none, none, np.zeros(4))
-    found = with_dead_time(rows, (n, n), np.zeros(4), **weights)
+    found = with_dead_time(rows, (n, n), Cost(4, 2, 1, **weights))
     powers = [np.linalg.matrix_power(A, i) for i in range(n + 1)]
     expected = np.zeros((2, 4 + 2 * n))
     expected[:, :4] = gain @ powers[n]
@@ -134,7 +135,9 @@ def test_the_law_of_a_dead_time_is_that_of_the_predicted_state(n: int) -> None:
     least = sum(float(z @ z) for z in free[:n]) + float(free[n] @ P @ free[n])
     assert cost == pytest.approx(least, rel=1e-9)
     # To a target it comes to rest where the law without a delay does.
-    at_target = with_dead_time(replace(rows, s_r=target), (n, n), target, **weights)
+    at_target = with_dead_time(
+        replace(rows, s_r=target), (n, n), Cost(4, 2, 1, target=target, **weights)
+    )
     _, last = cost_with_delay(at_target, n, start)
     direct = track(ReducedModel(A, B), **weights)
     rest = np.linalg.solve(np.eye(4) - A - B @ direct.K_a, B @ direct.K_b @ target)

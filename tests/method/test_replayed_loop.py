@@ -62,7 +62,8 @@ def explored() -> list[Record]:
 @cache
 def first_law() -> Observer:
     model = subspace_model([(r.states, r.actions) for r in explored()], order=ORDER)
-    return Observer(law_of_innovations(model, TARGET, state_weight=1.0, action_weight=0.3), T)
+    cost = Cost(len(TARGET), model.B.shape[1], T, action_weight=0.3, target=TARGET)
+    return Observer(law_of_innovations(model, TARGET, cost), T)
 
 
 def context(**others: object) -> Context:

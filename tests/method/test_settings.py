@@ -113,11 +113,11 @@ def test_noise_has_to_show_by_as_many_standard_errors_as_are_set() -> None:
     z, none = s + 0.3 * rng.normal(size=s.shape), np.zeros((1, 2))
     rows = ModelRows(A=A, B=B, U=np.eye(2), K_a=none, K_b=none, s_r=none[0])
     found = {
-        errors: noise_of(rows, [(z, a)], None, IdentificationSettings(noise_evidence=errors))
+        errors: noise_of(rows, [(z, a)], IdentificationSettings(noise_evidence=errors))
         for errors in (2.0, 100.0)
     }
-    assert found[2.0].measurement[0, 0] == pytest.approx(0.09, rel=0.3)
-    assert found[100.0].measurement[0, 0] < 1e-3
+    assert found[2.0][1][0, 0] == pytest.approx(0.09, rel=0.3)
+    assert found[100.0][1][0, 0] < 1e-3
 
 
 def test_the_constants_of_field_models_reach_controller_and_tuner() -> None:

@@ -79,9 +79,9 @@ def cost_of(law: Observer) -> float:
 
 
 def test_its_law_costs_what_lqg_with_the_true_plant_costs() -> None:
-    law = law_of_innovations(identified(), np.zeros(N_Y), state_weight=Q, action_weight=R)
-    found, true = cost_of(Observer(law, 10)), kalman_filter(A, C, W, V)
     cost = Cost(N_Y, N_A, 1, state_weight=Q, action_weight=R)
+    law = law_of_innovations(identified(), np.zeros(N_Y), cost)
+    found, true = cost_of(Observer(law, 10)), kalman_filter(A, C, W, V)
     gains = track_outputs(A, B, C, cost)
     error = (np.eye(N) - true.M @ C) @ true.P
     S = R * np.eye(N_A) + B.T @ gains.P @ B
@@ -93,8 +93,7 @@ def test_its_offset_is_kept_where_the_reduced_target_is_0() -> None:
     """Against a drift, and to the target of the actions: at rest no other offset costs less."""
     model, a_r = replace(identified(), d=np.array([0.5, -1.0, 0.3, 0.2])), np.array([0.4, -0.2])
     cost = Cost(N_Y, N_A, 1, state_weight=Q, action_weight=R, action_target=a_r)
-    own = {"state_weight": Q, "action_weight": R, "cost": cost}
-    rows = unpack(pack(law_of_innovations(model, np.zeros(N_Y), **own)), N_A, filtered=True)
+    rows = unpack(pack(law_of_innovations(model, np.zeros(N_Y), cost)), N_A, filtered=True)
     law = Observer(rows, 10)
     b = law.parts(law.theta_start)["b"]
 
@@ -167,7 +166,9 @@ def test_data_that_do_not_determine_it_are_refused_by_name() -> None:
         2,
     )
     with pytest.raises(DesignError, match=r"do not observe a mode that grows by the factor 1\.1"):
-        law_of_innovations(blind, np.zeros(1), state_weight=Q, action_weight=R)
+        law_of_innovations(
+            blind, np.zeros(1), Cost(1, blind.B.shape[1], 1, state_weight=Q, action_weight=R)
+        )
 
 
 def test_a_stable_machine_at_ambient_temperature_is_stable() -> None:

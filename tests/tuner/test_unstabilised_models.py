@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.cost import Cost
 from pdeloop.method.design import lqg, lqt
 from pdeloop.method.reduce.subspace import InnovationModel
 from pdeloop.problem_check import check
@@ -79,10 +80,10 @@ def test_a_model_of_few_readings_keeps_its_filter(monkeypatch: pytest.MonkeyPatc
 def test_an_innovation_model_whose_inputs_do_nothing_has_a_filter_alone() -> None:
     one = np.ones((1, 1))
     model = InnovationModel(1.1 * one, 0 * one, one, 0.5 * one, one, innovations=one, past=1)
-    weights = {"state_weight": 1.0, "action_weight": 1.0}
+    cost = Cost(1, 1, 1, target=1.0)
     with pytest.raises(lqt.DesignError):
-        lqg.law_of_innovations(model, np.ones(1), **weights)
-    rows = lqg.law_of_innovations(model, np.ones(1), **weights, or_no_control=True)
+        lqg.law_of_innovations(model, np.ones(1), cost)
+    rows = lqg.law_of_innovations(model, np.ones(1), cost, or_no_control=True)
     assert not rows.K_a.any() and not rows.K_b.any()
     # The estimate after a measurement has the gain M of A M = G.
     assert np.allclose(rows.L, 0.5 / 1.1)

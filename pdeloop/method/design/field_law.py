@@ -268,10 +268,8 @@ def field_law(
     trajectories: Sequence[Trajectory],
     target: Array,
     other: ModelRows,
+    cost: Cost,
     *,
-    state_weight: float,
-    action_weight: float,
-    cost: Cost | None = None,
     action_set: ActionSet = ANY_ACTION,
     noise: float = 0.0,
     settings: IdentificationSettings = DEFAULTS,
@@ -289,10 +287,8 @@ def field_law(
         z_r.
     other : ModelRows
         The law to compare with, and its model.
-    state_weight, action_weight : float
-        q and r.
-    cost : Cost, optional
-        In place of them.
+    cost : Cost
+        That of the law, and that which models predict.
     action_set : ActionSet
         Admissible actions, in the data and under both laws.
     noise : float
@@ -306,7 +302,7 @@ def field_law(
     order : int
         Modes of the law; 0: as many as `other` has.
     """
-    weights = None if cost is None else cost.state_weights
+    weights = cost.state_weights
     selected = best_model(trajectories, target, action_set, settings, noise, models, axes, weights)
     if selected is None:
         return FieldLaw(None)
@@ -322,7 +318,9 @@ def field_law(
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
     accepted = _accepted(known, most, BETTER)
     model = fitted.model
-    if not accepted and _is_better(fitted.own, regression):
+    own = fitted.own
+    predicts = own.simulated < min(1.0, regression.simulated) and own.one_step < regression.one_step
+    if not accepted and predicts:  # more than nothing, and all of it better than the other one does
         accepted = [model]
     elif fitted.error > most:
         accepted = [judge for judge in accepted if judge is not model]
@@ -336,19 +334,12 @@ def field_law(
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
         return report
     horizon = max(len(actions) for _, actions in trajectories)
-    stage = cost or Cost(
-        len(target),
-        model.n_a,
-        horizon,
-        state_weight=state_weight,
-        action_weight=action_weight,
-        target=target,
-    )
     try:
-        if cost is None and point is target:
-            K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+        if cost.plain and point is target:
+            q, r = cost.size
+            K, b = finite_horizon(A, B, drift, q, r, horizon)
         else:
-            K, b = finite_horizon_of(A, B, drift, stage, point)
+            K, b = finite_horizon_of(A, B, drift, cost, point)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
         return report
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
@@ -372,8 +363,8 @@ def field_law(
             if len(states) <= horizon:
                 return np.inf
             actions = action_set.applied(law(0, states[:horizon]))
-            total += float(stage.along(states[None, :horizon], actions[None], 0)[0][0])
-            total += float(stage.at_end(states[-1:])[0][0])
+            total += float(cost.along(states[None, :horizon], actions[None], 0)[0][0])
+            total += float(cost.at_end(states[-1:])[0][0])
         return total / (horizon * len(fields))
 
     worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
@@ -404,11 +395,6 @@ def aim_of(mean: Array, target: Array, weights: Array) -> Array:
         return np.where(weights > 0.0, target, mean)
     aim: Array = mean + linalg.pinv(weights) @ (weights @ (target - mean))
     return aim
-
-
-def _is_better(own: Accuracy, other: Accuracy) -> bool:
-    """True if a model predicts more than nothing, and all of it better than another one does."""
-    return own.simulated < min(1.0, other.simulated) and own.one_step < other.one_step
 
 
 def linearisation_point(

@@ -42,15 +42,15 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.lqt import DesignError, output_law, target_gain
+from pdeloop.method.design.lqt import DesignError, output_law, target_gain, unreached
 from pdeloop.method.reduce.input_delay import Delays
 from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
     IdentificationSettings,
-    Steps,
-    repeated,
+    distinct,
     steps_of,
 )
+from pdeloop.method.reduce.regression import residuals
 from pdeloop.method.reduce.subspace import InnovationModel
 from pdeloop.process.one_thread import one_thread
 
@@ -79,20 +79,6 @@ class Filter(NamedTuple):
     M: Array
     P: Array
     poles: NDArray[np.complex128]
-
-
-class Noise(NamedTuple):
-    """Covariances of the noise of a reduced model, (n_s, n_s) each.
-
-    Attributes
-    ----------
-    process, measurement : array
-        W, what moves the reduced state besides the model, and V, what a measured reduced state has in
-        it besides the state.
-    """
-
-    process: Array
-    measurement: Array
 
 
 def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: ArrayLike) -> Filter:
@@ -141,43 +127,30 @@ def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: A
 
 
 def require_detectable(A: Array, C: Array) -> None:
-    """DesignError where a mode that does not decay is not seen in y = C x.
-
-    Popov, Belevitch, Hautus: C v is not 0 for any eigenvector v of A with an eigenvalue of magnitude 1
-    or more, nor for any combination of those of one eigenvalue.
-    """
-    size, largest = float(linalg.norm(A, 2)), float(linalg.norm(C, 2))
-    # As large as A: the unit of the readings hides no mode.
-    scaled = C * (size / largest) if largest > 0.0 else C
-    for eigenvalue in linalg.eigvals(A):
-        growth = abs(eigenvalue)
-        if growth < 1.0 - _SEEN:
-            continue
-        pencil = np.vstack([eigenvalue * np.eye(len(A)) - A, scaled])
-        seen = float(linalg.svdvals(pencil)[-1])
-        if seen <= _SEEN * size:
-            turns = abs(np.angle(eigenvalue))
-            wave = f" and turns by {turns:.3g} rad" if 0.0 < turns < np.pi else ""
-            raise DesignError(
-                f"the readings do not observe a mode that grows by the factor {growth:.6g} a "
-                f"step{wave} (smallest singular value of [lambda I - A; C] {seen:.1e}), so no "
-                "filter can estimate it: move or add sensors so that at least one is where the "
-                "mode is not 0"
-            )
+    """DesignError where a mode that does not decay is not seen in y = C x."""
+    for eigenvalue, seen in unreached(A.T, C.T, _SEEN):
+        turns = abs(np.angle(eigenvalue))
+        wave = f" and turns by {turns:.3g} rad" if 0.0 < turns < np.pi else ""
+        raise DesignError(
+            f"the readings do not observe a mode that grows by the factor {abs(eigenvalue):.6g} a "
+            f"step{wave} (smallest singular value of [lambda I - A; C] {seen:.1e}), so no filter can "
+            "estimate it: move or add sensors so that at least one is where the mode is not 0"
+        )
 
 
 def noise_of(
     model: ModelRows,
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
-    sigma: float | None = None,
     settings: IdentificationSettings = DEFAULTS,
-) -> Noise:
-    """The noise that the residuals of a reduced model show.
+) -> tuple[Array, Array]:
+    """W, what moves a reduced state besides the model, and V, the noise of a measured one.
 
-    With r_k = s_{k+1} - A s_k - B a_k of measured s_k = U^T z_k, and noise of the variance sigma^2 in
-    every number of z_k,
+    They are what the residuals show. With r_k = s_{k+1} - A s_k - B a_k of measured s_k = U^T z_k, and
+    noise of the variance sigma^2 in every number of z_k,
 
-        E r_k r_k^T = W + V + A V A^T,        E r_{k+1} r_k^T = -A V,        V = sigma^2 U^T U.
+        E r_k r_k^T = W + V + A V A^T,        E r_{k+1} r_k^T = -A V,        V = sigma^2 U^T U,
+
+    sigma is that of the second equation, and 0 where that is not above 0 by more than chance.
 
     Parameters
     ----------
@@ -185,29 +158,21 @@ def noise_of(
         Its A, B and U.
     trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
         What was measured.
-    sigma : float, optional
-        The noise of a number of z_k; estimated from the second equation if it is not given, and 0 where
-        that is not above 0 by more than chance.
     settings : IdentificationSettings
         `noise_evidence`: what counts as chance.
     """
-    copies = repeated(trajectories)
-    steps = [steps_of([one]) for number, one in enumerate(trajectories) if number not in copies]
-    parts = [_residuals(model, own) for own in steps]
-    residuals, states = np.concatenate(parts), np.concatenate([own.before for own in steps])
-    both = residuals.T @ residuals / len(residuals)
+    steps = [steps_of([one]) for one in distinct(trajectories)]
+    parts = [residuals(model, own) for own in steps]
+    left, states = np.concatenate(parts), np.concatenate([own.before for own in steps])
+    both = left.T @ left / len(left)
     gram, n_s = model.U.T @ model.U, len(model.A)
     size = float(np.trace(both)) / n_s
     least = max(_LEAST * size, _EXACT * float(np.mean((states @ model.U) ** 2)))
-    variance = (
-        sigma**2
-        if sigma is not None
-        else _measured_variance(model.A @ gram, parts, settings.noise_evidence)
-    )
+    variance = _measured_variance(model.A @ gram, parts, settings.noise_evidence)
     V = max(variance, least / float(np.trace(gram)) * n_s) * gram
     values, vectors = linalg.eigh(both - V - model.A @ V @ model.A.T)
     W: Array = (vectors * np.maximum(values, least)) @ vectors.T
-    return Noise(W, 0.5 * (V + V.T))
+    return W, 0.5 * (V + V.T)
 
 
 def with_filter(
@@ -217,17 +182,8 @@ def with_filter(
 ) -> ModelRows:
     """A reduced model with the gain of its Kalman filter; parameters as for `noise_of`."""
     with one_thread():
-        noise = noise_of(rows, trajectories, settings=settings)
-    found = kalman_filter(rows.A, np.eye(len(rows.A)), noise.process, noise.measurement)
-    return replace(rows, L=found.M)
-
-
-def _residuals(model: ModelRows, steps: Steps) -> Array:
-    s, after = steps.before @ model.U, steps.after @ model.U
-    residuals: Array = after - s @ model.A.T - steps.inputs @ model.B.T
-    if model.d is not None:
-        residuals -= model.d
-    return residuals
+        W, V = noise_of(rows, trajectories, settings)
+    return replace(rows, L=kalman_filter(rows.A, np.eye(len(rows.A)), W, V).M)
 
 
 def _measured_variance(AV: Array, parts: Sequence[Array], standard_errors: float) -> float:
@@ -242,13 +198,7 @@ def _measured_variance(AV: Array, parts: Sequence[Array], standard_errors: float
 
 
 def law_of_innovations(
-    model: InnovationModel,
-    target: Array,
-    *,
-    state_weight: float,
-    action_weight: float,
-    cost: Cost | None = None,
-    or_no_control: bool = False,
+    model: InnovationModel, target: Array, cost: Cost, *, or_no_control: bool = False
 ) -> ModelRows:
     """The LQG law of a model in innovation form, for the cost of the measurements.
 
@@ -262,10 +212,8 @@ def law_of_innovations(
         Of the plant as it is measured.
     target : (n_z,) array
         z_r, of what is measured.
-    state_weight, action_weight : float
-        q and r.
-    cost : Cost, optional
-        In place of them.
+    cost : Cost
+        Of what is measured.
     or_no_control : bool
         Gains of 0, with the filter, where there are no stabilising ones.
 
@@ -277,34 +225,16 @@ def law_of_innovations(
     A, B, C = model.A, model.B, model.C
     with one_thread():
         require_detectable(A, C)
-        K_a, b = output_law(
-            A,
-            B,
-            model.U @ C,
-            target,
-            state_weight=state_weight,
-            action_weight=action_weight,
-            cost=cost,
-            d=model.d,
-            or_no_control=or_no_control,
-        )
-        back = linalg.pinv(C)
+        K_a, b = output_law(A, B, model.U @ C, cost, model.d, or_no_control=or_no_control)
         M = linalg.lstsq(A, model.G)[0]
-        U = model.U @ back.T
+        U = model.U @ linalg.pinv(C).T
         s_r = U.T @ target
     K_b, left = target_gain(b, s_r)
     return ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=M @ C, d=model.d, b=left)
 
 
 def with_dead_time(
-    rows: ModelRows,
-    delays: Delays,
-    target: Array,
-    *,
-    state_weight: float,
-    action_weight: float,
-    cost: Cost | None = None,
-    or_no_control: bool = False,
+    rows: ModelRows, delays: Delays, cost: Cost, *, or_no_control: bool = False
 ) -> ModelRows:
     """A model with the last inputs in its state, its law, and the filter that it had, or L = I.
 
@@ -314,12 +244,8 @@ def with_dead_time(
         The model without delays, z_{k+1} by a_{k-n}.
     delays : tuple of int
         n of each input; those below 0 count as 0.
-    target : (n_z,) array
-        z_r.
-    state_weight, action_weight : float
-        q and r.
-    cost : Cost, optional
-        In place of them.
+    cost : Cost
+        That of the law.
     or_no_control : bool
         Gains of 0 where there are no stabilising ones.
 
@@ -344,17 +270,7 @@ def with_dead_time(
     none = np.zeros(memory)
     d = None if rows.d is None else np.concatenate([rows.d, none])
     seen = np.hstack([rows.measurement, np.zeros((len(rows.U), memory))])
-    K_a, b = output_law(
-        A,
-        B,
-        seen,
-        target,
-        state_weight=state_weight,
-        action_weight=action_weight,
-        cost=cost,
-        d=d,
-        or_no_control=or_no_control,
-    )
+    K_a, b = output_law(A, B, seen, cost, d, or_no_control=or_no_control)
     s_r = np.concatenate([rows.s_r, none])
     K_b, left = target_gain(b, s_r)
     with one_thread():

@@ -44,6 +44,7 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4; "Optima
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from numbers import Real
 from typing import NamedTuple
 
@@ -235,20 +236,12 @@ def output_law(
     A: Array,
     B: Array,
     U: Array,
-    target: Array,
-    *,
-    state_weight: float,
-    action_weight: float,
-    cost: Cost | None = None,
+    cost: Cost,
     d: Array | None = None,
+    *,
     or_no_control: bool = False,
 ) -> tuple[Array, Array]:
     """K_a and b of a = K_a s + b for the cost of z = U s; or_no_control: 0 where none stabilises."""
-    if cost is None or cost.plain:
-        n_z, n_a = len(U), B.shape[1]
-        cost = Cost(
-            n_z, n_a, 1, state_weight=state_weight, action_weight=action_weight, target=target
-        )
     try:
         gains = track_outputs(A, B, U, cost, 0.0 if d is None else d)
     except DesignError:
@@ -299,23 +292,30 @@ def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:
 
 
 def _require_stabilisable(A: Array, B: Array) -> None:
-    # Popov-Belevitch-Hautus: [lambda I - A, B] keeps full row rank at every eigenvalue with
-    # |lambda| >= 1.
+    for eigenvalue, reach in unreached(A, B, _REACH):
+        raise DesignError(
+            "the reduced model is not stabilisable: no actuator reaches the mode with eigenvalue "
+            f"magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I - A, B] "
+            f"{reach:.1e}); place actuators that reach it or identify with another seed or n_s."
+        )
+
+
+def unreached(A: Array, B: Array, least: float) -> Iterator[tuple[complex, float]]:
+    """Eigenvalues of A, of magnitude 1 or more, whose modes B does not reach.
+
+    Popov, Belevitch, Hautus: where [lambda I - A, B] does not keep full row rank, with its smallest
+    singular value; least: that of full rank, relative to the size of A. Of A^T and C^T: modes that do
+    not show in C x, nor in any combination of those of one eigenvalue.
+    """
     size, largest = float(linalg.norm(A, 2)), float(linalg.norm(B, 2))
     # As large as A: the unit of the inputs does not move a mode out of reach, or into it.
     scaled = B * (size / largest) if largest > 0.0 else B
     for eigenvalue in linalg.eigvals(A):
-        if abs(eigenvalue) < 1.0 - _REACH:
-            continue
-        pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, scaled])
-        reach = float(linalg.svdvals(pencil)[-1])
-        if reach <= _REACH * size:
-            raise DesignError(
-                f"the reduced model is not stabilisable: no actuator reaches the mode with "
-                f"eigenvalue magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I "
-                f"- A, B] {reach:.1e}); place actuators that reach it or identify with another "
-                "seed or n_s."
-            )
+        if abs(eigenvalue) >= 1.0 - least:
+            pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, scaled])
+            reach = float(linalg.svdvals(pencil)[-1])
+            if reach <= least * size:
+                yield eigenvalue, reach
 
 
 def _steady_state_map(closed_loop: Array) -> Array:
