@@ -562,20 +562,19 @@ def _regression(
         decay = np.exp(model.linear[:cut])
     # Each window has `steps` of the steps and the state at its end besides, whose number is one higher
     # among the states than among the steps for every rollout before.
-    windows, own = [], []
-    for i, rollout in enumerate(rollouts):
-        begin = sum(len(other.actions) for other in rollouts[:i])
-        length = min(steps, len(rollout.actions))
-        for at in range(0, len(rollout.actions) - length + 1, length):
-            if length == steps:
-                windows.append(begin + at)
-                own.append(begin + i + at)
-    if not windows:
+    lengths = [len(rollout.actions) for rollout in rollouts]
+    counts = [length // steps for length in lengths]
+    if not any(counts):
         return None
-    index = np.array(windows)[:, None] + np.arange(steps)
+    begin = np.cumsum([0, *lengths[:-1]])
+    windows = np.concatenate(
+        [at + steps * np.arange(n) for at, n in zip(begin, counts, strict=True)]
+    )
+    own = windows + np.repeat(np.arange(len(rollouts)), counts)
+    index = windows[:, None] + np.arange(steps)
     W, inputs = W[:, index], np.concatenate([actions, np.ones((len(actions), 1))], axis=1)[index]
     spectra = np.concatenate([scipy.fft.rfft(r.states)[:, :cut] for r in rollouts]) / model.n_z
-    y = spectra[np.array(own)[:, None] + np.arange(steps + 1)]
+    y = spectra[own[:, None] + np.arange(steps + 1)]
     total = np.zeros((len(W), len(y), steps + 1, cut), complex)
     common = np.zeros((len(y), steps + 1, cut, inputs.shape[2]), complex)
     for j in range(steps):
@@ -596,12 +595,9 @@ def _regression(
     total = total - free * np.einsum("jk,pnjk->pnk", free.conj(), total)[:, :, None]
     explained = np.einsum("jk,njka->nka", free.conj(), common)
     common = common - free[..., None] * explained[:, None]
-    y, total, common = (
-        y * root[:, None, None],
-        total * root[:, None, None],
-        common * root[:, None, None, None],
-    )
-    columns = common.transpose(2, 0, 1, 3).reshape(cut, -1, inputs.shape[2])
+    y, total = (values * root[:, None, None] for values in (y, total))
+    columns = common * root[:, None, None, None]
+    columns = columns.transpose(2, 0, 1, 3).reshape(cut, -1, inputs.shape[2])
     return WindowRegression(
         symbols=model.symbols,
         y=y.reshape(-1, cut),

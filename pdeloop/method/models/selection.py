@@ -168,10 +168,23 @@ def kinds_of(
     line: whether a point has one neighbour at each side, which is not so on several axes; shape: points
     of each axis, where there are several and the states are fields on them.
     """
+    if n_z > DENSE:
+        linear = [_of_samples(LINEAR, fit_low_rank, (_LINEAR_MODES, 0), most=_LINEAR_MODES)]
+    else:
+        linear = [_of_samples(LINEAR, fit_linear, (n_z, 0), ridge=_LINEAR_RIDGE)]
     if shape:
-        return _linear(n_z) + _finite_difference(n_z // math.prod(shape), settings, "", shape)
+        return linear + _finite_difference(n_z // math.prod(shape), settings, shape=shape)
+    last = list[Kind]()  # products of any numbers, where nothing simpler describes the plant
+    if n_z <= _SPARSE_NUMBERS:
+        unknowns = n_z + SPARSE_TERMS, 0
+        last += [
+            _of_samples(name, fit_sparse, unknowns, NEAR_NEEDED, is_map=is_map)
+            for name, is_map in SPARSE.items()
+        ]
+    if n_z <= LARGEST_STATE:
+        last.append(Kind("polynomial", lambda own, _: fit_polynomial(own), (n_z + 1.0, 0)))
     if not line:
-        return _linear(n_z) + _sparse(n_z) + _polynomial(n_z)
+        return linear + last
     forms = FORMS if components == 1 and n_z >= _FEWEST_POINTS else ()
     spectral = [_spectral(own, settings) for own in forms if own.degree <= settings.largest_degree]
     several, near = _several_fields(n_z, components, settings), _neighbours(n_z, components)
@@ -184,12 +197,22 @@ def kinds_of(
     # And equations of a high degree late, as that takes long.
     late = [kind for kind in spectral if kind.name == FORMS[-1].name]
     early = [kind for kind in spectral if kind.name != FORMS[-1].name]
-    return early + several + late + _linear(n_z) + near + _sparse(n_z) + _polynomial(n_z)
+    return early + several + late + linear + near + last
 
 
-def _of_samples(fit: Callable[..., FieldModel | None], **known: Any) -> Fit:
-    """A fit to the steps of rollouts, whatever their order."""
-    return lambda rollouts, _: fit(Samples.of(rollouts), **known)
+def _of_samples(
+    name: str,
+    fit: Callable[..., FieldModel | None],
+    unknowns: tuple[float, int],
+    needed: float = 0.0,
+    **known: Any,
+) -> Kind:
+    """A kind that is fitted to the steps of rollouts, whatever their order."""
+
+    def fitted(rollouts: Sequence[Measured], _: float) -> FieldModel | None:
+        return fit(Samples.of(rollouts), kind=name, **known)
+
+    return Kind(name, fitted, unknowns, needed=needed)
 
 
 def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
@@ -202,13 +225,6 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
     return Kind(form.name, fit, form.unknowns, not form.free, enough=enough)
 
 
-def _linear(n_z: int) -> list[Kind]:
-    if n_z > DENSE:
-        fit = _of_samples(fit_low_rank, kind=LINEAR, most=_LINEAR_MODES)
-        return [Kind(LINEAR, fit, (_LINEAR_MODES, 0))]
-    return [Kind(LINEAR, _of_samples(fit_linear, kind=LINEAR, ridge=_LINEAR_RIDGE), (n_z, 0))]
-
-
 def _several_fields(
     n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
 ) -> list[Kind]:
@@ -217,11 +233,9 @@ def _several_fields(
         return []
     kinds: list[Kind] = []
     if components > 1 and n_z <= DENSE:
+        given = {"ridge": _CONVOLUTION_RIDGE, "components": components}
         name = f"{prefix}convolution"
-        convolution = _of_samples(
-            fit_convolution, kind=name, ridge=_CONVOLUTION_RIDGE, components=components
-        )
-        kinds.append(Kind(name, convolution, (float(components), 0)))
+        kinds.append(_of_samples(name, fit_convolution, (float(components), 0), **given))
     return kinds + _finite_difference(components, settings, prefix)
 
 
@@ -234,37 +248,10 @@ def _neighbours(n_z: int, components: int, prefix: str = "") -> list[Kind]:
     for name, ridge in NEAR_RIDGES.items():
         if ridge is not None and components > 1:
             continue  # too many unknowns
-        fit = _of_samples(
-            fit_neighbours,
-            components=components,
-            kind=prefix + name,
-            ridge=ridge,
-        )
-        own = 0.0 if ridge is None else count
-        kinds.append(Kind(prefix + name, fit, (own, count), needed=NEAR_NEEDED))
+        unknowns = 0.0 if ridge is None else count, count
+        given = {"components": components, "ridge": ridge}
+        kinds.append(_of_samples(prefix + name, fit_neighbours, unknowns, NEAR_NEEDED, **given))
     return kinds
-
-
-def _sparse(n_z: int) -> list[Kind]:
-    """Few products of any numbers of a small state."""
-    if n_z > _SPARSE_NUMBERS:
-        return []
-    return [
-        Kind(
-            name,
-            _of_samples(fit_sparse, kind=name, is_map=is_map),
-            (n_z + SPARSE_TERMS, 0),
-            needed=NEAR_NEEDED,
-        )
-        for name, is_map in SPARSE.items()
-    ]
-
-
-def _polynomial(n_z: int) -> list[Kind]:
-    """Products of the leading modes and of actions, where nothing simpler describes the plant."""
-    if n_z > LARGEST_STATE:
-        return []
-    return [Kind("polynomial", lambda rollouts, _: fit_polynomial(rollouts), (n_z + 1.0, 0))]
 
 
 def _finite_difference(
@@ -273,15 +260,15 @@ def _finite_difference(
     """Equations whose coefficients depend on the place; shape: as for `kinds_of`."""
     if settings.largest_degree < _POINT_DEGREE:
         return []
-    kinds, count = list[Kind](), components * len(features_of(components, len(shape) or 1))
-    for name, ridge in POINT_RIDGES.items():
-        known: dict[str, Any] = {"kind": prefix + name, "ridge": ridge}
-        if shape:
-            fit = _of_samples(fit_coarse, shape=shape, **known)
-        else:
-            fit = _of_samples(fit_finite_difference, components=components, **known)
-        kinds.append(Kind(prefix + name, fit, (0.0 if ridge is None else count, count)))
-    return kinds
+    count = components * len(features_of(components, len(shape) or 1))
+    fit: Callable[..., FieldModel | None] = fit_coarse if shape else fit_finite_difference
+    given: dict[str, Any] = {"shape": shape} if shape else {"components": components}
+    return [
+        _of_samples(
+            prefix + name, fit, (0.0 if ridge is None else count, count), ridge=ridge, **given
+        )
+        for name, ridge in POINT_RIDGES.items()
+    ]
 
 
 _HOPELESS = 20.0

@@ -245,23 +245,7 @@ def sensed_model(
     settings: FieldModelSettings = DEFAULTS,
     noise: float = 0.0,
 ) -> SensedModel:
-    """The equation on the grid for this many sensors.
-
-    Parameters
-    ----------
-    shared : (44 + n_a,) array
-        The unknowns that all rollouts share, in their units.
-    sensors : int
-        n_y.
-    actuators : Actuators
-        What is declared of them.
-    largest : float
-        Largest |z| that is simulated; the internal steps follow it.
-    settings : FieldModelSettings
-        How they do.
-    noise : float
-        As for `SensedModel`.
-    """
+    """The equation on the grid for this many sensors; settings: how internal steps follow `largest`."""
     n = grid_points(sensors)
     equation = SensedEquation(shared, n, actuators, settings)
     symbols, followed = equation.symbols, equation.followed(largest)

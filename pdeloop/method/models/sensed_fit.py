@@ -69,26 +69,10 @@ _FASTEST = 1e50
 
 
 class SensedFlow:
-    """The equation with the unknowns (44 + n_a,), and with some of them less by a difference each.
+    """The equation with unknowns `shared` (44 + n_a,), and with the varied ones less by a difference.
 
-    Parameters
-    ----------
-    shared : (44 + n_a,) array
-        The unknowns.
-    n : int
-        Number of grid points.
-    actuators : Actuators
-        What is declared of them.
-    sizes : (T,) array
-        How large the fields are at the time steps, which the internal steps follow.
-    settings : FieldModelSettings
-        How they do.
-    clip : float
-        As for `SensedEquation.compiled`.
-    varied : sequence of int
-        Which unknowns, in their order.
-    difference : float
-        By how much.
+    sizes (T,): how large the fields on n points are at the time steps, which the internal steps follow;
+    clip: as for `SensedEquation.compiled`; varied: which unknowns, in their order.
     """
 
     def __init__(
@@ -485,11 +469,11 @@ class _Fit:
         other = _Fit(data, library, unequal, self.shared, self.spread)
         other.fields, other.sigma = self.fields, self.sigma
         with np.errstate(all="ignore"):
-            e, Jz, Jp = other._derivatives(data.steps)
-        if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+            known = other._expansion(data.steps)
+        if known is None:
             return 0.0
-        gz, gp = other._slopes(e, Jz, Jp)
-        H, rest, X = eliminated(*other._curvatures(Jz, Jp), gz, gp)
+        H, rest, X = eliminated(*known)
+        gz = known[3]
         gain = 0.5 * float(rest @ np.linalg.solve(H, rest) + np.sum(gz * X[..., -1]))
         share = 2.0 * gain / data.readings.size * (self.sigma / data.size) ** 2
         return self.error(data.steps) - share
@@ -510,11 +494,10 @@ class _Fit:
         with np.errstate(all="ignore"):
             now = self._value(self.shared, self.fields, m)
             for _ in range(most):
-                e, Jz, Jp = self._derivatives(m)
-                if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+                known = self._expansion(m)
+                if known is None:
                     return
-                A, B, C = self._curvatures(Jz, Jp)
-                gz, gp = self._slopes(e, Jz, Jp)
+                A, B, C, gz, gp = known
                 before = now
                 while damping < _MOST_DAMPING:
                     damped = A + damping * np.einsum("ruu,uv->ruv", A, np.eye(A.shape[1]))
@@ -549,12 +532,11 @@ class _Fit:
     def learn(self) -> bool:
         """S from what was found, and fewer terms; False where nothing is finite."""
         with np.errstate(all="ignore"):
-            e, Jz, Jp = self._derivatives(self.data.steps)
-        if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+            known = self._expansion(self.data.steps)
+        if known is None:
             return False
-        A, B, C = self._curvatures(Jz, Jp)
-        P = eliminated(A, B, C, *self._slopes(e, Jz, Jp))[0]
-        own = np.diagonal(np.linalg.inv(A), axis1=1, axis2=2)
+        P = eliminated(*known)[0]
+        own = np.diagonal(np.linalg.inv(known[0]), axis1=1, axis2=2)
         second = np.sum(self.fields**2 + own, axis=0)
         # Nothing is known of where on the circle a field is.
         second[1:] = np.tile(second[1:].reshape(2, WAVES).mean(axis=0), 2)
@@ -583,17 +565,21 @@ class _Fit:
         self.shared = well_posed(self.shared)
         self.varied, self.deviations = self.varied[kept], self.deviations[kept]
 
-    def _curvatures(self, Jz: Array, Jp: Array) -> tuple[Array, Array, Array]:
-        """A (R, 33, 33), B (R, 33, varied) and that of phi (varied, varied)."""
+    def _expansion(self, m: int) -> tuple[Array, Array, Array, Array, Array] | None:
+        """Curvatures A (R, 33, 33), B (R, 33, varied) and that of phi (varied, varied), and slopes.
+
+        Those of J by the fields (R, 33) and the varied unknowns (varied,); None where they are not
+        finite.
+        """
+        e, Jz, Jp = self._derivatives(m)
+        if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
+            return None
         A = np.einsum("ure,vre->ruv", Jz, Jz) + np.diag(self.spread**-2.0)
         B = np.einsum("ure,vre->ruv", Jz, Jp)
-        return A, B, np.einsum("ure,vre->uv", Jp, Jp) + np.diag(self.deviations**-2.0)
-
-    def _slopes(self, e: Array, Jz: Array, Jp: Array) -> tuple[Array, Array]:
-        """Of J, by the fields (R, 33) and the shared unknowns (varied,)."""
+        C = np.einsum("ure,vre->uv", Jp, Jp) + np.diag(self.deviations**-2.0)
         gz = np.einsum("ure,re->ru", Jz, e) + self.fields / self.spread**2
         gp = np.einsum("ure,re->u", Jp, e) + self.shared[self.varied] / self.deviations**2
-        return gz, gp
+        return A, B, C, gz, gp
 
     def _value(self, shared: Array, fields: Array, m: int) -> float:
         """J."""

@@ -270,7 +270,12 @@ class Regression:
 
     def coefficients(self, columns: Spectrum, values: Spectrum) -> Array:
         """Real coefficients of complex columns (N, terms) that explain values (N,) best."""
-        return _real_least_squares(columns, values)
+        scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=0))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        A = columns / scale
+        gram = (A.conj().T @ A).real + COEFFICIENT_RIDGE * np.eye(A.shape[1])
+        found: Array = np.linalg.solve(gram, (A.conj().T @ values).real) / scale
+        return found
 
     def inputs(self, left: Spectrum) -> Spectrum:
         """F of B and c, (n_a + 1, modes), from what the other terms leave (N, modes)."""
@@ -295,7 +300,8 @@ def polynomial(data: Regression, form: Form, turn: int) -> Symbols:
     if form.hilbert:
         terms += [(0, 1j * np.sign(k.imag) * term) for _, term in terms]
     count = len(terms)
-    powers = _power_terms(form)
+    # Indices p - 1 of the powers above the first, and orders of the derivative.
+    powers = [(p, j) for p in range(1, form.degree) for j in range(ORDERS[p] + 1)]
     terms += [(p, k**j) for p, j in powers]
     columns = np.stack([(rests[p] * term[low]).ravel() for p, term in terms], axis=1)
     found = data.coefficients(columns, data.rest(data.y[:, low]).ravel())
@@ -306,7 +312,11 @@ def polynomial(data: Regression, form: Form, turn: int) -> Symbols:
     most = max(float(linear[compared - 1].real), 0.0)
     high = np.arange(len(k)) >= compared
     linear = np.where(high, np.minimum(linear.real, most) + 1j * linear.imag, linear)
-    return linear, *_grouped(form, powers, found[count:], k)
+    orders = np.arange(max((j for _, j in powers), default=-1) + 1)
+    polynomials = np.zeros((len(orders), form.degree - 1))
+    for (p, j), coefficient in zip(powers, found[count:], strict=True):
+        polynomials[j, p - 1] = coefficient
+    return linear, k ** orders[:, None], polynomials
 
 
 def all_free(data: Regression) -> Symbols:
@@ -325,32 +335,6 @@ def all_free(data: Regression) -> Symbols:
     most = max(0.5, float(data.symbols[0].real.max()))
     linear = np.minimum(linear.real, most) + 1j * linear.imag
     return linear, symbols[1:], np.eye(len(symbols) - 1)
-
-
-def _power_terms(form: Form) -> list[tuple[int, int]]:
-    """Indices p - 1 of the powers above the first, and orders of the derivative."""
-    return [(p, j) for p in range(1, form.degree) for j in range(ORDERS[p] + 1)]
-
-
-def _grouped(
-    form: Form, terms: list[tuple[int, int]], found: Array, k: Spectrum
-) -> tuple[Spectrum, Array]:
-    """The powers of ik as multipliers, with their polynomials."""
-    orders = np.arange(max((j for _, j in terms), default=-1) + 1)
-    polynomials = np.zeros((len(orders), form.degree - 1))
-    for (p, j), coefficient in zip(terms, found, strict=True):
-        polynomials[j, p - 1] = coefficient
-    return k ** orders[:, None], polynomials
-
-
-def _real_least_squares(A: Spectrum, y: Spectrum) -> Array:
-    """Real coefficients of complex columns."""
-    scale = np.sqrt(np.sum(np.abs(A) ** 2, axis=0))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    A = A / scale
-    gram = (A.conj().T @ A).real + COEFFICIENT_RIDGE * np.eye(A.shape[1])
-    found: Array = np.linalg.solve(gram, (A.conj().T @ y).real) / scale
-    return found
 
 
 _SETTLED = 1e-3
