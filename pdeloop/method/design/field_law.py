@@ -193,39 +193,19 @@ def _cost(cost: float) -> str:
     return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
 
 
-def best_model(
-    trajectories: Sequence[Trajectory],
-    target: Array,
-    action_set: ActionSet = ANY_ACTION,
-    settings: IdentificationSettings = DEFAULTS,
-    noise: float = 0.0,
-    models: FieldModelSettings = MODEL_DEFAULTS,
-    axes: tuple[int, ...] = (),
-    weights: Array | None = None,
-) -> Selected | None:
+def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Selected | None:
     """The model of the whole field that predicts trajectories best; None where there is none.
 
     A target far outside of the data makes every error small, so a model that does not reproduce what
     the data do is chosen again by that. The work grows with the third power of the size of the state,
-    so there is a largest one. axes: as for `field_law`; weights: as for `Selection`.
+    so there is a largest one.
     """
-    if len(target) > _FIELD_LARGEST:
+    if len(selection.target) > _FIELD_LARGEST:
         return None
-    line = len(axes) < 2
-    selection = Selection(
-        target=target,
-        accepted=settings.field_error,
-        settings=models,
-        noise=noise,
-        action_set=action_set,
-        line=line,
-        shape=() if line or len(target) % math.prod(axes) else axes,
-        weights=weights,
-    )
     found = selection.select([Measured(z, a) for z, a in trajectories])
     if found is None or found.noise or found.near < np.inf:
         return found
-    if found.error <= settings.field_error < found.fitted.own.simulated:
+    if found.error <= selection.accepted < found.fitted.own.simulated:
         scale = scale_of([states for states, _ in trajectories])
         again = selection.fit(found.rollouts, scale, by_scale=True)
         if again is not None and again.own.simulated < found.fitted.own.simulated:
@@ -237,9 +217,9 @@ def regression_accuracy(
     rollouts: Sequence[Measured],
     n_s: int,
     scale: Scale,
-    models: FieldModelSettings = MODEL_DEFAULTS,
-    noise: float = 0.0,
-    constant: bool = False,
+    models: FieldModelSettings,
+    noise: float,
+    constant: bool,
 ) -> Accuracy:
     """The accuracy of a regression of this order, on rollouts or pieces that it was not fitted to."""
     if len(rollouts) == 1:
@@ -302,8 +282,18 @@ def field_law(
     order : int
         Modes of the law; 0: as many as `other` has.
     """
-    weights = cost.state_weights
-    selected = best_model(trajectories, target, action_set, settings, noise, models, axes, weights)
+    weights, line = cost.state_weights, len(axes) < 2
+    selection = Selection(
+        target=target,
+        accepted=settings.field_error,
+        settings=models,
+        noise=noise,
+        action_set=action_set,
+        line=line,
+        shape=() if line or len(target) % math.prod(axes) else axes,
+        weights=weights,
+    )
+    selected = best_model(selection, trajectories)
     if selected is None:
         return FieldLaw(None)
     if selected.noise:
@@ -312,9 +302,7 @@ def field_law(
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
     limits = [limited(rollout, action_set) for rollout in rollouts]
     with one_thread():
-        regression = regression_accuracy(
-            limits, n_s, scale, models, noise, constant=other.d is not None
-        )
+        regression = regression_accuracy(limits, n_s, scale, models, noise, other.d is not None)
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
     accepted = _accepted(known, most, BETTER)
     model = fitted.model

@@ -41,7 +41,7 @@ from pdeloop.messages.arrays import Array, read_only
 from pdeloop.method.models.base import Arrays, FieldModel, Samples, StoredModel, numbers_of
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, fit_finite_difference
 from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
-from pdeloop.method.reduce.reduced_model import Trajectory
+from pdeloop.method.reduce.reduced_model import Trajectory, turns
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 
@@ -372,11 +372,7 @@ def fit_readings(
     whole = subspace_model(rollouts, order=order)
     model = _model(whole)
     missed = size = 0.0
-    for fold in range(2):
-        others = [rollout for i, rollout in enumerate(rollouts) if i % 2 != fold]
-        own = rollouts[fold::2]
-        if not others or not own:
-            continue
+    for others, own in turns(rollouts, 2):
         try:
             half = _model(subspace_model(others, order=order, past=whole.past))
         except ValueError:

@@ -341,42 +341,6 @@ def with_clean(
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
 
-def judged(
-    kind: Kind,
-    rollouts: Sequence[Measured],
-    least: float,
-    target: Array,
-    settings: FieldModelSettings,
-    noise: float,
-    scale: Scale | None,
-    weights: Array | None,
-) -> tuple[float, Accuracy] | None:
-    """E of a kind, its mean over the rollouts, and its accuracy on a scale if there is one.
-
-    None where there is nothing to fit or to judge.
-
-    least: that of the best kind so far. One that is far from it after the first turn gets no other.
-    """
-    # Coefficients that all points share are hardly fitted to a single rollout's accidents.
-    if len(rollouts) == 1 and kind.unknowns[0] > 0:
-        rollouts = pieces(rollouts[0], settings.folds)
-    found: list[float] = []
-    parts: list[tuple[FieldModel, list[Measured], list[Array]]] = []
-    for others, own in turns(rollouts, settings.folds):
-        model = fitted(kind, others, noise)
-        if model is None:
-            return None
-        own = usable(own)
-        parts.append((model, own, predicted(model, own)))
-        found += errors(model, own, target, settings.worst, noise, weights, parts[-1][2]).tolist()
-        if found and np.mean(found) > _HOPELESS * max(least, settings.reproduced):
-            break
-    if not found:
-        return None
-    known = UNKNOWN if scale is None else accuracy_of(parts, scale, settings.worst, noise)
-    return float(np.mean(found)), known
-
-
 def turns(
     rollouts: Sequence[Measured], folds: int
 ) -> Iterable[tuple[list[Measured], list[Measured]]]:
@@ -590,13 +554,12 @@ class Selection:
         kinds.sort(key=lambda kind: kind.name != first)
         tried: dict[Kind, float] = {}
         own: dict[Kind, Accuracy] = {}
-        known = target, settings, noise, scale, self.weights
         with one_thread():  # a rounding must not depend on the machine's load
             for kind in kinds:
                 least = min(tried.values(), default=np.inf)
                 if not least > kind.needed:
                     continue
-                found = judged(kind, rollouts, least, *known)
+                found = self._judged(kind, rollouts, least, settings, scale)
                 if found is not None:
                     error, own[kind] = found
                     error = own[kind].simulated if by_scale else error
@@ -617,11 +580,47 @@ class Selection:
                 model = fitted(kind, rollouts, noise)
                 if model is not None:
                     if scale and len(rollouts) == 1 and not kind.unknowns[0]:
-                        held = judged(kind, pieces(rollouts[0], settings.folds), np.inf, *known)
+                        parts = pieces(rollouts[0], settings.folds)
+                        held = self._judged(kind, parts, np.inf, settings, scale)
                         own[kind] = held[1] if held else UNKNOWN
                     seen = [(kind.name, error) for kind, error in tried.items()]
                     return FittedModel(model, tried[kind], seen, own[kind])
         return None
+
+    def _judged(
+        self,
+        kind: Kind,
+        rollouts: Sequence[Measured],
+        least: float,
+        settings: FieldModelSettings,
+        scale: Scale | None,
+    ) -> tuple[float, Accuracy] | None:
+        """E of a kind, its mean over the rollouts, and its accuracy on a scale if there is one.
+
+        None where there is nothing to fit or to judge.
+
+        least: that of the best kind so far. One that is far from it after the first turn gets no other.
+        """
+        # Coefficients that all points share are hardly fitted to a single rollout's accidents.
+        if len(rollouts) == 1 and kind.unknowns[0] > 0:
+            rollouts = pieces(rollouts[0], settings.folds)
+        found: list[float] = []
+        parts: list[tuple[FieldModel, list[Measured], list[Array]]] = []
+        for others, own in turns(rollouts, settings.folds):
+            model = fitted(kind, others, self.noise)
+            if model is None:
+                return None
+            own = usable(own)
+            parts.append((model, own, predicted(model, own)))
+            known = self.target, settings.worst, self.noise, self.weights, parts[-1][2]
+            found += errors(model, own, *known).tolist()
+            if found and np.mean(found) > _HOPELESS * max(least, settings.reproduced):
+                break
+        if not found:
+            return None
+        if scale is None:
+            return float(np.mean(found)), UNKNOWN
+        return float(np.mean(found)), accuracy_of(parts, scale, settings.worst, self.noise)
 
     def select(self, rollouts: Sequence[Measured], first: str = "") -> Selected | None:
         """The model, which need not be accepted; None where none can be fitted.
