@@ -204,7 +204,8 @@ def subspace_model(
         else:
             p, n, errors = _choose(tried, known, simulations, affine)
         error = float(errors[tried.index((p, n)), 0])
-        found = _fitted(known, p, n, channels, error, constant=constant, affine=affine)
+        predictor = _predictor(known, p, n, channels, affine)
+        found = _fitted(predictor, n, channels, error, constant=constant)
         table = tuple((*sizes, *own) for sizes, own in zip(tried, errors.tolist(), strict=True))
         found = replace(found, tried=table)
         if found.d is None:
@@ -253,16 +254,7 @@ def _choose(
             try:
                 if size != made or predictor is None:
                     made, predictor = size, _predictor(others, *size, NUMBERED, affine)
-                model = _fitted(
-                    others,
-                    p,
-                    n,
-                    NUMBERED,
-                    np.nan,
-                    check=False,
-                    constant=affine,
-                    predictor=predictor,
-                )
+                model = _fitted(predictor, n, NUMBERED, np.nan, check=False, constant=affine)
             except (linalg.LinAlgError, ValueError):
                 sums[0, fold, i] = np.inf
                 continue
@@ -379,11 +371,12 @@ def _from_any_start(A: Array, C: Array, inputs: Array, y: Array) -> float:
 class _Predictor:
     """The vector ARX of p steps of trajectories, and the states that its past gives.
 
-    U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last ones of each trajectory; last
+    p; U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last of each trajectory; last
     (N,), which are the last of a trajectory; future (N, p r), the next p measurements that the past
     predicts, and their directions over the data with their singular values.
     """
 
+    p: int
     U: Array
     y: Array
     inputs: Array
@@ -432,27 +425,19 @@ def _predictor(
     markov = _ridge(past / unit, about).T / unit
     last = np.zeros(len(past), dtype=bool)
     last[np.cumsum([len(rows) for rows in regressors]) - 1] = True
-    return _Predictor(U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
+    return _Predictor(p, U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
 
 
 def _fitted(
-    known: Sequence[Trajectory],
-    p: int,
+    predictor: _Predictor,
     n: int,
     channels: Channels,
     error: float,
     *,
     check: bool = True,
     constant: bool = False,
-    affine: bool = False,
-    predictor: _Predictor | None = None,
 ) -> InnovationModel:
-    """The model of given sizes. Call it with one LAPACK thread.
-
-    predictor: that of these trajectories, p and r, if it is known; affine: as for `_predictor`.
-    """
-    if predictor is None:
-        predictor = _predictor(known, p, n, channels, affine)
+    """The model of n states. Call it with one LAPACK thread."""
     y, last = predictor.y, predictor.last
     if len(y) <= n:
         raise ValueError(f"{len(y)} samples do not determine {n} states")
@@ -487,7 +472,7 @@ def _fitted(
         ) from failed
     innovations = C @ P @ C.T + V
     G = linalg.solve(innovations, (A @ P @ C.T + S).T, assume_a="pos").T
-    return InnovationModel(A, B, C, G, predictor.U, innovations, p, error, d)
+    return InnovationModel(A, B, C, G, predictor.U, innovations, predictor.p, error, d)
 
 
 def _ridge(X: Array, y: Array) -> Array:
