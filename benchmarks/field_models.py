@@ -52,13 +52,12 @@ class Rollouts:
         self._own: Any = getattr(plants, case.plant)() if case.plant else None
         if self._own is not None:
             plant: Any = self._own
-            self.components = plant_components(plant)
             self.variance = case.settings["exploration_variance"]
             self.action_set, self.noise = ANY_ACTION, 0.0
         else:
             problem = pdeloop.problem(case.base, **case.parameters())
             plant = self._plant = problem.plant()
-            self.action_set, self.components = plant.action_set, 1
+            self.action_set = plant.action_set
             given = problem.values["exploration_variance"]
             self.variance = given or self.action_set.exploration_variance
             self.noise = plant.instruments.measurement_noise
@@ -106,7 +105,6 @@ class Rollouts:
         """The model of measured rollouts."""
         how = Selection(
             target=self.target,
-            components=self.components,
             noise=self.noise,
             action_set=self.action_set,
         )
@@ -122,11 +120,6 @@ class Rollouts:
         except (linalg.LinAlgError, ValueError):
             return None
         return saturated(affine_law(K, b - K @ self.target), self.action_set)
-
-
-def plant_components(plant: Any) -> int:
-    """Fields that stand one after the other."""
-    return int(getattr(plant, "components", 1))
 
 
 def run(cases: Sequence[str] = ()) -> dict[str, Any]:

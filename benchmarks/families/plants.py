@@ -118,7 +118,6 @@ class FitzHughNagumo(RatePlant):
     sample_time, horizon = 0.2, 100
     state_weight, action_weight = 1.0, 1.0
     substeps = 8
-    components = 2
 
     def __init__(self) -> None:
         self.target = np.zeros(self.n_z)

@@ -112,8 +112,7 @@ def test_equations_are_recovered(equation, sample_time, steps, kind, error):
 )
 def test_plants_that_are_no_periodic_equation_are_recovered(name, count, variance, error):
     rollouts, target = rolled_out(name, count, variance)
-    components = getattr(getattr(plants, name), "components", 1)
-    fitted = fit_field_model(rollouts[:-1], target, components=components)
+    fitted = fit_field_model(rollouts[:-1], target)
     assert errors(fitted.model, rollouts[-1:], target, 2.0)[0] < error
 
 
@@ -138,8 +137,8 @@ def test_a_linear_plant_of_two_fields_is_a_convolution():
         for a in actions:
             states.append(step(states[-1], a))
         rollouts.append(Measured(np.array(states), actions))
-    fitted = fit_field_model(rollouts, np.zeros(2 * n_x), components=2)
-    assert fitted.model.kind == "convolution" and fitted.error < 1e-8
+    fitted = fit_field_model(rollouts, np.zeros(2 * n_x))
+    assert fitted.model.kind == "two-convolution" and fitted.error < 1e-8
 
 
 @cache
@@ -234,11 +233,10 @@ def test_a_field_that_rests_is_no_error():
 
 def test_kinds_for_large_states_have_no_matrix_of_their_size():
     settings = FieldModelSettings()
-    small = {kind.name for kind in kinds_of(512, 1, settings)}
-    large = {kind.name for kind in kinds_of(514, 1, settings)}
+    small = {kind.name for kind in kinds_of(512, settings)}
+    large = {kind.name for kind in kinds_of(514, settings)}
     near = {*NEAR_RIDGES, "two-near-shared"}
     assert small - large == {"two-convolution"} | near
-    assert "convolution" not in {kind.name for kind in kinds_of(514, 2, settings)}
 
 
 def test_an_offset_changes_no_linear_model() -> None:

@@ -304,7 +304,7 @@ def field_law(
     with one_thread():
         regression = regression_accuracy(limits, n_s, scale, models, noise, other.d is not None)
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    accepted = _accepted(known, most, BETTER)
+    accepted = _accepted(known, most)
     model = fitted.model
     own = fitted.own
     predicts = own.simulated < min(1.0, regression.simulated) and own.one_step < regression.one_step
@@ -359,15 +359,13 @@ def field_law(
     return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)
 
 
-def _accepted(
-    models: Sequence[tuple[FieldModel, Accuracy]], most: float, better: float
-) -> list[FieldModel]:
+def _accepted(models: Sequence[tuple[FieldModel, Accuracy]], most: float) -> list[FieldModel]:
     """The models whose errors are small, and not several times as large as those of another one.
 
     Errors of less than a millionth of the variation are equal.
     """
     simulated, once = (
-        better * max(min(own[i] for _, own in models), level)
+        BETTER * max(min(own[i] for _, own in models), level)
         for i, level in enumerate((EXACT, np.sqrt(EXACT)))
     )
     return [

@@ -254,11 +254,6 @@ _POINT_REACH = 2.5
 """Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
 
-def largest_rate(order: int) -> float:
-    """The largest rate of a difference on a unit grid; order: 0, 1, 2, and on as of the model."""
-    return 4.0 if order and order % 2 == 0 else 1.0
-
-
 def fit_finite_difference(
     samples: Samples,
     *,
@@ -313,8 +308,12 @@ def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
     """
     if not model.substeps:
         return 0
+    # Of a second difference on a unit grid the largest rate is 4, of others 1.
     growth = np.array(
-        [len(m) * size ** (len(m) - 1) * largest_rate(j) for m, j, _ in model.features]
+        [
+            len(m) * size ** (len(m) - 1) * (4.0 if j and j % 2 == 0 else 1.0)
+            for m, j, _ in model.features
+        ]
     )
     rate = float((np.abs(model.coefficients) * growth[:, None, None]).sum(axis=0).max())
     return int(np.clip(np.ceil(rate / reach), 2, _POINT_SUBSTEPS))

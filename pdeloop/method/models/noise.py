@@ -263,7 +263,7 @@ def denoised(states: Array, noise: float) -> Array:
     return clean
 
 
-def smoothed(fields: Array, noise: float, components: int = 1) -> Array:
+def smoothed(fields: Array, noise: float) -> Array:
     """Fields with the amplitude at each wavenumber that is nearest to that without noise in the mean.
 
     The Wiener filter (S - R)/S, with S the mean power of the fields at a wavenumber and R that of the
@@ -276,19 +276,15 @@ def smoothed(fields: Array, noise: float, components: int = 1) -> Array:
         Of one distribution.
     noise : float
         Standard deviation of the noise on every number.
-    components : int
-        Number of fields in a state, stored one after the other.
     """
-    parts = fields.reshape(len(fields), components, -1)
-    spectra = np.fft.rfft(parts)
-    signal, noise_power = signal_power(spectra, noise, parts.shape[2])
-    kept = signal / (signal + noise_power)
-    clean: Array = np.fft.irfft(kept * spectra, parts.shape[2]).reshape(fields.shape)
+    spectra, n_z = np.fft.rfft(fields), fields.shape[1]
+    signal, noise_power = signal_power(spectra, noise, n_z)
+    clean: Array = np.fft.irfft(signal / (signal + noise_power) * spectra, n_z)
     return clean
 
 
 def cleaned_states(
-    trajectories: Sequence[Array], noise: float, components: int = 1, *, line: bool = True
+    trajectories: Sequence[Array], noise: float, *, line: bool = True
 ) -> list[Array]:
     """States of trajectories `denoised`, the initial ones `smoothed` together where they are on a line.
 
@@ -296,14 +292,14 @@ def cleaned_states(
     ----------
     trajectories : sequence of (T, n_z) arrays
         None of them empty.
-    noise, components
+    noise : float
         As for `smoothed`.
     line : bool
         Whether the states are fields on one axis.
     """
     clean = [denoised(states, noise) for states in trajectories]
     if line and clean:
-        first = smoothed(np.stack([states[0] for states in trajectories]), noise, components)
+        first = smoothed(np.stack([states[0] for states in trajectories]), noise)
         for own, state in zip(clean, first, strict=True):
             own[0] = state
     return clean

@@ -176,13 +176,13 @@ class _Scaled:
         modes = np.ascontiguousarray(vectors[:, ::-1][:, kept])
         return _Scaled(samples, centre, scale, modes, action_centre, action_scale)
 
-    def empty(self, kind: str, leading: int) -> PolynomialModel:
+    def empty(self, leading: int) -> PolynomialModel:
         """The model without coefficients."""
         r, n_a = self.modes.shape[1], len(self.action_scale)
         numbers = [*range(min(leading, r)), *range(r, r + n_a)]
         pairs = list(combinations_with_replacement(numbers, 2))
         return PolynomialModel(
-            kind,
+            "polynomial",
             np.ascontiguousarray(self.modes / self.scale[:, None]),
             self.centre,
             self.action_centre,
@@ -221,9 +221,7 @@ class _Scaled:
         return found
 
 
-def fit_polynomial(
-    rollouts: Sequence[Measured], kind: str = "polynomial"
-) -> PolynomialModel | None:
+def fit_polynomial(rollouts: Sequence[Measured]) -> PolynomialModel | None:
     """The polynomial that predicts rollouts, and pieces of them, best that it was not fitted to."""
     rollouts = usable([Measured(own.known, own.actions) for own in rollouts])
     samples = Samples.of(rollouts)
@@ -239,11 +237,11 @@ def fit_polynomial(
         # Whole rollouts tell what is unstable, and pieces what is wrong where nothing predicts those.
         both = [own] if short else [own, _cut(own)]
         for i, q in enumerate(leading):
-            for j, model in enumerate(data.fits(data.empty(kind, q), ridges)):
+            for j, model in enumerate(data.fits(data.empty(q), ridges)):
                 missed[i, j] += sum(_error(model, parts, data.scale) for parts in both)
     i, j = divmod(int(np.argmin(missed)), len(ridges))
     data = _Scaled.of(samples)
-    return data.fits(data.empty(kind, leading[i]), [ridges[j]])[0]
+    return data.fits(data.empty(leading[i]), [ridges[j]])[0]
 
 
 def _cut(rollouts: Sequence[Measured]) -> list[Measured]:

@@ -88,8 +88,8 @@ from pdeloop.method.models.spectral import Form, fit_spectral
 from pdeloop.method.reduce.reduced_model import turns as held_out
 from pdeloop.process.one_thread import one_thread
 
-_FEWEST_POINTS = 8
-"""Minimum number of points of a field."""
+_FEWEST_POINTS, _FEWEST_CELLS = 8, 5
+"""Minimum number of points of a field, and of cells with neighbours."""
 NEAR_NEEDED = 0.05
 """Least E of the other kinds above which models of neighbours are tried."""
 DENSE = 512
@@ -156,12 +156,7 @@ class Kind:
 
 
 def kinds_of(
-    n_z: int,
-    components: int,
-    settings: FieldModelSettings,
-    *,
-    line: bool = True,
-    shape: tuple[int, ...] = (),
+    n_z: int, settings: FieldModelSettings, *, line: bool = True, shape: tuple[int, ...] = ()
 ) -> list[Kind]:
     """The kinds for states of that size.
 
@@ -185,15 +180,20 @@ def kinds_of(
         last.append(Kind("polynomial", lambda own, _: fit_polynomial(own), (n_z + 1.0, 0)))
     if not line:
         return linear + last
-    forms = FORMS if components == 1 and n_z >= _FEWEST_POINTS else ()
+    forms = FORMS if n_z >= _FEWEST_POINTS else ()
     spectral = [_spectral(own, settings) for own in forms if own.degree <= settings.largest_degree]
-    several, near = _several_fields(n_z, components, settings), _neighbours(n_z, components)
-    if components == 1:  # two fields that were not declared
-        two = _several_fields(n_z, 2, settings, "two-")
+    several, near = list[Kind](), list[Kind]()
+    for components, prefix in ((1, ""), (2, "two-")):  # fields that stand one after the other
+        n_x, rest = divmod(n_z, components)
+        if not rest and n_x >= _FEWEST_POINTS:
+            several += _finite_difference(components, settings, prefix)
+        if not rest and n_x >= _FEWEST_CELLS and n_z <= DENSE:
+            near += _neighbours(components, prefix)
+    if n_z % 2 == 0 and 2 * _FEWEST_POINTS <= n_z <= DENSE:
         # Linear ones are tried early, as that is quick.
-        spectral[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
-        several += [kind for kind in two if kind.name != "two-convolution"]
-        near += _neighbours(n_z, 2, "two-")
+        given = {"ridge": _CONVOLUTION_RIDGE, "components": 2}
+        convolution = _of_samples("two-convolution", fit_convolution, (2.0, 0), **given)
+        spectral.insert(SIMPLEST, convolution)
     # And equations of a high degree late, as that takes long.
     late = [kind for kind in spectral if kind.name == FORMS[-1].name]
     early = [kind for kind in spectral if kind.name != FORMS[-1].name]
@@ -225,26 +225,9 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
     return Kind(form.name, fit, form.unknowns, not form.free, enough=enough)
 
 
-def _several_fields(
-    n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
-) -> list[Kind]:
-    """Kinds of fields that stand one after the other; `prefix` is that of their names."""
-    if n_z % components or n_z // components < _FEWEST_POINTS:
-        return []
-    kinds: list[Kind] = []
-    if components > 1 and n_z <= DENSE:
-        given = {"ridge": _CONVOLUTION_RIDGE, "components": components}
-        name = f"{prefix}convolution"
-        kinds.append(_of_samples(name, fit_convolution, (float(components), 0), **given))
-    return kinds + _finite_difference(components, settings, prefix)
-
-
-def _neighbours(n_z: int, components: int, prefix: str = "") -> list[Kind]:
-    """Products of neighbours, for states that are no fields; arguments: as for `_several_fields`."""
-    count = components * len(neighbour_features(components))
-    if n_z % components or n_z // components < 5 or n_z > DENSE:
-        return []
-    kinds = []
+def _neighbours(components: int, prefix: str) -> list[Kind]:
+    """Products of neighbours, for states that are no fields; `prefix` is that of their names."""
+    count, kinds = components * len(neighbour_features(components)), list[Kind]()
     for name, ridge in NEAR_RIDGES.items():
         if ridge is not None and components > 1:
             continue  # too many unknowns
@@ -332,12 +315,10 @@ class FittedModel:
     own: Accuracy = UNKNOWN
 
 
-def with_clean(
-    rollouts: Sequence[Measured], noise: float, components: int = 1, *, line: bool = True
-) -> list[Measured]:
+def with_clean(rollouts: Sequence[Measured], noise: float, *, line: bool = True) -> list[Measured]:
     """The rollouts with denoised states."""
     rollouts = usable(rollouts)
-    clean = cleaned_states([r.states for r in rollouts], noise, components, line=line)
+    clean = cleaned_states([r.states for r in rollouts], noise, line=line)
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
 
 
@@ -492,8 +473,6 @@ class Selection:
         W of E (`errors`), in which the numbers of a state count as in the cost.
     undeclared : bool
         Whether noise that was not declared is looked for.
-    components : int
-        Number of fields in a state, stored one after the other.
     """
 
     target: Array
@@ -505,7 +484,6 @@ class Selection:
     shape: tuple[int, ...] = ()
     weights: Array | None = None
     undeclared: bool = True
-    components: int = 1
 
     @cached_property
     def most(self) -> float:
@@ -542,11 +520,11 @@ class Selection:
         if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
             return None
         if noise:
-            rollouts = with_clean(rollouts, noise, self.components, line=self.line)
+            rollouts = with_clean(rollouts, noise, line=self.line)
             share = share_of_noise(noise, [r.states for r in rollouts], target, self.weights)
             enough = min(_GROWN * share, REPRODUCED_NOISY)
             settings = replace(settings, reproduced=max(settings.reproduced, enough))
-        kinds = kinds_of(len(target), self.components, settings, line=self.line, shape=self.shape)
+        kinds = kinds_of(len(target), settings, line=self.line, shape=self.shape)
         if linear:
             kinds = [kind for kind in kinds if kind.name == LINEAR]
         if knows_noise:

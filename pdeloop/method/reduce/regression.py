@@ -210,15 +210,11 @@ def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
         d = means[1] @ U - centred.A @ (means[0] @ U) - centred.B @ means[2]
         return ReducedModel(centred.A, centred.B, U, d)
     # The modes keep their proportions, in which small ones are small; inputs have none to each other.
-    units = np.concatenate([np.full(n_s, _norm(s)), scaled(y)[1]])
+    units = np.concatenate([np.full(n_s, float(linalg.norm(s))), scaled(y)[1]])
     units[units == 0.0] = 1.0
     coefficients: Array = linalg.lstsq(np.hstack([s, y]) / units, data.after @ U)[0]
     coefficients /= units[:, None]
     return ReducedModel(A=coefficients[:n_s].T, B=coefficients[n_s:].T, U=U)
-
-
-def _norm(values: Array) -> float:
-    return float(linalg.norm(values))
 
 
 LOST, SHRUNK = 0.01, 0.1
