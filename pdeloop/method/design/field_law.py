@@ -46,20 +46,17 @@ from pdeloop.method.models import (
     Measured,
     affine_law,
 )
-from pdeloop.method.models.base import Law, Samples, predicted, saturated, usable
-from pdeloop.method.models.base import pieces as cut
+from pdeloop.method.models.base import Law, Samples, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
 from pdeloop.method.models.selection import (
     UNKNOWN,
     Accuracy,
-    Scale,
+    Kind,
     Selected,
     Selection,
-    accuracy_of,
     limited,
     scale_of,
-    turns,
 )
 from pdeloop.method.models.settings import BETTER
 from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
@@ -213,29 +210,15 @@ def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Sele
     return found
 
 
-def regression_accuracy(
-    rollouts: Sequence[Measured],
-    n_s: int,
-    scale: Scale,
-    models: FieldModelSettings,
-    noise: float,
-    constant: bool,
-) -> Accuracy:
-    """The accuracy of a regression of this order, on rollouts or pieces that it was not fitted to."""
-    if len(rollouts) == 1:
-        rollouts = cut(rollouts[0], models.folds)
-    parts = []
-    for others, own in turns(rollouts, models.folds):
-        samples = Samples.of(others)
-        try:
-            U, _ = leading_modes(samples.after, n_s)
-            data = Steps(samples.before, samples.after, samples.actions)
-            model = _whole(fit(data, U, constant))
-        except ValueError:  # fewer modes than that, or numbers that overflow
-            return UNKNOWN
-        own = usable(own)
-        parts.append((model, own, predicted(model, own)))
-    return accuracy_of(parts, scale, models.worst, noise)
+def regression_kind(n_s: int, constant: bool) -> Kind:
+    """The regression of this order as a kind of model, to be judged like the others."""
+
+    def made(rollouts: Sequence[Measured], _: float) -> FieldModel:
+        samples = Samples.of(rollouts)
+        U = leading_modes(samples.after, n_s)[0]
+        return _whole(fit(Steps(samples.before, samples.after, samples.actions), U, constant))
+
+    return Kind("regression", made, (float(n_s), 0))
 
 
 def _whole(model: ReducedModel | ModelRows) -> ProjectedModel:
@@ -302,7 +285,9 @@ def field_law(
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
     limits = [limited(rollout, action_set) for rollout in rollouts]
     with one_thread():
-        regression = regression_accuracy(limits, n_s, scale, models, noise, other.d is not None)
+        kind = regression_kind(n_s, constant=other.d is not None)
+        held = selection.judged(kind, limits, np.inf, models, scale)
+    regression = held[1] if held else UNKNOWN
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
     accepted = _accepted(known, most)
     model = fitted.model

@@ -237,14 +237,6 @@ def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, A
     return model.pull_back(states, actions, eye)
 
 
-def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str, *shape: int | None) -> Array:
-    """Finite real numbers of this shape among arrays; ValueError for anything else.
-
-    What is compiled does not look where an array ends.
-    """
-    return checked_array(arrays, name, "f", shape)
-
-
 def checked_substeps(steps: int, least: int = 1) -> int:
     """The internal steps of a sampling time; ValueError for none or too many."""
     if not least <= steps <= MAX_SUBSTEPS:

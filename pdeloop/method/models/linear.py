@@ -37,8 +37,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.jit.cache import cached_njit
+from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
-from pdeloop.method.models.base import Arrays, FieldModel, Samples, StoredModel, numbers_of
+from pdeloop.method.models.base import Arrays, FieldModel, Samples, StoredModel
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, fit_finite_difference
 from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 from pdeloop.method.reduce.reduced_model import Trajectory, turns
@@ -228,8 +229,8 @@ class ProjectedModel:
         inner = model_of(
             {name.removeprefix(_INNER): a for name, a in arrays.items() if name.startswith(_INNER)}
         )
-        P = numbers_of(arrays, "prolongation", None, inner.n_z)
-        return cls(inner, numbers_of(arrays, "restriction", inner.n_z, len(P)), P)
+        P = checked_array(arrays, "prolongation", "f", (None, inner.n_z))
+        return cls(inner, checked_array(arrays, "restriction", "f", (inner.n_z, len(P))), P)
 
 
 def _products(rows: Array, matrix: Array) -> Array:

@@ -76,7 +76,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import FieldModel, Measured, finite, least_squares, weighing
+from pdeloop.method.models.base import FieldModel, Measured, least_squares, usable, weighing
 from pdeloop.method.models.settings import (
     COEFFICIENT_RIDGE,
     FAR,
@@ -473,8 +473,7 @@ def fit_noisy(
     rollouts: with `clean`, the initial state of which is where the filter begins; noise: standard
     deviation of the noise on every number of their states.
     """
-    rollouts = [short for r in rollouts if len((short := finite(r)).actions)]
-    rollouts = _thinned(rollouts)
+    rollouts = _thinned(usable(rollouts))
     n_z, n_a = rollouts[0].states.shape[1], rollouts[0].actions.shape[1]
     first = [rollout.known[0] for rollout in rollouts]
     largest = max(float(np.abs(rollout.states).max()) for rollout in rollouts)

@@ -537,7 +537,7 @@ class Selection:
                 least = min(tried.values(), default=np.inf)
                 if not least > kind.needed:
                     continue
-                found = self._judged(kind, rollouts, least, settings, scale)
+                found = self.judged(kind, rollouts, least, settings, scale)
                 if found is not None:
                     error, own[kind] = found
                     error = own[kind].simulated if by_scale else error
@@ -559,13 +559,13 @@ class Selection:
                 if model is not None:
                     if scale and len(rollouts) == 1 and not kind.unknowns[0]:
                         parts = pieces(rollouts[0], settings.folds)
-                        held = self._judged(kind, parts, np.inf, settings, scale)
+                        held = self.judged(kind, parts, np.inf, settings, scale)
                         own[kind] = held[1] if held else UNKNOWN
                     seen = [(kind.name, error) for kind, error in tried.items()]
                     return FittedModel(model, tried[kind], seen, own[kind])
         return None
 
-    def _judged(
+    def judged(
         self,
         kind: Kind,
         rollouts: Sequence[Measured],

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Arrays, numbers_of, shaped
+from pdeloop.method.models.base import Arrays, shaped
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.spectral import ORDERS, SpectralModel, fewer_of, substeps_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
@@ -227,9 +227,10 @@ class SensedModel(SpectralModel):
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         own = shaped(arrays, cls.OWN)
-        own["shared"] = numbers_of(arrays, "shared", unknowns(whole.n_a))
+        own["shared"] = checked_array(arrays, "shared", "f", (unknowns(whole.n_a),))
         known = {name: getattr(whole, name) for name in _FIELDS}
-        where = {name: numbers_of(arrays, name, whole.n_a) for name in ("centres", "widths")}
+        size = (whole.n_a,)
+        where = {name: checked_array(arrays, name, "f", size) for name in ("centres", "widths")}
         if (where["widths"] < 0.0).any():
             raise ValueError(
                 f"a model has actuators of the width {where['widths'].min():g}; expected at least 0"
