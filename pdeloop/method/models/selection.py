@@ -36,7 +36,7 @@ equation's own errors.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -85,7 +85,7 @@ from pdeloop.method.models.settings import (
     FieldModelSettings,
 )
 from pdeloop.method.models.spectral import Form, fit_spectral
-from pdeloop.method.reduce.reduced_model import turns as held_out
+from pdeloop.method.reduce.reduced_model import turns
 from pdeloop.process.one_thread import one_thread
 
 _FEWEST_POINTS, _FEWEST_CELLS = 8, 5
@@ -320,31 +320,6 @@ def with_clean(rollouts: Sequence[Measured], noise: float, *, line: bool = True)
     rollouts = usable(rollouts)
     clean = cleaned_states([r.states for r in rollouts], noise, line=line)
     return [replace(r, clean=own) for r, own in zip(rollouts, clean, strict=True)]
-
-
-def turns(
-    rollouts: Sequence[Measured], folds: int
-) -> Iterable[tuple[list[Measured], list[Measured]]]:
-    """Rollouts to fit to and others to judge by, so that each is judged once; a single one is both."""
-    if len(rollouts) == 1:
-        return [(list(rollouts), list(rollouts))]
-    return held_out(rollouts, folds)
-
-
-def accuracy_of(
-    parts: Sequence[tuple[FieldModel, Sequence[Measured], Sequence[Array]]],
-    scale: Scale,
-    worst: float,
-    noise: float = 0.0,
-) -> Accuracy:
-    """The accuracy of models, each with rollouts to judge it by and what it predicts of them."""
-    found, sums = list[float](), np.zeros(2)
-    for model, own, simulated in parts:
-        own_weights = 1.0 / scale.units
-        found += errors(model, own, scale.reference, worst, noise, own_weights, simulated).tolist()
-        sums += one_step(model, own, scale.units)
-    with np.errstate(all="ignore"):
-        return Accuracy(float(np.mean(found)), float(np.sqrt(sums[0] / sums[1])))
 
 
 def fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:
@@ -582,23 +557,29 @@ class Selection:
         # Coefficients that all points share are hardly fitted to a single rollout's accidents.
         if len(rollouts) == 1 and kind.unknowns[0] > 0:
             rollouts = pieces(rollouts[0], settings.folds)
-        found: list[float] = []
-        parts: list[tuple[FieldModel, list[Measured], list[Array]]] = []
-        for others, own in turns(rollouts, settings.folds):
+        # A single one that is no piece is fitted to and judged by.
+        whole = [(list(rollouts), list(rollouts))]
+        found, relative, sums = list[float](), list[float](), np.zeros(2)
+        for others, own in whole if len(rollouts) == 1 else turns(rollouts, settings.folds):
             model = fitted(kind, others, self.noise)
             if model is None:
                 return None
             own = usable(own)
-            parts.append((model, own, predicted(model, own)))
-            known = self.target, settings.worst, self.noise, self.weights, parts[-1][2]
-            found += errors(model, own, *known).tolist()
+            known, simulated = (settings.worst, self.noise), predicted(model, own)
+            found += errors(model, own, self.target, *known, self.weights, simulated).tolist()
+            if scale is not None:
+                units = scale.units
+                missed = errors(model, own, scale.reference, *known, 1.0 / units, simulated)
+                relative, sums = relative + missed.tolist(), sums + one_step(model, own, units)
             if found and np.mean(found) > _HOPELESS * max(least, settings.reproduced):
                 break
         if not found:
             return None
         if scale is None:
             return float(np.mean(found)), UNKNOWN
-        return float(np.mean(found)), accuracy_of(parts, scale, settings.worst, self.noise)
+        with np.errstate(all="ignore"):
+            one = float(np.sqrt(sums[0] / sums[1]))
+        return float(np.mean(found)), Accuracy(float(np.mean(relative)), one)
 
     def select(self, rollouts: Sequence[Measured], first: str = "") -> Selected | None:
         """The model, which need not be accepted; None where none can be fitted.

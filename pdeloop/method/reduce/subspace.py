@@ -121,20 +121,20 @@ class InnovationModel:
 
         x_0 ~ N(0, I), as states are scaled, of the foremost measurements.
         """
-        L = linalg.cholesky(self.innovations, lower=True)
+        L, d = linalg.cholesky(self.innovations, lower=True), self.drift
         x, moved = np.zeros(len(self.A)), np.eye(len(self.A))
         rows, wanted = [np.eye(len(self.A))], [np.zeros(len(self.A))]
         for measured, a in zip(v[:foremost], actions, strict=False):
             rows.append(linalg.solve_triangular(L, self.C @ moved, lower=True))
             wanted.append(linalg.solve_triangular(L, measured - self.C @ x, lower=True))
-            x = self.A @ x + self.B @ a + self.G @ (measured - self.C @ x) + self.drift
+            x = self.A @ x + self.B @ a + self.G @ (measured - self.C @ x) + d
             moved = self.A @ moved - self.G @ (self.C @ moved)
         first: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
         x, e = first, np.empty_like(v)
         for k, measured in enumerate(v):
             e[k] = measured - self.C @ x
             if k < len(actions):
-                x = self.A @ x + self.B @ actions[k] + self.G @ e[k] + self.drift
+                x = self.A @ x + self.B @ actions[k] + self.G @ e[k] + d
         return first, e
 
 
