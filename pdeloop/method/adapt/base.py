@@ -23,6 +23,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.base import Law
+from pdeloop.method.laws.observer import Observer
 from pdeloop.method.models.sensed import Actuators
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 from pdeloop.method.settings import Settings as _Settings
@@ -207,6 +208,14 @@ class Context:
     def every_exploration(self) -> Sequence[Trajectory]:
         """The exploration of the reduced model first."""
         return (self.exploration, *self.further)
+
+    @cached_property
+    def of_readings(self) -> bool:
+        """Whether a filter's state tells what follows and the measured one does not.
+
+        So it is with few sensors, and where its state has the last actions, of which U is 0.
+        """
+        return isinstance(self.law, Observer) and (self.sensors > 0 or not self.U.any(axis=0).all())
 
     @cached_property
     def largest(self) -> float:

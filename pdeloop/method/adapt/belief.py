@@ -122,7 +122,7 @@ def believe(
     first : str
         The kind that is tried first, the one selected before; empty: none.
     """
-    if context.sensors and isinstance(context.law, Observer):
+    if context.of_readings:
         return _of_readings(context, records)
     selection = Selection(
         target=context.target,

@@ -189,7 +189,7 @@ class ModelBased(Optimizer):
         if isinstance(context.law, Predictive):
             few = isinstance(context.law, PredictiveKalman)
             return ModelBasedPredictiveSensed if few else ModelBasedPredictive
-        if not (context.sensors and isinstance(context.law, Observer)):
+        if not context.of_readings:
             return cls
         return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings
 

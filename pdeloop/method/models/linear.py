@@ -350,7 +350,9 @@ class ReadingsModel(LinearModel):
 
     def replay(self, readings: Array, actions: Array) -> tuple[Array, Array]:
         """The likeliest x_0 (n,) and the innovations (L, r) of readings and actions (L, ...)."""
-        own = InnovationModel(self.A, self.B, self.C, self.G, self.U, self.innovations, past=0)
+        own = InnovationModel(
+            self.A, self.B, self.C, self.G, self.U, self.innovations, past=0, d=self.constant
+        )
         return own.replay(readings[: len(actions)] @ self.U, actions, FOREMOST)
 
     def foreseen(self, first: Array, actions: Array) -> Array:
@@ -358,7 +360,7 @@ class ReadingsModel(LinearModel):
         x, found = first, []
         for a in actions:
             found.append(self.C @ x)
-            x = self.A @ x + self.B @ a
+            x = self.A @ x + self.B @ a + self.constant
         return np.array(found)
 
 
@@ -368,14 +370,21 @@ def fit_readings(
     """The model of rollouts (readings (L + 1, n_y), actions (L, n_a)), and its error E.
 
     E is that of readings of rollouts that it was not fitted to, foreseen from x_0 without innovations,
-    relative to sum |y - y_r|^2. ValueError where the data determine no model.
+    relative to sum |y - y_r|^2. It has a constant term if E is less with one. ValueError where the data
+    determine no model.
     """
-    whole = subspace_model(rollouts, order=order)
-    model = _model(whole)
-    missed = size = 0.0
+    found = [_fit_readings(rollouts, target, order, constant) for constant in (False, True)]
+    return min(found, key=lambda one: one[1])
+
+
+def _fit_readings(
+    rollouts: Sequence[Trajectory], target: Array, order: int, constant: bool
+) -> tuple[ReadingsModel, float]:
+    whole = subspace_model(rollouts, order=order, constant=constant)
+    model, missed, size = _model(whole), 0.0, 0.0
     for others, own in turns(rollouts, 2):
         try:
-            half = _model(subspace_model(others, order=order, past=whole.past))
+            half = _model(subspace_model(others, order=order, past=whole.past, constant=constant))
         except ValueError:
             return model, np.inf
         for y, a in own:
@@ -388,6 +397,5 @@ def fit_readings(
 
 
 def _model(found: InnovationModel) -> ReadingsModel:
-    none = np.zeros(len(found.A))
     own = found.C, found.G, found.U, found.innovations
-    return ReadingsModel("innovations", found.A, found.B, none, *own)
+    return ReadingsModel("innovations", found.A, found.B, found.drift, *own)
