@@ -21,9 +21,8 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws import Law
 from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import FeedForward, Observer
 from pdeloop.method.laws.neural import Neural
-from pdeloop.method.laws.observer import Observer
 
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
 """Columns of a curve."""

@@ -23,8 +23,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.neural import Neural
-from pdeloop.method.laws.observer import Observer
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from pde_sim_node.equations.registry import EQUATIONS
 from pde_sim_node.plants.loading import PLANTS
 from pdeloop.cli import COMMANDS
 from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
-from pdeloop.method.laws.registry import OWN_LAWS
 from tests.house.test_house import KNOWS, imports, sources
 from tests.support.interpreter import ROOT
 
@@ -56,20 +55,22 @@ def test_nothing_but_the_registry_names_an_equation(name: str) -> None:
     assert f"equation: {name}\n" in text
 
 
-KNOWING_FEED_FORWARD = ("closed_loop", "belief", "in_coordinates", "model_based")
-
-
 @pytest.mark.parametrize("name", PLANTS)
 def test_nothing_but_the_registry_names_a_plant(name: str) -> None:
     # Plants of one family share a file with their common base.
     assert who_names(PLANTS[name]) <= {*TABLE["a plant"], "pde_sim_node/plants/reactions.py"}
 
 
-def test_nothing_but_the_registry_and_model_based_name_a_law() -> None:
-    own = {f"pdeloop/method/adapt/{name}.py" for name in KNOWING_FEED_FORWARD}
-    own |= {"pdeloop/export.py"}  # its form in C
+def test_nothing_but_the_registry_names_a_law() -> None:
+    named = {
+        str(path.relative_to(ROOT))
+        for path in sources("pdeloop", *KNOWS)
+        if re.search(r"\bFeedForward\b", path.read_text())
+    }
+    own = {f"pdeloop/method/laws/{name}.py" for name in ("__init__", "linear")}
     own |= {"pdeloop/method/laws/extended.py"}  # laws that begin as it
-    assert who_names(OWN_LAWS.shipped["feedforward"]) <= {*TABLE["a law"], *own}
+    own |= {"pdeloop/export.py"}  # its form in C
+    assert named - own <= {*TABLE["a law"]}
 
 
 def test_the_package_offers_an_optimiser_as_any_other_package_would() -> None:

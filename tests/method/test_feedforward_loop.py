@@ -12,11 +12,11 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Record
-from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import track_horizon
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import FeedForward
 from pdeloop.method.models.linear import LinearModel
 
 N, N_A, T = 4, 2, 15
@@ -29,13 +29,13 @@ COST = Cost(N, N_A, T, state_weight=np.diag([1.0, 2.0, 0.5, 1.0]), action_weight
 MODEL = LinearModel("linear", A, B, DRIFT)
 
 
-def loop(**changes: object) -> FeedForwardLoop:
+def loop(**changes: object) -> LinearLoop:
     gains = np.zeros((N_A, N))
     rows = ModelRows(A=A, B=B, U=np.eye(N), K_a=gains, K_b=gains, s_r=np.zeros(N))
     law = FeedForward(rows, T)
     law.cost = COST
     problem = (np.eye(N), COST.field_target, *COST.size, T)
-    made = FeedForwardLoop(*problem, model=MODEL, cost=COST, law=law)
+    made = LinearLoop(*problem, model=MODEL, cost=COST, law=law)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 

@@ -14,7 +14,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqg import with_dead_time
 from pdeloop.method.design.lqt import track
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.reduce.input_delay import shifted, study_delays
 from pdeloop.method.reduce.reduced_model import ReducedModel
 

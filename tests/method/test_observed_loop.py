@@ -12,7 +12,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
-from pdeloop.method.adapt.closed_loop import ClosedLoop, ObservedLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import track
@@ -46,7 +46,7 @@ FIELDS = RNG.standard_normal((4, N_Z))
 WEIGHTS = np.array([0.1, 0.4, 0.3, 0.2])
 
 
-def loop_of(rows: ModelRows = ROWS, **others: object) -> ObservedLoop:
+def loop_of(rows: ModelRows = ROWS, **others: object) -> LinearLoop:
     law = Observer(rows, T)
     given = {
         "model": PLANT,
@@ -55,10 +55,10 @@ def loop_of(rows: ModelRows = ROWS, **others: object) -> ObservedLoop:
         "action_set": ActionSet(limit=LIMIT),
         **others,
     }
-    return ObservedLoop(rows.U, TARGET, 1.0, 0.5, T, **given)
+    return LinearLoop(rows.U, TARGET, 1.0, 0.5, T, **given)
 
 
-def some(loop: ObservedLoop) -> np.ndarray:
+def some(loop: LinearLoop) -> np.ndarray:
     law = loop.law
     return loop.theta(law.theta_start + 0.1 * RNG.standard_normal(law.size))
 
@@ -118,7 +118,7 @@ def test_where_few_numbers_are_seen_memory_wins_over_the_best_static_law() -> No
     own = {"model": PLANT, "noise": 0.3}
     static = ClosedLoop(one, TARGET, 1.0, 0.5, T, **own)
     law = Observer(seen, T)
-    observed = ObservedLoop(one, TARGET, 1.0, 0.5, T, **own, law=law)
+    observed = LinearLoop(one, TARGET, 1.0, 0.5, T, **own, law=law)
     begun = static.theta(seen.policy)
     best = improve(static, begun, fields, weights, curvature_of(static), settings)
     begun = observed.theta(law.theta_start)

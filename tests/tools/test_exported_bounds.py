@@ -18,9 +18,8 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws import Affine, Law
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import FeedForward, Observer
 from pdeloop.method.laws.neural import Layers, Neural
-from pdeloop.method.laws.observer import Observer
 from tests.tools.test_compare_and_export import DOUBLES, compiled
 
 N_Z, N_S, N_A, N_H, T = 6, 3, 4, 5, 12

@@ -8,7 +8,7 @@ import pytest
 
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Rollout, Trajectory
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.registry import along
 from tuner_node.law_check import check_law
 

@@ -23,7 +23,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.base import Law
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Linear, Observer
 from pdeloop.method.models.sensed import Actuators
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 from pdeloop.method.settings import Settings as _Settings
@@ -203,6 +203,12 @@ class Context:
     cost: Cost | None = None
     law: Law | None = None
     field_models: FieldModelSettings = DEFAULTS
+
+    @property
+    def with_constants(self) -> Linear | None:
+        """The law, where constants are parts of its theta; None: the affine one."""
+        law = self.law
+        return law if isinstance(law, Linear) and "1" in law.acts.values() else None
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:

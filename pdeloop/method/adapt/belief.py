@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record, State, numbers_of, part_of
-from pdeloop.method.adapt.closed_loop import ClosedLoop, FeedForwardLoop, ObservedLoop, ReplayedLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, ReplayedLoop
 from pdeloop.method.adapt.sensed_loop import sensed_loop
-from pdeloop.method.laws.feedforward import FeedForward
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Observer, at_step
 from pdeloop.method.models import FieldModel, Measured, affine_law
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.linear import ReadingsModel, fit_readings
@@ -99,11 +97,8 @@ class Belief:
             return ReplayedLoop(*of_readings, model=self.model, law=context.law, cost=cost)
         if isinstance(self.model, SensedModel):
             return sensed_loop(context, self.model)
-        if isinstance(context.law, Observer):
-            return ObservedLoop(*problem, **on, law=context.law)
-        if isinstance(context.law, FeedForward):
-            return FeedForwardLoop(*problem, **on, law=context.law)
-        return ClosedLoop(*problem, **on)
+        law = context.with_constants
+        return LinearLoop(*problem, **on, law=law) if law else ClosedLoop(*problem, **on)
 
 
 def believe(
@@ -170,14 +165,10 @@ def _measured(context: Context, record: Record) -> Measured:
     if explored or context.noise or isinstance(context.law, Observer):
         return Measured(record.states, record.actions)
     n_s = context.U.shape[1]
-    if isinstance(context.law, FeedForward):
-        parts = context.law.parts(record.policy)
-        gains, every = parts["K"] @ context.U.T, parts["b"]
-
-        def law(k: int, states: Array) -> Array:
-            return affine_law(gains, every[min(k, len(every) - 1)])(k, states)
-
-        return Measured(record.states, record.actions, law)
-    K = record.policy[:, :n_s] @ context.U.T
-    b = record.policy[:, n_s:] @ (context.U.T @ context.target)
-    return Measured(record.states, record.actions, affine_law(K, b))
+    if context.with_constants is not None:
+        parts = context.with_constants.parts(record.policy)
+        K, b = parts["K"] @ context.U.T, parts["b"]
+    else:
+        K = record.policy[:, :n_s] @ context.U.T
+        b = record.policy[:, n_s:] @ (context.U.T @ context.target)
+    return Measured(record.states, record.actions, lambda k, z: affine_law(K, at_step(b, k))(k, z))

@@ -15,7 +15,7 @@ affine law has no memory, and theta = [K_a b]. From an initial field z_0 the cos
 or another quadratic one. With g_k = dJ/d[r_k; u_k] of the adjoint (`pdeloop.method.models.sweep`) its
 gradient is dJ/dtheta = sum_k g_k [s_k; p_k; 1]^T.
 
-The memory of a law with an observer (`ObservedLoop`) is the prediction p of the reduced state, and its
+The memory of a law with an observer (`LinearLoop`) is the prediction p of the reduced state, and its
 theta is [D K b; G F c], with columns of b and c for each step where the target moves. On a model of
 the readings (`ReplayedLoop`) it replays measured innovations: an initial field is a row [x_0, e_0, ..,
 e_{T-1}] (`pdeloop.method.models.linear`), where a rollout began, and what in it no model predicted.
@@ -38,8 +38,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.design.lqt import DesignError, finite_horizon_of, track_outputs
-from pdeloop.method.laws.feedforward import FeedForward
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Linear
 from pdeloop.method.models import FieldModel
 from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
@@ -404,49 +403,21 @@ class Simulation:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class FeedForwardLoop(ClosedLoop):
-    """Laws a_k = K U^T z_k + b_k; theta is [K b_0 .. b_{T-1}].
-
-    Attributes
-    ----------
-    law : FeedForward
-        Whose vector of parameters a policy is.
-    """
-
-    law: FeedForward = field(kw_only=True)
-
-    constant_feature: ClassVar[float] = 1.0
-
-    @property
-    def constants(self) -> int:
-        return self.horizon
-
-    def theta(self, policy: Array) -> Array:
-        parts = self.law.parts(np.ravel(policy))
-        return np.hstack([parts["K"], parts["b"].T])
-
-    def policy(self, theta: Array, near: Array) -> Array:
-        n_s = self.U.shape[1]
-        parts = {"K": theta[:, :n_s], "b": theta[:, n_s:].T}
-        return self.law.vector(parts).reshape(near.shape)
-
-
 ROUND = 1e-2
 """Share of the identity in the cost matrix of a change of the memory, beyond that of the gains."""
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedLoop(ClosedLoop):
-    """A model under laws with an observer.
+class LinearLoop(ClosedLoop):
+    """A model under laws whose constants, and memory where they have one, are parts of their own.
 
     Attributes
     ----------
-    law : Observer
+    law : Linear
         That of the reduced model; policies are its theta, and theta here is Theta.
     """
 
-    law: Observer = field(kw_only=True)
+    law: Linear = field(kw_only=True)
 
     constant_feature: ClassVar[float] = 1.0
     """b and c are gains of their own, whatever the target is."""
@@ -456,31 +427,39 @@ class ObservedLoop(ClosedLoop):
         return len(np.atleast_2d(self.law.parts(self.law.theta_start)["b"]))
 
     def theta(self, policy: Array) -> Array:
-        """Theta (n_a + n_s, 2 n_s + constants) of the law's vector."""
-        p = self.law.parts(np.ravel(policy))
-        b, c = np.atleast_2d(p["b"]).T, np.atleast_2d(p["c"]).T
-        return np.block([[p["D"], p["K"], b], [p["G"], p["F"], c]])
+        """Theta (n_a + n_p, n_s + n_p + constants) of the law's vector."""
+        parts = self.law.parts(np.ravel(policy))
+        return np.block(
+            [
+                [
+                    np.atleast_2d(parts[name]).T if x == "1" else parts[name]
+                    for name, x in own.items()
+                ]
+                for own in self.law.outputs
+            ]
+        )
 
     def policy(self, theta: Array, near: Array) -> Array:
         """The law's vector, of the shape of `near`."""
-        n_a, n_s = self.law.n_a, len(self.law.model.A)
-        (D, K, b), (G, F, c) = (
-            np.split(rows, [n_s, 2 * n_s], axis=1) for rows in (theta[:n_a], theta[n_a:])
-        )
-        parts = {"D": D, "K": K, "b": b.T, "G": G, "F": F, "c": c.T}
-        others = self.law.parts(np.zeros(self.law.size))  # of a law that is derived from it
-        return self.law.vector({**others, **parts}).reshape(near.shape)
+        parts = dict(self.law.parts(np.zeros(self.law.size)))  # others of a law derived from it
+        for own, rows in zip(self.law.outputs, np.split(theta, [self.law.n_a]), strict=False):
+            columns = np.split(rows, self.U.shape[1] * np.arange(1, len(own)), axis=1)
+            for (name, x), part in zip(own.items(), columns, strict=True):
+                parts[name] = part.T if x == "1" else part
+        return self.law.vector(parts).reshape(near.shape)
 
     @property
     def memory_input(self) -> Array:
         """B of the reduced model."""
-        return self.law.model.B
+        return self.law.model.B[: self.law.memory_size]
 
     def curvature(self, own: Array) -> Array:
         """Cost matrix of a change of [a; u], from that of an action alone, (n_a, n_a).
 
         A prediction that is wrong by one moves the action by K.
         """
+        if not self.law.remembers:
+            return own
         K = self.law.model.K_a
         moved = K.T @ own @ K
         size = float(np.trace(moved)) / len(moved)
@@ -489,12 +468,14 @@ class ObservedLoop(ClosedLoop):
 
     def _noise(self, drawn: Array) -> Array:
         """Effect of the noise on U^T z, where the columns of U need not be orthonormal."""
+        if not self.law.remembers:
+            return super()._noise(drawn)
         R = linalg.qr(self.U, mode="r")[0][: min(self.U.shape)]
         return np.asarray(super()._noise(drawn)[..., : len(R)] @ R, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
-class ReplayedLoop(ObservedLoop):
+class ReplayedLoop(LinearLoop):
     """Laws with an observer on a `ReadingsModel`; U and target are those of U^T y."""
 
     replays: ClassVar[bool] = True

@@ -33,8 +33,6 @@ from pdeloop.method.adapt.base import (
 )
 from pdeloop.method.adapt.trajectories import LowRankTrajectory
 from pdeloop.method.laws.base import Law
-from pdeloop.method.laws.feedforward import FeedForward
-from pdeloop.method.laws.observer import Observer
 from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
 from pdeloop.process.one_thread import one_thread
 
@@ -77,10 +75,8 @@ class InCoordinates(Optimizer):
 
     def _law(self, context: Context) -> Law | None:
         """The law of the coordinates, where it is more than gains."""
-        if not isinstance(context.law, FeedForward | Observer):
-            return None
-        U = self.basis.coordinates(context.U.T).T
-        return type(context.law)(replace(context.law.model, U=U), context.law.horizon)
+        law, U = context.with_constants, self.basis.coordinates(context.U.T).T
+        return law and type(law)(replace(law.model, U=U), law.horizon)
 
     @classmethod
     def first_step(cls, settings: Any) -> int:

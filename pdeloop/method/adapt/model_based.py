@@ -78,9 +78,8 @@ from pdeloop.method.adapt.verdict import (
     measured_change,
     size_of,
 )
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.neural import Neural
-from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.noise import cleaned_states
 from pdeloop.method.seeds import field_seed
@@ -357,7 +356,7 @@ class ModelBased(Optimizer):
 
     def _law_about_target(self) -> Array | None:
         """One of all that was measured, while rollouts are left; else None."""
-        affine = not isinstance(self._context.law, FeedForward | Observer)
+        affine = self._context.with_constants is None
         left = self._records.count < self._schedule.last
         if not (affine and left and self._repeats) or self._progress.replayed:
             return None
@@ -510,7 +509,7 @@ class ModelBased(Optimizer):
         laws = by_law(self._records.all())
         own = [rolled for rolled in laws if not np.array_equal(rolled[0].policy, self._none)]
         costs = [float(np.mean([record.cost for record in rolled])) for rolled in own]
-        affine = not isinstance(self._context.law, FeedForward | Observer)
+        affine = self._context.with_constants is None
         lost = affine and len(costs) > 0 and not np.isfinite(costs[0])
         if not lost or (best.any() and not np.array_equal(best, self._first)):
             return None

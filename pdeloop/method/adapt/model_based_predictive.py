@@ -65,8 +65,8 @@ from pdeloop.method.adapt.verdict import (
     evidence_of_pairs,
     excess_of,
 )
-from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.linear import Affine
 from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.base import FieldModel

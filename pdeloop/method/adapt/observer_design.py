@@ -58,7 +58,7 @@ LEAST = 1e-8
 def compensators(
     loop: SensedLoop, law: WholeFieldLaw, settings: ModelBasedSettings | None = None
 ) -> Iterator[Array]:
-    """Theta (`ObservedLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
+    """Theta (`LinearLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
 
     One for each of `SHARES` and `ESTIMATED`. settings: of the descent to the law of newest readings,
     which without them is the regression's.

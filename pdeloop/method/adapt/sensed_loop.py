@@ -15,10 +15,10 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
-from pdeloop.method.adapt.closed_loop import ObservedLoop, Simulation
+from pdeloop.method.adapt.closed_loop import LinearLoop, Simulation
 from pdeloop.method.adapt.estimated_loop import simulate_estimated
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.models.sensed import SensedModel, interpolated, sensed_model
 from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
 from pdeloop.method.models.settings import (
@@ -41,7 +41,7 @@ _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array,
 
 
 @dataclass(frozen=True, eq=False)
-class SensedLoop(ObservedLoop):
+class SensedLoop(LinearLoop):
     """Laws with an observer on a `SensedModel`; U and target are those of its grid."""
 
     settings: FieldModelSettings = DEFAULTS

@@ -320,11 +320,6 @@ class Law(ABC):
         return {name: np.shape(part) for name, part in self.start().items()}
 
 
-def at_step(part: Array, k: int) -> Array:
-    """The row of step k of a part with one for each step, the last one beyond it; else the part."""
-    return part if part.ndim < 2 else part[min(k, len(part) - 1)]
-
-
 def float64(values: ArrayLike) -> Array:
     """The values as an array of float64."""
     return np.asarray(values, dtype=np.float64)

@@ -10,9 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.base import Law, Parts
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import Affine, FeedForward
 
 TIMED = 12
 """Steps that are timed."""

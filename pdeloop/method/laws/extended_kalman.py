@@ -11,7 +11,7 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Law, Parts
-from pdeloop.method.laws.observer import Observer
+from pdeloop.method.laws.linear import Observer
 from pdeloop.method.models.sensed import (
     WAVES,
     Actuators,

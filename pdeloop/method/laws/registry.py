@@ -22,12 +22,10 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.own_code import OwnCode, OwnCodeError, called
 from pdeloop.messages.spec import LAW_SETTINGS
-from pdeloop.method.laws.affine import Affine
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.feedforward import FeedForward
+from pdeloop.method.laws.linear import Affine, FeedForward, Observer
 from pdeloop.method.laws.neural import Neural
-from pdeloop.method.laws.observer import Observer
 from pdeloop.method.laws.predictive import Auto, AutoKalman, Predictive, PredictiveKalman
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
