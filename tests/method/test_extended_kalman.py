@@ -10,7 +10,8 @@ import pytest
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.adapt import ModelBased
-from pdeloop.method.adapt.estimated_loop import (
+from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
+from pdeloop.method.adapt.sensed_loop import (
     FILTER_INFLATION,
     FILTER_MODES,
     UNPREDICTED,
@@ -21,7 +22,6 @@ from pdeloop.method.adapt.estimated_loop import (
     root_mean_square,
     whole_field_law,
 )
-from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.laws.base import differentiable

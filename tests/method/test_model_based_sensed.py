@@ -17,10 +17,9 @@ from pdeloop.method.adapt import (
     Trajectory,
     model_based_sensed,
 )
-from pdeloop.method.adapt.estimated_loop import UNPREDICTED, noise_of_filter
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed, gained
 from pdeloop.method.adapt.progress import JUDGING
-from pdeloop.method.adapt.sensed_loop import sensed_from
+from pdeloop.method.adapt.sensed_loop import UNPREDICTED, noise_of_filter, sensed_from
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.models.sensed import SensedModel

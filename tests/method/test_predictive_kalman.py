@@ -17,11 +17,11 @@ from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult
 from pdeloop.method.adapt.base import Optimizer
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictiveSensed,
-    from_estimates,
 )
+from pdeloop.method.adapt.sensed_loop import from_estimates
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman
-from pdeloop.method.laws.plans import Planner, simulated
+from pdeloop.method.laws.plans import Planner, planned, simulated
 from pdeloop.method.laws.predictive import PredictiveKalman
 from pdeloop.method.laws.registry import action, along, updated
 from pdeloop.method.models.settings import DEFAULTS
@@ -102,7 +102,7 @@ def test_its_simulation_is_what_the_law_does_on_the_model() -> None:
     planner, known = law.planner(parts), law.kalman.filter(parts)
     assert known is not None
     found, noisy = (
-        simulated(planner, starts, from_estimates(planner, known, sigma))[0]
+        simulated(planner, starts, from_estimates(planned(planner), known, sigma))[0]
         for sigma in (0.0, CUBIC.noise)
     )
     cost = planner.cost

@@ -8,10 +8,15 @@ import pytest
 
 from pdeloop.method.adapt import Context, Record, Trajectory
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.estimated_loop import WholeFieldLaw, whole_field_law
 from pdeloop.method.adapt.model_based_sensed import cheapest, weighted
-from pdeloop.method.adapt.observer_design import compensators, law_theta
-from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_loop
+from pdeloop.method.adapt.sensed_loop import (
+    SensedLoop,
+    WholeFieldLaw,
+    compensators,
+    law_theta,
+    sensed_loop,
+    whole_field_law,
+)
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of

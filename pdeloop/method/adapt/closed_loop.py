@@ -478,11 +478,13 @@ class LinearLoop(ClosedLoop):
 class ReplayedLoop(LinearLoop):
     """Laws with an observer on a `ReadingsModel`; U and target are those of U^T y."""
 
+    model: ReadingsModel = field(kw_only=True)
+
     replays: ClassVar[bool] = True
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """[x_0, e] of each rollout; a shorter one continues without innovations."""
-        model, found = self._readings, []
+        model, found = self.model, []
         for record in records:
             first, e = model.replay(record.states, record.actions)
             whole = np.zeros((self.horizon, e.shape[1]))
@@ -492,7 +494,7 @@ class ReplayedLoop(LinearLoop):
 
     def curvature(self, own: Array) -> Array:
         """With R + B^T P B of the cost of the readings."""
-        model, cost = self._readings, self.cost
+        model, cost = self.model, self.cost
         seen = model.C if cost is None else np.eye(len(model.A))
         cost = cost or Cost(
             len(model.C),
@@ -508,26 +510,21 @@ class ReplayedLoop(LinearLoop):
             pass
         return super().curvature(own)
 
-    @property
-    def _readings(self) -> ReadingsModel:
-        assert isinstance(self.model, ReadingsModel)
-        return self.model
-
     def _start(self, fields: Array) -> Array:
         return fields[:, : self.model.n_z]
 
     def _innovations(self, fields: Array) -> Array:
         """e of each step."""
-        return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self._readings.C))
+        return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self.model.C))
 
     def _disturbances(self, fields: Array) -> Array:
-        moved: Array = self._innovations(fields) @ self._readings.G.T
+        moved: Array = self._innovations(fields) @ self.model.G.T
         return moved
 
     def _outputs(self, z: Array) -> Array:
-        v: Array = z @ self._readings.C.T
+        v: Array = z @ self.model.C.T
         return v
 
     def _pull_outputs(self, by_outputs: Array) -> Array:
-        by_z: Array = by_outputs @ self._readings.C
+        by_z: Array = by_outputs @ self.model.C
         return by_z

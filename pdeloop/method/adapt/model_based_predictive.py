@@ -50,10 +50,15 @@ from pdeloop.method.adapt.base import (
 )
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.estimate import ZERO, mean_change
-from pdeloop.method.adapt.estimated_loop import estimated_laws, least_trusting
 from pdeloop.method.adapt.improve import cheapest
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_loop
+from pdeloop.method.adapt.sensed_loop import (
+    SensedLoop,
+    estimated_laws,
+    from_estimates,
+    least_trusting,
+    sensed_loop,
+)
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
@@ -67,10 +72,10 @@ from pdeloop.method.adapt.verdict import (
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Affine
-from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated
+from pdeloop.method.laws.plans import Planner, planned, seen_with_noise, simulated
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.base import FieldModel
-from pdeloop.method.models.sensed import SensedFilter, SensedModel
+from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.seeds import field_seed
 from pdeloop.process.one_thread import one_thread
 
@@ -498,9 +503,8 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         known = law.filter(law.parts(np.ravel(policy)[: law.size]))
         if known is None:
             return np.full(len(fields), np.inf)
-        return simulated(planner, fields, from_estimates(planner, known, self._loop(belief).noise))[
-            0
-        ]
+        act = from_estimates(planned(planner), known, self._loop(belief).noise)
+        return simulated(planner, fields, act)[0]
 
     def _seeds(self) -> list[int]:
         """Those of fields of the trained law, and further ones where it has fewer."""
@@ -529,26 +533,3 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         ]
         own, others = np.array(pairs).reshape(-1, 2).T
         return evidence_of_pairs({base: others, PREDICTIVE: own}, base)
-
-
-def from_estimates(planner: Planner, known: SensedFilter, sigma: float) -> Act:
-    """Plans from the estimates of a filter, of readings with noise of this standard deviation."""
-    rng, of_plans, estimate = np.random.default_rng(0), planned(planner), known.start
-
-    def act(z: Array, before: Array, k: int) -> Array:
-        nonlocal estimate
-        if k == 0:
-            first, spread = known.start
-            estimate = np.tile(first, (len(z), 1)), np.tile(spread, (len(z), 1, 1))
-        else:
-            estimate = known.predicted(*estimate, before)
-        x, S = estimate
-        lost = ~np.isfinite(x).all(axis=1)
-        x[lost], S[lost] = 0.0, 0.0
-        seen = z[:, known.model.seen]
-        x, S = estimate = known.measured(x, S, seen + sigma * rng.standard_normal(seen.shape))
-        a = of_plans(x, before, k)
-        a[lost] = np.nan
-        return a
-
-    return act

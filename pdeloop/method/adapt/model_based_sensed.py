@@ -4,17 +4,17 @@
 Where one equation reproduces the readings of the rollouts (`pdeloop.method.models.sensed`), the law is
 designed and improved on it as on a model of the whole field, from the initial fields estimated from the
 readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those of `observer_design`. Laws are compared on other draws. In simulations of the
-filter's own equation what trusts it looks too good: the cheapest law on an estimate gets a filter that
-trusts the equation less where it then costs hardly more. The last rollouts of the final law begin where
-those of the first law did, and these pairs decide between the two: an equation that reproduces the
-readings may be wrong where no sensor is. An earlier law that measured better than the final one is
-returned in its place. Where no equation reproduces the rollouts, it continues with a model of the
-readings (`ModelBasedReadings`), in short steps from measured laws, and tries again with more of them. A
-linear model of the readings describes the plant near the fields of one law, and its innovations change
-with the law. So a step stays close to its starting point, the law with the best measured cost, and
-replays the innovations of its rollouts. Under its own law a rollout is reproduced exactly. Measured
-costs alone decide.
+current law and those that are designed on it (`sensed_loop`). Laws are compared on other draws. In
+simulations of the filter's own equation what trusts it looks too good: the cheapest law on an estimate
+gets a filter that trusts the equation less where it then costs hardly more. The last rollouts of the
+final law begin where those of the first law did, and these pairs decide between the two: an equation
+that reproduces the readings may be wrong where no sensor is. An earlier law that measured better than
+the final one is returned in its place. Where no equation reproduces the rollouts, it continues with a
+model of the readings (`ModelBasedReadings`), in short steps from measured laws, and tries again with
+more of them. A linear model of the readings describes the plant near the fields of one law, and its
+innovations change with the law. So a step stays close to its starting point, the law with the best
+measured cost, and replays the innovations of its rollouts. Under its own law a rollout is reproduced
+exactly. Measured costs alone decide.
 """
 
 from __future__ import annotations
@@ -28,14 +28,21 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Rollout, Row
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate, mean_of
-from pdeloop.method.adapt.estimated_loop import estimated_laws, least_trusting, whole_field_law
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from pdeloop.method.adapt.initial_fields import mixtures, weighted
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.observer_design import compensators
 from pdeloop.method.adapt.progress import JUDGING, RENEWING
 from pdeloop.method.adapt.replay import FEWEST, best_measured, step
-from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_from, sensed_loop, to_be_fitted
+from pdeloop.method.adapt.sensed_loop import (
+    SensedLoop,
+    compensators,
+    estimated_laws,
+    least_trusting,
+    sensed_from,
+    sensed_loop,
+    to_be_fitted,
+    whole_field_law,
+)
 from pdeloop.method.adapt.settings import FIRST_GAIN, READINGS_TRUST, ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,

@@ -1,25 +1,68 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A law with an observer on a model of the field between few sensors.
+"""A model of the field between few sensors under laws that estimate it, and the design of such laws.
 
-The initial field of a rollout is estimated from its readings
-(`pdeloop.method.models.sensed_fit`).
+The initial field of a rollout is estimated from its readings (`pdeloop.method.models.sensed_fit`). All
+designs begin with the best law of the whole field on the model, a = K x + b with x = V^T z and V the
+POD modes of simulated fields (`whole_field_law`).
+
+The law `extended_kalman` acts on the filter's estimate of the field as if that were the field:
+certainty equivalence, which is optimal where model and law are linear and the cost is quadratic. What
+is not known of the field in a closed loop is seen in simulations under the filter, of its own model or
+of others.
+
+The law `observer` combines it with a Kalman filter for the linear model that fits these simulations on
+average, by statistical linearisation,
+
+    x_{k+1} = A x_k + B a_k + c + w_k,    y_k = C x_k + d + v_k,
+
+A, c, C, d by least squares, B that of the model at the target. w is the residual of the regression plus
+a share of the initial second moment per step, because a steady filter does not know when an episode
+begins; v is the noise plus the part of a reading that the modes do not represent. A linearisation at
+the target would have unstable modes in directions that no field takes.
+
+Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So the
+law is also mixed with the best law of the newest readings, a = D y + b, found by a descent on the model
+from the regression of the actions on the readings.
+
+The law starts with p_0 = U^T y_0. The compensator's coordinates are those in which this is the best
+linear estimate of x_0 from the first readings.
+
+References
+----------
+Bar-Shalom, Tse, "Dual effect, certainty equivalence, and separation in stochastic control", IEEE
+Trans. Automatic Control 19(5), 1974.
+Booton, "Nonlinear control systems with random inputs", IRE Trans. Circuit Theory 1(1), 1954. Gelb
+(ed.), "Applied Optimal Estimation", 1974, section 6.4 (statistical linearisation).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
-from pdeloop.method.adapt.closed_loop import LinearLoop, Simulation
-from pdeloop.method.adapt.estimated_loop import simulate_estimated
+from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, Simulation
+from pdeloop.method.adapt.improve import curvature_of, improve
+from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.design.lqg import kalman_filter
+from pdeloop.method.design.lqt import DesignError, finite_horizon
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Observer
-from pdeloop.method.models.sensed import SensedModel, interpolated, sensed_model
+from pdeloop.method.laws.plans import Act, Planner, simulated
+from pdeloop.method.models.sensed import (
+    WAVES,
+    SensedFilter,
+    SensedModel,
+    coefficients_of,
+    interpolated,
+    sensed_model,
+)
 from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
 from pdeloop.method.models.settings import (
     DEFAULTS,
@@ -33,6 +76,27 @@ _LARGEST_COST = 3.0
 """Maximum cost of a rollout in a fit, per cost of the exploration."""
 _EXTRAPOLATION = 1.5
 """Maximum of simulated fields, relative to the estimated initial ones."""
+FILTER_MODES = 24
+"""Modes of the field that the law extended_kalman feeds back."""
+FILTER_INFLATION = 1.0
+"""Factor by which the standard deviations of its estimate grow in every step."""
+_FILTER_SEEN = 0.2
+"""Noise, as a share of the size of a field, for which one of its laws is optimised."""
+INDEPENDENT = (0.3, 1.0)
+"""Shares of the standard deviation of each wave that initial fields are assumed to have besides the
+covariance of those that were estimated; each makes a filter."""
+UNPREDICTED = (6.0, 3.0)
+"""Multiples of `filter_unpredicted` with which the cheapest law is tried again, one after the other."""
+SHARES = (0.01, 0.1, 1.0)
+"""Shares of the initial second moment that count as process noise over an episode; each makes laws."""
+ESTIMATED = (1.0, 0.5, 0.0)
+"""Shares of the action that follow the filter's estimate; the rest follows the newest readings."""
+RIDGE = 1e-6
+"""Of the regressions, relative to the mean square of a mode."""
+TOLD = 1e-2
+"""Least singular value of the estimate of x_0 from readings, relative to the largest."""
+LEAST = 1e-8
+"""Least variance of a noise, relative to the mean square of a reading or a mode."""
 
 _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
     WeakKeyDictionary()
@@ -44,6 +108,7 @@ _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array,
 class SensedLoop(LinearLoop):
     """Laws with an observer on a `SensedModel`; U and target are those of its grid."""
 
+    model: SensedModel = field(kw_only=True)
     settings: FieldModelSettings = DEFAULTS
 
     def theta(self, policy: Array) -> Array:
@@ -59,7 +124,24 @@ class SensedLoop(LinearLoop):
         if theta.ndim > 1:
             return super().simulate(theta, fields)
         assert isinstance(self.law, ExtendedKalman)
-        return simulate_estimated(self, self.law, theta, fields)
+        parts, count = self.law.parts(theta), len(fields)
+        allowed, known, n_a = self.action_set, self.law.filter(parts), self.model.n_a
+        K, b, features = parts["K_e"], parts["b"], np.empty((self.horizon, count, 0))
+        if known is None:
+            states, actions = (np.zeros((self.horizon, count, n)) for n in (self.model.n_z, n_a))
+            return Simulation(states, actions, np.full(count, np.inf), features)
+        plan = Planner(self.model, self.stage, allowed, K, b, around=False, steps=1, terminal=False)
+        act = from_estimates(
+            lambda x, before, k: allowed.project(x @ K.T + b, after=before), known, self.noise
+        )
+        costs, states, actions = simulated(plan, fields, act)
+        return Simulation(states.swapaxes(0, 1), actions.swapaxes(0, 1), costs, features)
+
+    def without_memory(self, U: Array, kind: type[ClosedLoop], noise: float = 0.0) -> ClosedLoop:
+        """The same model under laws a = K U^T z + b."""
+        weights = self.state_weight, self.action_weight
+        given = U, self.target, *weights, self.horizon, self.action_set
+        return kind(*given, model=self.model, noise=noise)
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""
@@ -67,15 +149,13 @@ class SensedLoop(LinearLoop):
 
     def smoothed(self, record: Record) -> tuple[Array, float]:
         """The initial field of a rollout, and its error."""
-        model = self.model
-        assert isinstance(model, SensedModel)
-        known = _SMOOTHED.setdefault(model, WeakKeyDictionary())
+        known = _SMOOTHED.setdefault(self.model, WeakKeyDictionary())
         if record not in known:  # each renewal and the verdict ask for all rollouts
-            known[record] = self._smooth(model, record)
+            known[record] = self._smooth(record)
         return known[record]
 
-    def _smooth(self, model: SensedModel, record: Record) -> tuple[Array, float]:
-        steps = len(record.actions)
+    def _smooth(self, record: Record) -> tuple[Array, float]:
+        model, steps = self.model, len(record.actions)
         if not steps or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[model.seen], self.state_weight * (model.n_z // model.sensors)
@@ -168,3 +248,285 @@ def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
         law=context.law,
         settings=context.field_models,
     )
+
+
+def from_estimates(of_fields: Act, known: SensedFilter, sigma: float) -> Act:
+    """The same from the estimates of a filter, of readings with noise of this standard deviation."""
+    rng, estimate = np.random.default_rng(0), known.start
+
+    def act(z: Array, before: Array, k: int) -> Array:
+        nonlocal estimate
+        if k == 0:
+            first, spread = known.start
+            estimate = np.tile(first, (len(z), 1)), np.tile(spread, (len(z), 1, 1))
+        else:
+            estimate = known.predicted(*estimate, before)
+        x, S = estimate
+        lost = ~np.isfinite(x).all(axis=1)
+        x[lost], S[lost] = 0.0, 0.0
+        seen = z[:, known.model.seen]
+        x, S = estimate = known.measured(x, S, seen + sigma * rng.standard_normal(seen.shape))
+        a = of_fields(x, before, k)
+        a[lost] = np.nan
+        return a
+
+    return act
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFieldLaw:
+    """The best law found of the whole field on a model.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+        Its U are the modes V.
+    theta : (n_a, n_s + 1) array
+        [K b].
+    simulation : Simulation
+        Of this law, from the fields that have a finite cost.
+    weights : array
+        Of these fields.
+    steps : int
+        Of L-BFGS.
+    """
+
+    loop: ClosedLoop
+    theta: Array
+    simulation: Simulation
+    weights: Array
+    steps: int
+
+
+def whole_field_law(
+    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings, modes: int
+) -> WholeFieldLaw | None:
+    """The best law of so many POD modes; None where none is finite."""
+    model, n = loop.model, loop.model.n_z
+    none = np.zeros(model.n_a)
+    A, B = model.linearise(loop.target, none)
+    drift = model.step(loop.target[None], none[None])[0] - loop.target
+    K, b = finite_horizon(A, B, drift, loop.state_weight, loop.action_weight, loop.horizon)
+    b = b - K @ loop.target
+    first = loop.without_memory(np.eye(n), ClosedLoop)
+    simulation = first.simulate(np.column_stack([K, b]), fields)
+    seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])
+    rows = linalg.svd(seen, full_matrices=False)[2][:modes]
+    whole = loop.without_memory(rows.T, ClosedLoop)
+    found = improve(
+        whole, np.column_stack([K @ rows.T, b]), fields, weights, curvature_of(whole), settings
+    )
+    if found is None:
+        return None
+    simulation = whole.simulate(found.theta, fields)
+    known = np.isfinite(simulation.costs)
+    if not known.any():
+        return None
+    share = weights[known] / weights[known].sum()
+    return WholeFieldLaw(whole, found.theta, simulation.of_fields(known), share, found.steps)
+
+
+def estimated_laws(
+    loop: SensedLoop,
+    law: ExtendedKalman,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+    models: FieldModelSettings,
+) -> tuple[list[Array], int]:
+    """Theta of laws on the estimate, and the steps of L-BFGS; none if none is finite.
+
+    That of the whole field, and one that is optimised with noise on what it sees, so that it depends
+    less on what an estimate has wrong; each with filters that know the initial fields well, and less.
+    """
+    model = loop.model
+    whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
+    if whole is None:
+        return [], 0
+    size = root_mean_square(model.spread)
+    noise = noise_of_filter(model, settings)
+    filters = [
+        SensedFilter(model, *prior(fields, weights, share), noise, FILTER_INFLATION)
+        for share in INDEPENDENT
+    ]
+    found, theta, steps = [], whole.theta, whole.steps
+    for share in (0.0, _FILTER_SEEN):
+        seen = replace(whole.loop, noise=share * size)
+        if share:
+            better = improve(seen, theta, fields, weights, curvature_of(seen), settings)
+            if better is None:
+                continue
+            theta, steps = better.theta, steps + better.steps
+        K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
+        found += [law.theta_of(K, b, known, models) for known in filters]
+    return found, steps
+
+
+def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
+    """Standard deviation of a reading for a filter: noise, and what the model does not predict of it.
+
+    times: multiple of the latter.
+    """
+    unpredicted = settings.filter_unpredicted * root_mean_square(model.spread)
+    return float(np.hypot(model.noise, times * unpredicted))
+
+
+def least_trusting(
+    loop: SensedLoop, law: ExtendedKalman, best: Array, fields: Array, settings: ModelBasedSettings
+) -> Array:
+    """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
+
+    Plants in simulations follow the filter's equation, or ones like it: what trusts it looks too good.
+
+    best: the law on an estimate that is cheapest from these fields.
+    """
+    model = loop.model
+    parts, costs = dict(law.parts(best)), loop.costs(best, fields)
+    known = np.isfinite(costs)
+    if not known.any():
+        return best
+    most = (1.0 + settings.filter_margin) * costs[known].mean()
+    for times in UNPREDICTED:
+        noise = noise_of_filter(model, settings, times)
+        other = law.vector(parts | {"noise": np.array([noise, FILTER_INFLATION])})
+        if loop.costs(other, fields)[known].mean() <= most:
+            return other
+    return best
+
+
+def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:
+    """Mean and factor (`SensedFilter`) of the Fourier coefficients of these weighted fields.
+
+    independent: share of the standard deviation of each wave that its cosine and sine have in addition,
+    independently, as a few fields do not have all that others may.
+    """
+    x = coefficients_of(fields)
+    mean = weights @ x
+    off = x - mean
+    covariance = off.T @ (weights[:, None] * off)
+    own = np.diag(covariance).copy()
+    waves = 0.5 * (own[1 : WAVES + 1] + own[WAVES + 1 :])
+    added = independent**2 * np.concatenate([own[:1], waves, waves])
+    values, vectors = np.linalg.eigh(covariance + np.diag(added))
+    return mean, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def root_mean_square(spread: Array) -> float:
+    """That of fields with independent Fourier coefficients of these standard deviations."""
+    return float(np.sqrt(spread[0] ** 2 + 2.0 * np.sum(spread[1:] ** 2)))
+
+
+def compensators(
+    loop: SensedLoop, law: WholeFieldLaw, settings: ModelBasedSettings | None = None
+) -> Iterator[Array]:
+    """Theta (`LinearLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
+
+    One for each of `SHARES` and `ESTIMATED`. settings: of the descent to the law of newest readings,
+    which without them is the regression's.
+    """
+    model = loop.model
+    z, a = law.simulation.states, law.simulation.actions
+    x, y = z @ law.loop.U, z[..., model.seen]
+    n_s, steps = x.shape[2], len(a)
+    weights = np.tile(law.weights / steps, steps)
+    before = np.column_stack([x[:-1].reshape(-1, n_s), np.ones(weights.size)])
+    B = law.loop.U.T @ model.linearise(loop.target, np.zeros(model.n_a))[1]
+    moved = (x[1:] - x[:-1]).reshape(-1, n_s) - a.reshape(-1, a.shape[2]) @ B.T
+    A, c, W = _regression(before, moved, weights)
+    A = A + np.eye(n_s)
+    C, d, V = _regression(before, y[:-1].reshape(-1, model.sensors), weights)
+    first = x[0].T @ (law.weights[:, None] * x[0])
+    noise = np.full(model.sensors, max(model.noise**2, LEAST * float(np.mean(y * y))))
+    V = V + np.diag(noise)
+    W = W + LEAST * np.trace(first) / n_s * np.eye(n_s)
+    seen = y[0].T @ (law.weights[:, None] * y[0]) + np.diag(noise)
+    guess = linalg.solve(seen, y[0].T @ (law.weights[:, None] * x[0]), assume_a="pos").T
+    read = np.column_stack([y[:-1].reshape(-1, model.sensors), np.ones(weights.size)])
+    D, own, _ = _regression(read, a.reshape(weights.size, -1), weights, np.append(noise, 0.0))
+    if settings is not None:
+        D, own = _of_readings(loop, D, own, z[0], law.weights, settings)
+    K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
+    for share in SHARES:
+        try:
+            M = kalman_filter(A, C, W + share / steps * first, V).M
+        except DesignError:
+            continue
+        I_MC = np.eye(n_s) - M @ C
+        after = A @ I_MC, A @ M, c - A @ M @ d
+        for part in ESTIMATED:
+            rows = part * K @ I_MC, part * K @ M, part * (b - K @ M @ d)
+            rest = (1.0 - part) * D, (1.0 - part) * own
+            mixed = rows[0], rows[1] + rest[0], rows[2] + rest[1]
+            yield law_theta(loop, B, guess, mixed, after)
+
+
+class _WithOffset(ClosedLoop):
+    """A loop whose law has an offset of its own, whatever the target is."""
+
+    constant_feature: ClassVar[float] = 1.0
+
+
+def _of_readings(
+    loop: SensedLoop,
+    D: Array,
+    own: Array,
+    fields: Array,
+    weights: Array,
+    settings: ModelBasedSettings,
+) -> tuple[Array, Array]:
+    """The law a = D y + b of the newest readings of least cost on the model, from one to begin with."""
+    model = loop.model
+    static = loop.without_memory(model.at_sensors(np.eye(model.sensors)), _WithOffset, loop.noise)
+    theta = np.column_stack([D, own])
+    found = improve(static, theta, fields, weights, curvature_of(static), settings)
+    if found is not None:
+        theta = found.theta
+    return theta[:, :-1], theta[:, -1]
+
+
+def _regression(
+    features: Array, wanted: Array, weights: Array, noise: Array | float = 0.0
+) -> tuple[Array, Array, Array]:
+    """Matrix and constant of the weighted regression on [x; 1], and the covariance of its residual.
+
+    noise: variances of what will be added to the features.
+    """
+    weighted = features * weights[:, None]
+    moment = features.T @ weighted
+    n = len(moment) - 1
+    moment[np.diag_indices(n)] += RIDGE * np.trace(moment[:n, :n]) / n
+    moment[np.diag_indices(n + 1)] += noise
+    found = linalg.solve(moment, weighted.T @ wanted, assume_a="pos")
+    left = wanted - features @ found
+    return found[:n].T, found[n], left.T @ (weights[:, None] * left)
+
+
+def law_theta(
+    loop: SensedLoop,
+    B: Array,
+    guess: Array,
+    rows: tuple[Array, Array, Array],
+    after: tuple[Array, Array, Array],
+) -> Array:
+    """Theta of a = K x + D y + b, x+ = F x + G y + B a + c, with p in place of x.
+
+    guess (n_s, n_y): x_0 from y_0; rows [K D b]; after [F G c], without B a.
+    """
+    left, values, _ = linalg.svd(loop.law.model.U.T)
+    rank = int(np.sum(values > 1e-9 * values[0]))
+    inside, outside = left[:, :rank], left[:, rank:]
+    readings = linalg.pinv(loop.law.model.U.T)  # of s
+    # Readings that say nothing of x_0 move it a little, so that T has an inverse.
+    turned, told, back = linalg.svd(guess @ readings @ inside, full_matrices=False)
+    own = (turned * np.maximum(told, TOLD * told[0])) @ back
+    other = linalg.svd(own)[0][:, rank:]
+    # p = T x with p_0 = s_0.
+    T = inside @ linalg.pinv(own) + outside @ other.T / told[0]
+    back = linalg.inv(T)
+    (K, D, b), (F, G, c) = rows, after
+    K, D = K @ back, D @ readings
+    F, G = T @ F @ back, T @ G @ readings
+    # The law adds B a with the B of its own model.
+    moved = T @ B - loop.law.model.B
+    F, G, c = F + moved @ K, G + moved @ D, T @ c + moved @ b
+    return np.block([[D, K, b[:, None]], [G, F, c[:, None]]])
