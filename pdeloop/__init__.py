@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from pdeloop.method.adapt.base import Optimizer as Optimizer
     from pdeloop.method.adapt.base import Rollout as Rollout
     from pdeloop.method.adapt.base import RolloutResult as RolloutResult
-    from pdeloop.method.adapt.step_optimizer import StepOptimizer as StepOptimizer
+    from pdeloop.method.adapt.base import StepOptimizer as StepOptimizer
     from pdeloop.method.design.lqt import track as track
     from pdeloop.method.design.lqt import track_horizon as track_horizon
     from pdeloop.method.laws.base import Law as Law

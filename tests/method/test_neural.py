@@ -18,8 +18,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import RolloutResult, Trajectory
-from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
-from pdeloop.method.adapt.network import Network, NetworkTraining
+from pdeloop.method.adapt.network import ModelBasedNeural, Network, NetworkTraining
 from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner, simulated

@@ -7,7 +7,7 @@ from pdeloop.method.adapt.base import Record as Record
 from pdeloop.method.adapt.base import Rollout as Rollout
 from pdeloop.method.adapt.base import RolloutResult as RolloutResult
 from pdeloop.method.adapt.base import State as State
+from pdeloop.method.adapt.base import StepOptimizer as StepOptimizer
 from pdeloop.method.adapt.base import Trajectory as Trajectory
 from pdeloop.method.adapt.model_based import ModelBased as ModelBased
-from pdeloop.method.adapt.step_optimizer import StepOptimizer as StepOptimizer
 from pdeloop.method.adapt.two_point import TwoPoint as TwoPoint

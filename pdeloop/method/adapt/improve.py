@@ -130,29 +130,8 @@ def improve(
     # s and the constants each in its own unit.
     units = np.append(np.full(count, size), np.full(loop.constants, 1.0 / loop.constants))
     moment[np.diag_indices(len(moment))] += _ISOTROPY * units
+    coordinates = Coordinates(curvature, moment)
     gain = settings.least_gain if least_gain is None else least_gain
-    return _descend(
-        loop,
-        theta,
-        fields,
-        weights,
-        Coordinates(curvature, moment),
-        settings,
-        gain,
-        trust,
-    )
-
-
-def _descend(
-    loop: ClosedLoop,
-    theta: Array,
-    fields: Array,
-    weights: Array,
-    coordinates: Coordinates,
-    settings: ImprovementSettings,
-    least_gain: float,
-    trust: float,
-) -> Improvement:
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
 
@@ -182,7 +161,7 @@ def _descend(
         values.append(least / before)
         earlier = values[max(len(values) - 1 - _WINDOW, 0)]
         few = len(values) <= _WINDOW
-        if not few and earlier - values[-1] <= least_gain * values[-1]:
+        if not few and earlier - values[-1] <= gain * values[-1]:
             raise StopIteration
 
     minimize(

@@ -176,12 +176,12 @@ class ModelBased(Optimizer):
     def for_context(cls, context: Context) -> type[Optimizer]:
         """Another one for a law that plans, has a network, or estimates the state from few readings."""
         # Not at the top: they know this class.
-        from pdeloop.method.adapt.model_based_neural import ModelBasedNeural
         from pdeloop.method.adapt.model_based_predictive import (
             ModelBasedPredictive,
             ModelBasedPredictiveSensed,
         )
         from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
+        from pdeloop.method.adapt.network import ModelBasedNeural
 
         if isinstance(context.law, Neural):
             return ModelBasedNeural

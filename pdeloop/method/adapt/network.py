@@ -1,7 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A network beside an affine law, trained on a model of the plant.
+"""`model_based` for the law `neural`: first the affine law, then a network beside it, and rollouts.
 
-With s = U^T z of mean m and covariance C in the episodes of the law a_k = K s_k + b_k,
+The last rollouts are of the law with the network, from fresh fields, and replace the affine law only if
+it is better by more than chance (`verdict`). With s = U^T z of mean m and covariance C in the episodes
+of the law a_k = K s_k + b_k,
 
     a_k = K s_k + b_k + E (A x_k + c + D tanh(W [x_k; r_k] + w)),    x = (C + e |C| I)^-1/2 (s - m),
     E = share sqrt(J / T) G^-1/2,                                    G = R + B^T P B,
@@ -10,8 +12,9 @@ so that no number depends on the units of states and actions. r_k is b_k in such
 changes: what the target of that step and those to come ask for. D, A and c are zero at first. Two
 descents follow, both by Adam with a step length that falls as a cosine:
 
-    imitation   mean |G^1/2 (a - a*)|^2 of the actions a* of plans, from the states of episodes that
-                plans control, and of others that the network controls (DAgger)
+    imitation   mean |G^1/2 (a - a*)|^2 of the actions a* of the plans that the law `predictive` would
+                use on the same model, from the states of episodes that plans control, and of
+                others that the network controls (DAgger)
     improvement mean over z_k of sum_{i < H} l_{k+i} + V(z_{k+H}), the cost of plans, with the exact
                 gradient through all steps of the model; z_k are states of episodes of the network
 
@@ -29,14 +32,22 @@ over short parts of episodes, closed by a cost to go). Polyak, Juditsky, SIAM J.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt.base import Context, Row
+from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.improve import curvature_of
 from pdeloop.method.adapt.initial_fields import mixtures
-from pdeloop.method.laws.neural import Layers
+from pdeloop.method.adapt.model_based_predictive import Candidate, ModelBasedPredictive, share_saved
+from pdeloop.method.adapt.verdict import NEURAL
+from pdeloop.method.laws.neural import Layers, Neural
 from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated
+from pdeloop.method.laws.predictive import Predictive
 
 LABELLED, LABEL_STEPS = 24, 200
 """Initial fields from which actions are imitated, and steps of each at most, in each round."""
@@ -58,6 +69,78 @@ AVERAGED = 0.02
 """Weight of the last iterate in the average."""
 _SHARE, _RIDGE, _DRAWN = 0.3, 1e-2, 48
 _BETAS = 0.9, 0.999
+_STREAM = 0x4E4554  # "NET"
+
+
+class ModelBasedNeural(ModelBasedPredictive):
+    """`ModelBased`, and then the law `neural` on its model; parameters as there."""
+
+    candidate = NEURAL
+
+    def __init__(
+        self, policy0: ArrayLike, *, context: Context | None = None, **others: Any
+    ) -> None:
+        if context is None or not isinstance(context.law, Neural):
+            raise ValueError("this optimiser needs a context with the law neural")
+        self._neural = context.law
+        plans = Predictive(self._neural.model, self._neural.horizon)
+        plans.cost = self._neural.cost
+        super().__init__(policy0, context=replace(context, law=plans), **others)
+
+    def _made(self, belief: Belief, row: Row) -> Candidate | str:
+        """The law with the network of this model; or why there is none."""
+        policy, context, own = self._affine.policy, self._context, self._neural
+        fields, _ = self._simulated(belief, policy)
+        planner, _ = self._planner(belief, policy, fields)
+        K, b = own.feedback(own.without.parts(np.ravel(policy)))
+        loop, every = belief.loop(context), self._affine.fields
+        costs, states, _ = simulated(planner, every, self._acts(planner, policy, loop.noise))
+        known = np.isfinite(costs)
+        if not (known.any() and costs[known].any()):
+            return f"the law {own.without.name} does not stay finite on the model, or costs nothing"
+        network = Network.of(
+            context.U,
+            K,
+            b,
+            states[known].reshape(-1, states.shape[2]),
+            curvature_of(loop),
+            float(costs[known].mean()),
+            own.settings.neurons,
+        )
+        training = NetworkTraining(
+            network,
+            planner,
+            every,
+            [self._seed, _STREAM, self._count],
+            belief.components,
+            periodic=context.periodic,
+            noise=loop.noise,
+        )
+        numbers = training.trained(own.settings.iterations)
+        every = np.concatenate([every, training.drawn(HELD_OUT)])
+        before = simulated(planner, every, self._acts(planner, policy, loop.noise))[0]
+        after = training.costs(numbers, every)
+        row["network_saves"] = share_saved(after, before)
+        if not np.sum(after) < np.sum(before):
+            return "on the model no network is better"
+        return Candidate(own.theta_of(policy, *network.folded(numbers)), after, before)
+
+    def _acts(self, planner: Planner, theta: Array, noise: float) -> Act:
+        """The law of a theta in simulations."""
+        own, parts = self._neural, self._neural.parts(np.ravel(theta))
+
+        def law(z: Array, k: int) -> Array:
+            return np.stack([own.action(parts, row, np.zeros(0), k) for row in z])
+
+        return acting(planner, law, noise)
+
+    def _check(self, theta: Array) -> None:
+        self._neural.layers(self._neural.parts(theta)["network"])
+
+    def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
+        planner = self._plain(belief, self._affine.policy, self._affine.fields)
+        noise = belief.loop(self._context).noise
+        return simulated(planner, fields, self._acts(planner, theta, noise))[0]
 
 
 @dataclass(frozen=True, eq=False)

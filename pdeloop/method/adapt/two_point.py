@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Rollout, RolloutResult, Row, require_positive
-from pdeloop.method.adapt.step_optimizer import StepOptimizer
+from pdeloop.method.adapt.base import Rollout, RolloutResult, Row, StepOptimizer, require_positive
 from pdeloop.method.seeds import DIRECTION_STREAM
 from pdeloop.method.settings import Settings
 
