@@ -117,8 +117,10 @@ class ClosedLoop:
         """Columns of theta that are constant parts: 1, or one for each step."""
         return 1
 
-    replays: ClassVar[bool] = False
-    """True if initial fields are measured rollouts, with what in them was not foreseen."""
+    @property
+    def replays(self) -> bool:
+        """True if initial fields are measured rollouts, with what in them was not foreseen."""
+        return self.readings is not None
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, (n, n_z)."""
@@ -249,13 +251,15 @@ class ClosedLoop:
         v = np.zeros((len(fields), self.horizon, len(theta)))
         if self.constants > 1:
             v += constants.T
-        begin = self._start(fields)
+        begin, e = fields[:, : self.model.n_z], self._innovations(fields)
         first = self._outputs(begin) @ self.U
         if offsets is not None:
             v += offsets @ gains.T
             first += offsets[:, 0]
         b = constants[:, 0] if self.constants == 1 else np.zeros(len(theta))
-        return np.hstack([begin, first[:, :n_p]]), v, K, b, self._disturbances(fields)
+        if self.readings is not None:
+            e = e @ self.readings.G.T
+        return np.hstack([begin, first[:, :n_p]]), v, K, b, e if e.size else None
 
     def _cost_and_slopes(
         self, states: Array, actions: Array, fields: Array
@@ -265,8 +269,9 @@ class ClosedLoop:
         z, cost = states[:, :-1, :n_z], self.stage
         on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
         if self.cost is None:
-            innovations = self._innovations(fields)
-            outputs = self._outputs(z) if innovations is None else self._outputs(z) + innovations
+            outputs = self._outputs(z)
+            if self.readings is not None:
+                outputs = outputs + self._innovations(fields)
             J, on_outputs, on_actions = cost.along(outputs, actions, 0)
             on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
         else:
@@ -340,31 +345,29 @@ class ClosedLoop:
         by_step = np.einsum("kfi,f->ik", features[:, :, :-1], weights) / T
         return np.block([[found[:-1, :-1], by_step], [by_step.T, np.eye(T) / T]])
 
-    def _start(self, fields: Array) -> Array:
-        """The model's state at the beginning; replayed rollouts have innovations after it."""
-        return fields[:, : len(self.U)]
+    @property
+    def readings(self) -> ReadingsModel | None:
+        """The model, where y = C z + e is what a law sees, and G e moves the state; else None."""
+        return self.model if isinstance(self.model, ReadingsModel) else None
 
-    def _disturbances(self, fields: Array) -> Array | None:
-        """What is added to the states after each step, (F, T, n_z); None: nothing is."""
-        n_z = len(self.U)
-        return fields[:, n_z:].reshape(len(fields), -1, n_z) if fields.shape[1] > n_z else None
+    def _innovations(self, fields: Array) -> Array:
+        """e of each step, (F, T, n_e), which replayed rollouts have after their beginning."""
+        e, T = fields[:, self.model.n_z :], self.horizon
+        return e.reshape(len(e), T, e.shape[1] // T)
 
     def _outputs(self, z: Array) -> Array:
-        """What U^T is applied to, and the target is of, for states (..., n_z)."""
-        return z
-
-    def _innovations(self, fields: Array) -> Array | None:
-        """What is added to the outputs, (F, T, n_y): measured ones; None: nothing is."""
-        return None
+        """What U^T is applied to, and the target is of, for states (..., n_z), without e."""
+        return z if self.readings is None else z @ self.readings.C.T
 
     def _pull_outputs(self, by_outputs: Array) -> Array:
         """The derivative by z of that by the outputs."""
-        return by_outputs
+        return by_outputs if self.readings is None else by_outputs @ self.readings.C
 
     def _offsets(self, fields: Array) -> Array | None:
         """What is added to s, (F, T, n_s); None: nothing is."""
-        innovations = self._innovations(fields)
-        found = None if innovations is None else innovations @ self.U
+        found = None
+        if self.readings is not None:
+            found = self._innovations(fields) @ self.U
         if self.noise:
             size = self.horizon, len(fields), self.U.shape[1]
             drawn = self._noise(np.random.default_rng(0).standard_normal(size)).swapaxes(0, 1)
@@ -480,8 +483,6 @@ class ReplayedLoop(LinearLoop):
 
     model: ReadingsModel = field(kw_only=True)
 
-    replays: ClassVar[bool] = True
-
     def beginnings(self, records: Sequence[Record]) -> Array:
         """[x_0, e] of each rollout; a shorter one continues without innovations."""
         model, found = self.model, []
@@ -509,22 +510,3 @@ class ReplayedLoop(LinearLoop):
         except DesignError:
             pass
         return super().curvature(own)
-
-    def _start(self, fields: Array) -> Array:
-        return fields[:, : self.model.n_z]
-
-    def _innovations(self, fields: Array) -> Array:
-        """e of each step."""
-        return fields[:, self.model.n_z :].reshape(len(fields), -1, len(self.model.C))
-
-    def _disturbances(self, fields: Array) -> Array:
-        moved: Array = self._innovations(fields) @ self.model.G.T
-        return moved
-
-    def _outputs(self, z: Array) -> Array:
-        v: Array = z @ self.model.C.T
-        return v
-
-    def _pull_outputs(self, by_outputs: Array) -> Array:
-        by_z: Array = by_outputs @ self.model.C
-        return by_z
