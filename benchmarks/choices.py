@@ -231,7 +231,7 @@ def table_of(name: str, seed: int, *, rollouts: int, seeds: Sequence[int]) -> Ta
 
     began = pdeloop.rollout(pair.plant, lambda k, z: np.zeros((len(z), len(none))), seeds)
     fields = np.ascontiguousarray(began.fields[0])
-    left_out = [left_out_costs(loop, base, [part], fields, count) for part in parts]
+    left_out = [left_out_costs(loop, base, [part], fields) for part in parts]
     return Table(
         np.stack([costs(theta) for theta in laws]),
         np.stack([loop.costs(theta, fields) for theta in laws]),

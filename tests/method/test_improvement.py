@@ -11,8 +11,14 @@ import pytest
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import improve
-from pdeloop.method.adapt.initial_fields import averaged_over_shifts, invariant_share, mixtures
-from pdeloop.method.adapt.renewal import Renewal, is_overfitted, renew
+from pdeloop.method.adapt.renewal import (
+    Renewal,
+    averaged_over_shifts,
+    invariant_share,
+    is_overfitted,
+    mixtures,
+    renew,
+)
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import track
 from pdeloop.method.models.linear import LinearModel

@@ -10,7 +10,7 @@ import pytest
 
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.initial_fields import (
+from pdeloop.method.adapt.renewal import (
     any_state_serves,
     initial_fields,
     is_chaotic,

@@ -322,6 +322,7 @@ class Optimizer(Protocol):
     @classmethod
     def first_step(cls, settings: Any) -> int:
         """Rollouts of its first step, without which there is nothing to adapt with."""
+        return 1
 
     @classmethod
     def settings_of(cls, values: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

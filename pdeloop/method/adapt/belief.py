@@ -106,16 +106,9 @@ def believe(
 ) -> Belief | None:
     """The model that predicts the rollouts, as `Selection` says; None where none can be fitted.
 
-    Parameters
-    ----------
-    context : Context
-        The law's basis and target.
-    records : sequence of Record
-        Explorations, whose policy is zero and whose cost is infinite, and rollouts of laws.
-    accepted : float
-        Largest E of a model that is accepted without noise.
-    first : str
-        The kind that is tried first, the one selected before; empty: none.
+    records: explorations, whose policy is zero and whose cost is infinite, and rollouts of laws;
+    accepted: largest E of a model that is accepted without noise; first: the kind that is tried first,
+    the one selected before; empty: none.
     """
     if context.of_readings:
         return _of_readings(context, records)

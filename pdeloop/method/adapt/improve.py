@@ -95,23 +95,10 @@ def improve(
 ) -> Improvement | None:
     """The law after a descent, or None where no law to begin with is finite on the model.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The model and the cost.
-    theta : (n_a, n_s + 1) array
-        The law to begin with. It is halved where its simulations are not finite from any field.
-    fields, weights : (F, n_z) and (F,) arrays
-        Initial fields; those from which the law to begin with is not finite are left out.
-    curvature : (n_a, n_a) array
-        G.
-    settings : ImprovementSettings
-        Constants of the descent.
-    least_gain : float, optional
-        In place of that of the settings.
-    trust : float
-        Weight of the added cost |x - x_0|^2, with x_0 the initial law: for a linear plant the step is
-        1/(1 + trust) of the whole one.
+    theta: the law to begin with, which is halved where it is not finite from any field; fields (F, n_z)
+    and weights: initial fields, of which those from which it is not finite are left out; curvature: G;
+    least_gain: in place of that of the settings; trust: weight of the added cost |x - x_0|^2, with x_0
+    the initial law: for a linear plant the step is 1/(1 + trust) of the whole one.
     """
     for _ in range(_HALVINGS + 1):
         simulation = loop.simulate(theta, fields)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
-    Record,
     Rollout,
     RolloutResult,
     Row,
@@ -32,7 +30,6 @@ from pdeloop.method.adapt.base import (
     part_of,
 )
 from pdeloop.method.adapt.trajectories import LowRankTrajectory
-from pdeloop.method.laws.base import Law
 from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
 from pdeloop.process.one_thread import one_thread
 
@@ -57,10 +54,14 @@ class InCoordinates(Optimizer):
         self.basis.extend(context.target[None])
         self._noise = context.noise
         explorations = [self._seen(known) for known in context.every_exploration]
-        measured = [self._recorded(record) for record in context.measured]
+        measured = [
+            replace(record, states=self._seen(Trajectory(record.states, record.actions)).states)
+            for record in context.measured
+        ]
+        law, U = context.with_constants, self.basis.coordinates(context.U.T).T
         own = replace(
             context,
-            U=self.basis.coordinates(context.U.T).T,
+            U=U,
             target=self.basis.coordinates(context.target[None])[0],
             exploration=explorations[0],
             further=explorations[1:],
@@ -69,19 +70,9 @@ class InCoordinates(Optimizer):
             line=False,
             shape=(),
             cost=context.cost and CostInCoordinates(context.cost, self.basis),
-            law=self._law(context),
+            law=law and type(law)(replace(law.model, U=U), law.horizon),
         )
         self._own = make(own)
-
-    def _law(self, context: Context) -> Law | None:
-        """The law of the coordinates, where it is more than gains."""
-        law, U = context.with_constants, self.basis.coordinates(context.U.T).T
-        return law and type(law)(replace(law.model, U=U), law.horizon)
-
-    @classmethod
-    def first_step(cls, settings: Any) -> int:
-        """Of no meaning: the class of the optimiser itself is asked."""
-        return 0
 
     @property
     def policy(self) -> Array:
@@ -122,22 +113,13 @@ class InCoordinates(Optimizer):
 
     def _seen(self, trajectory: Trajectory) -> Trajectory:
         """In coordinates, with the basis extended by new directions."""
-        states, finite = trajectory.states, True
         if isinstance(trajectory, LowRankTrajectory):
-            states = trajectory.modes * linalg.norm(trajectory.coordinates, axis=0)[:, None]
-        else:
-            finite = bool(np.isfinite(states).all())
-        if finite:
-            self.basis.extend(states, self._noise)
-        if isinstance(trajectory, LowRankTrajectory):
-            own = trajectory.coordinates @ self.basis.coordinates(trajectory.modes)
-        else:
-            own = self.basis.coordinates(states)
-        return Trajectory(own, trajectory.actions)
-
-    def _recorded(self, record: Record) -> Record:
-        known = self._seen(Trajectory(record.states, record.actions))
-        return replace(record, states=known.states)
+            known, modes = trajectory.coordinates, trajectory.modes
+            self.basis.extend(modes * linalg.norm(known, axis=0)[:, None], self._noise)
+            return Trajectory(known @ self.basis.coordinates(modes), trajectory.actions)
+        if np.isfinite(trajectory.states).all():
+            self.basis.extend(trajectory.states, self._noise)
+        return Trajectory(self.basis.coordinates(trajectory.states), trajectory.actions)
 
 
 class CostInCoordinates(Cost):

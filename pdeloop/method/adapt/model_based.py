@@ -40,14 +40,15 @@ from pdeloop.method.adapt.base import (
 )
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate
-from pdeloop.method.adapt.initial_fields import (
+from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress, Schedule
+from pdeloop.method.adapt.renewal import (
     any_state_serves,
     begin_alike,
     initial_fields,
     measured_states,
+    renew,
+    renew_from_states,
 )
-from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress, Schedule
-from pdeloop.method.adapt.renewal import renew, renew_from_states
 from pdeloop.method.adapt.replay import (
     FIRST_TRUST,
     GROWS,

@@ -131,15 +131,10 @@ class ModelBasedPredictive(Optimizer):
         if context is None or not isinstance(context.law, Predictive):
             raise ValueError("this optimiser needs a context with a law that plans")
         self._law, self._seed = context.law, seed
-        self._settings = settings or ModelBasedSettings()
-        self._shape = self._law.without.shape
-        self._first = np.reshape(np.asarray(policy0, dtype=np.float64), self._shape)
-        measured = [
-            replace(own, policy=np.reshape(own.policy, self._shape)) for own in context.measured
-        ]
-        own = self._law.without
-        law = None if isinstance(own, Affine) else own
-        self._context = replace(context, measured=measured, law=law)
+        self._settings, own = settings or ModelBasedSettings(), context.law.without
+        self._first = np.reshape(np.asarray(policy0, dtype=np.float64), own.shape)
+        measured = [replace(r, policy=np.reshape(r.policy, own.shape)) for r in context.measured]
+        self._context = replace(context, measured=measured, law=own)
         spare = rollouts - ModelBased.first_step(self._settings)
         self._budget, self._judging = rollouts, max(min(self._settings.judging, spare), 0)
         self._kept = 0 if self._law.worth else self._judging
@@ -159,11 +154,6 @@ class ModelBasedPredictive(Optimizer):
             settings=self._settings,
             context=self._context,
         )
-
-    @classmethod
-    def first_step(cls, settings: ModelBasedSettings) -> int:
-        """As of `ModelBased`."""
-        return ModelBased.first_step(settings)
 
     @property
     def policy(self) -> Array:
@@ -298,19 +288,15 @@ class ModelBasedPredictive(Optimizer):
         """The law whose plan is compared with others at every step; None: there is none."""
         return self._affine.policy
 
-    def _feedback(self, policy: Array) -> tuple[Array, Array]:
-        """K and b of that law, a = K z + b, for states of the model."""
-        return self._law.feedback_of_states(self._law.without.parts(np.ravel(policy)))
-
     def _plain(self, belief: Belief, policy: Array, fields: Array) -> Planner:
         """Plans of one step around a law."""
-        context, settings, model = self._context, self._law.settings, belief.model
-        cost = belief.loop(context).stage
+        law, context, model = self._law, self._context, belief.model
+        cost, settings = belief.loop(context).stage, law.settings
         return Planner(
             model,
             cost,
             context.action_set,
-            *self._feedback(policy),
+            *law.feedback_of_states(law.without.parts(np.ravel(policy))),
             around=True,
             steps=1,
             terminal=rests(model, cost, fields),
@@ -321,27 +307,21 @@ class ModelBasedPredictive(Optimizer):
 
     def _planner(self, belief: Belief, policy: Array, fields: Array) -> tuple[Planner, Array]:
         """The plans to use, and their costs from initial fields."""
-        plain, settings = self._plain(belief, policy, fields), self._law.settings
-        lengths = sorted({min(steps, self._law.longest) for steps in LENGTHS})
-        if settings.steps:
-            lengths = [settings.steps]
-        tried: list[tuple[float, Planner, Array]] = []
+        plain, own = self._plain(belief, policy, fields), self._law.settings.steps
+        lengths = [own] if own else sorted({min(n, self._law.longest) for n in LENGTHS})
+
+        def tried(planner: Planner) -> tuple[float, Planner, Array]:
+            costs = self._costs(belief, policy, planner, fields)
+            return float(np.sum(costs)), planner, costs
 
         def worth(each: tuple[float, Planner, Array]) -> float:
             """Without a cost to go, which keeps a plant at its target, plans have to be cheaper."""
             return each[0] * (1.0 + SHORTER * (each[1].terminal != plain.terminal))
 
-        for steps in lengths:
-            first = not tried
-            ways = ways_of(plain) if first else [tried[-1][1]]
-            for way in ways:
-                planner = replace(way, steps=steps)
-                costs = self._costs(belief, policy, planner, fields)
-                tried.append((float(np.sum(costs)), planner, costs))
-            if first:
-                tried = [min(tried, key=worth)]
-        most = min(total for total, _, _ in tried) * (1.0 + SHORTER)
-        return next((own[1:] for own in tried if own[0] <= most), tried[0][1:])
+        best = min((tried(replace(way, steps=lengths[0])) for way in ways_of(plain)), key=worth)
+        every = [best, *(tried(replace(best[1], steps=steps)) for steps in lengths[1:])]
+        most = min(total for total, _, _ in every) * (1.0 + SHORTER)
+        return next((own[1:] for own in every if own[0] <= most), best[1:])
 
     def _check(self, theta: Array) -> None:
         """ValueError if a theta is that of no law that plans."""
@@ -402,9 +382,6 @@ class ModelBasedPredictive(Optimizer):
             base: Evidence(ZERO, of_base),
             self.candidate: Evidence(change, np.array(excess), (change,)),
         }
-
-    def _matrix(self, record: Record) -> Record:
-        return replace(record, policy=np.reshape(record.policy, self._shape))
 
     def state(self) -> State:
         """That of `ModelBased`, the stage, and the law that plans."""

@@ -7,7 +7,7 @@ And the numbers of rollouts after which it renews its law and judges the final o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,8 @@ class Progress:
     def state(self) -> State:
         """All of it, as the arrays of a checkpoint."""
         arrays: State = {name: np.array(getattr(self, name)) for name in _NUMBERS}
-        arrays |= {"policy": self.policy.copy(), "held_out": held_out(self.fraction, self.change)}
+        arrays["policy"] = self.policy.copy()
+        arrays["held_out"] = np.array([self.fraction, *astuple(self.change)])
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
         if self.belief is not None:
@@ -108,36 +109,21 @@ class Progress:
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
-        fraction, change = fraction_and_change(state)
+        known = checked_array(state, "held_out", "f", (4,), finite=False)
+        if (np.abs(known[np.isfinite(known)]) > LARGEST).any() or not known[3] > 0.0:
+            raise ValueError(
+                f"'held_out' is {known.tolist()}; expected numbers up to {LARGEST:g} and more than 0 "
+                "degrees of freedom"
+            )
         return cls(
             checked_array(state, "policy", "f", shape).copy(),
             belief=Belief.of(state),
             improved=laws[0] if laws else None,
             parts=laws[1:],
-            fraction=fraction,
-            change=change,
+            fraction=float(known[0]),
+            change=Estimate(*known[1:].tolist()),
             **numbers,
         )
-
-
-def held_out(fraction: float, change: Estimate) -> Array:
-    """How far a law moved and what fields that did not make it say, as an array of a checkpoint."""
-    return np.array([fraction, change.value, change.error, change.degrees])
-
-
-def fraction_and_change(state: Mapping[str, NDArray[np.generic]]) -> tuple[float, Estimate]:
-    """What `held_out` made an array of.
-
-    ValueError for numbers whose squares are infinite, unless they are themselves, and for no degrees of
-    freedom.
-    """
-    numbers = checked_array(state, "held_out", "f", (4,), finite=False)
-    if (np.abs(numbers[np.isfinite(numbers)]) > LARGEST).any():
-        raise ValueError(f"'held_out' has a number beyond {LARGEST:g}")
-    fraction, value, error, degrees = numbers.tolist()
-    if not degrees > 0.0:
-        raise ValueError(f"'held_out' has {degrees:g} degrees of freedom; expected more than 0")
-    return fraction, Estimate(value, error, degrees)
 
 
 @dataclass(frozen=True)
