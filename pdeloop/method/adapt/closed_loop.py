@@ -55,22 +55,12 @@ class ClosedLoop:
 
     Attributes
     ----------
-    U : (n_z, n_s) array
-        Basis of the projected state s = U^T z.
-    target : (n_z,) array
-        z_r.
-    state_weight, action_weight : float
-        q and r.
-    horizon : int
-        T, the steps of an episode.
-    action_set : ActionSet
-        Admissible actions, the nearest of which is applied.
+    U, target, state_weight, action_weight, horizon, action_set, cost
+        As of a `Context`.
     model : FieldModel
     noise : float
         Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
         is the same in every simulation of as many fields.
-    cost : Cost or None
-        Another quadratic cost in place of that of q, r and z_r.
     reach : float
         Magnitude of a state beyond which a simulation counts as not finite.
     """
@@ -495,18 +485,10 @@ class ReplayedLoop(LinearLoop):
 
     def curvature(self, own: Array) -> Array:
         """With R + B^T P B of the cost of the readings."""
-        model, cost = self.model, self.cost
-        seen = model.C if cost is None else np.eye(len(model.A))
-        cost = cost or Cost(
-            len(model.C),
-            model.n_a,
-            1,
-            state_weight=self.state_weight,
-            action_weight=self.action_weight,
-        )
+        model, seen = self.model, self.model.C if self.cost is None else np.eye(self.model.n_z)
         try:
-            P = track_outputs(model.A, model.B, seen, cost).P
-            own = cost.action_matrix + model.B.T @ P @ model.B
+            P = track_outputs(model.A, model.B, seen, self.stage).P
+            own = self.stage.action_matrix + model.B.T @ P @ model.B
         except DesignError:
             pass
         return super().curvature(own)

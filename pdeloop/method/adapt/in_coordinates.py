@@ -37,15 +37,7 @@ _ROWS, _OWN = "basis", "own."
 
 
 class InCoordinates(Optimizer):
-    """What `make` makes, for states as coordinates.
-
-    Parameters
-    ----------
-    make : callable
-        Makes the optimiser of a context.
-    context : Context
-        Of whole states.
-    """
+    """What `make` makes of a context, for states as coordinates; context: of whole states."""
 
     name = "in_coordinates"
 

@@ -106,20 +106,9 @@ _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
 class ModelBased(Optimizer):
-    """Policy optimisation on a model of the whole field.
+    """Policy optimisation on a model of the whole field; parameters as of `Optimizer`.
 
-    Parameters
-    ----------
-    policy0 : (n_a, 2 n_s) or (size,) array
-        Where to start, [K_a K_b] or the vector of a law with an observer; the first law.
-    seed : int
-        Determines the initial fields.
-    rollouts : int
-        The budget, without the rollouts that the context has already.
-    settings : ModelBasedSettings, optional
-        Constants.
-    context : Context
-        Basis, target, weights, horizon, the explorations and what else was measured.
+    The budget is without the rollouts that the context has already.
     """
 
     name = "model_based"

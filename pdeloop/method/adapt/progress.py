@@ -130,14 +130,7 @@ class Progress:
 class Schedule:
     """When a law is renewed, in rollouts of the optimiser itself.
 
-    Attributes
-    ----------
-    known : int
-        Rollouts that were measured before.
-    budget : int
-        Rollouts in all, without those.
-    settings : ModelBasedSettings
-        `enough_fields` and `judging`.
+    known: rollouts that were measured before; budget: rollouts in all, without those.
     """
 
     known: int

@@ -40,9 +40,8 @@ Cochran, "Sampling Techniques", 3rd ed., Wiley 1977, chapter 6 (ratio estimators
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from scipy import linalg
@@ -72,8 +71,6 @@ KEPT = 0.99
 # plant then change by more than the other share.
 _MOVED, _CHANGED = 1e-2, 4.5e-2
 """For a linear plant and a target of 0 they change by at most 4 _MOVED (Cauchy-Schwarz)."""
-
-_Descent: TypeAlias = Callable[[Sequence[Array], Array, int], tuple[Array, int] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +126,26 @@ def renew(
     last one: others end sooner, on fewer fields that are drawn.
     """
     least_gain = settings.least_gain if final else FIRST_GAIN
-    descend = _descent(loop, rng, settings, components, periodic, least_gain)
-    few = settings.mixtures // 2
+    curvature, designed = curvature_of(loop), loop.designed()
+    others = [] if designed is None else [designed]
+
+    def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
+        """The law after a descent from the cheapest of some laws, and its steps; most: as drawn."""
+        drawn = mixtures(fields, most, rng, components, periodic=periodic)
+        every, weights = weighted(fields, drawn)
+        starts = [*starts, *others]
+        if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
+            starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
+        start = cheapest(loop, starts, every, weights)
+        found = improve(loop, start, every, weights, curvature, settings, least_gain)
+        rests = found is not None and not found.after < (1.0 - least_gain) * found.before
+        if loop.action_set.bounded and found and rests:  # the gradient of saturated actions is 0
+            start = loop.unsaturated(found.theta, every, weights)
+            if not np.array_equal(start, found.theta):
+                again = improve(loop, start, every, weights, curvature, settings, least_gain)
+                found = again if again and again.after < found.after else found
+        return None if found is None else (found.theta, found.steps)
+
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
         only = descend([first, improved], fields, 0)
         if only is None:
@@ -141,15 +156,21 @@ def renew(
     def from_fields(
         start: Array, starts: Sequence[Array], drawn: int, of_parts: int
     ) -> Renewal | None:
-        made, steps = _of_parts(descend, first, starts, fields, of_parts)
+        part_of = np.arange(len(fields)) % len(starts)
+        found = [
+            descend([first, own], fields[part_of != part], of_parts)
+            for part, own in enumerate(starts)
+        ]
         best = descend([first, start], fields, drawn)
         if best is None:
             return None
+        made = [own if law is None else law[0] for law, own in zip(found, starts, strict=True)]
+        steps = sum(law[1] for law in found if law)
         fraction, change = held_out_fraction(loop, first, made, fields, settings)
         theta = first + fraction * (best[0] - first)
         return Renewal(theta, best[0], made, fraction, change, steps + best[1])
 
-    starts = [first] * settings.folds
+    starts, few = [first] * settings.folds, settings.mixtures // 2
     drawn, most = settings.mixtures if final else few, settings.most_mixtures
     found = from_fields(improved, parts or starts, drawn, few)
     if found is None or not final or most <= drawn:
@@ -213,23 +234,6 @@ def renew_from_states(
     return found
 
 
-def _of_parts(
-    descend: _Descent,
-    first: Array,
-    starts: Sequence[Array],
-    fields: Array,
-    drawn: int,
-) -> tuple[list[Array], int]:
-    """For each part of the fields the law that the others make, and all steps of L-BFGS."""
-    part_of = np.arange(len(fields)) % len(starts)
-    steps, made = 0, []
-    for part, start in enumerate(starts):
-        found = descend([first, start], fields[part_of != part], drawn)
-        made.append(start if found is None else found[0])
-        steps += 0 if found is None else found[1]
-    return made, steps
-
-
 def held_out_fraction(
     loop: ClosedLoop,
     first: Array,
@@ -269,40 +273,6 @@ def choose_fraction(costs: Array, confidence: float) -> tuple[int, Estimate]:
             if change.is_negative(confidence):
                 found, least = (i, change), float(own.mean())
     return found
-
-
-def _descent(
-    loop: ClosedLoop,
-    rng: np.random.Generator,
-    settings: ImprovementSettings,
-    components: int,
-    periodic: bool,
-    least_gain: float,
-) -> _Descent:
-    """The law after a descent from the cheapest of some laws, and its steps, as a function.
-
-    Its arguments are these laws, measured fields and how many to draw.
-    """
-    curvature, designed = curvature_of(loop), loop.designed()
-    others = [] if designed is None else [designed]
-
-    def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
-        drawn = mixtures(fields, most, rng, components, periodic=periodic)
-        every, weights = weighted(fields, drawn)
-        starts = [*starts, *others]
-        if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
-            starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
-        start = cheapest(loop, starts, every, weights)
-        found = improve(loop, start, every, weights, curvature, settings, least_gain)
-        rests = found is not None and not found.after < (1.0 - least_gain) * found.before
-        if loop.action_set.bounded and found and rests:  # the gradient of saturated actions is 0
-            start = loop.unsaturated(found.theta, every, weights)
-            if not np.array_equal(start, found.theta):
-                again = improve(loop, start, every, weights, curvature, settings, least_gain)
-                found = again if again and again.after < found.after else found
-        return None if found is None else (found.theta, found.steps)
-
-    return descend
 
 
 def initial_fields(records: Sequence[Record]) -> Array:

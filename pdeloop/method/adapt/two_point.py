@@ -51,18 +51,7 @@ class TwoPointSettings(Settings):
 
 
 class TwoPoint(StepOptimizer):
-    """Policy optimisation from costs alone.
-
-    Parameters
-    ----------
-    policy0 : array
-        Where the law's parameters start.
-    seed : int
-        Determines all directions and fields.
-    rollouts : int
-        The budget, spent in floor(rollouts / 2) steps.
-    settings : TwoPointSettings
-    """
+    """Policy optimisation from costs alone, in steps of two rollouts; parameters as of `Optimizer`."""
 
     name = "two_point"
     Settings = TwoPointSettings

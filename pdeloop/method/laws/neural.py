@@ -12,6 +12,7 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Parts
 from pdeloop.method.laws.extended import Extended
+from pdeloop.method.laws.linear import at_step
 from pdeloop.method.settings import Settings, setting
 
 MOST_NEURONS = 512
@@ -81,7 +82,7 @@ class Neural(Extended):
     def _input(self, theta: Parts, z: Array, k: int) -> Array:
         """x_k."""
         s, (_, b) = self.reduced(z), self.feedback(theta)
-        return s if b.ndim == 1 else np.concatenate([s, b[min(k, len(b) - 1)]])
+        return s if b.ndim == 1 else np.concatenate([s, at_step(b, k)])
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         a = self.without.action(theta, z, memory, k)
@@ -103,7 +104,7 @@ class Neural(Extended):
             by_x = W.T @ g
             by_z = by_z + self.model.U @ by_x[:n_s]
             if len(by_x) > n_s:
-                by_theta["b"][min(k, self.horizon - 1)] += by_x[n_s:]
+                at_step(by_theta["b"], k)[:] += by_x[n_s:]
             own = np.concatenate([np.outer(g, x).ravel(), g, np.outer(y, hidden).ravel(), y])
             by_network[1 : 1 + len(own)] = own
         return {**by_theta, "network": by_network}, by_z, memory

@@ -46,6 +46,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.design.lqt import cost_to_go, finite_horizon_of
+from pdeloop.method.laws.linear import at_step
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
@@ -346,8 +347,7 @@ class Planner:
         return v + b[steps], K, np.zeros(b.shape[1])
 
     def _law(self, z: Array, k: int, K: Array, b: Array) -> Array:
-        now = b if b.ndim == 1 else b[min(k, len(b) - 1)]
-        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], K) + now
+        a: Array = np.einsum("mi,ji->mj", z[:, : self.model.n_z], K) + at_step(b, k)
         return a
 
     @cached_property
