@@ -22,7 +22,7 @@ from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import FAR
 
 _MODEL = "model."
-_NUMBERS = {"error": "f", "components": "i", "whole": "b", "near": "f"}
+_NUMBERS = {"error": "f", "components": "i", "whole": "b"}
 """What is one number of a checkpoint, and its NumPy kind."""
 
 
@@ -39,9 +39,6 @@ class Belief:
         Fields in a state.
     whole : bool
         False: it predicts pieces of rollouts, of a chaotic plant, to E.
-    near : float
-        A linear model up to so many times the distance of initial states from the target; infinite: of
-        all that was measured, or of beginnings that it predicts as well.
     noise : float
         Measurement noise that it was fitted for in place of the declared one; 0: there is none.
     accepted : bool
@@ -52,7 +49,6 @@ class Belief:
     error: float
     components: int
     whole: bool = True
-    near: float = np.inf
     noise: float = 0.0
     accepted: bool = True
 
@@ -132,7 +128,6 @@ def believe(
         found.error,
         components,
         found.whole,
-        found.near,
         found.noise,
         accepted=found.predicts,
     )

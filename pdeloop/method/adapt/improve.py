@@ -44,43 +44,13 @@ FAR = 10.0
 class Improvement:
     """A law, and its weighted cost on the fields where the law to begin with has a finite one.
 
-    Attributes
-    ----------
-    theta : (n_a, n_s + 1) array
-    before, after : float
-    steps : int
-        Of L-BFGS.
+    steps: of L-BFGS.
     """
 
     theta: Array
     before: float
     after: float
     steps: int
-
-
-class Coordinates:
-    """x of theta, and back.
-
-    left: L^{-T} of G = L L^T; right: the same of F.
-    """
-
-    def __init__(self, curvature: Array, moment: Array) -> None:
-        self._left, self._right = (
-            linalg.solve_triangular(
-                linalg.cholesky(matrix, lower=True), np.eye(len(matrix)), lower=True
-            ).T
-            for matrix in (curvature, moment)
-        )
-
-    def theta(self, x: Array) -> Array:
-        """The law with the coordinates x, of any shape."""
-        theta: Array = self._left @ x.reshape(len(self._left), -1) @ self._right.T
-        return theta
-
-    def gradient(self, by_theta: Array) -> Array:
-        """d/dx of d/dtheta, (n_a (n_s + 1),)."""
-        by_x: Array = (self._left.T @ by_theta @ self._right).ravel()
-        return by_x
 
 
 def improve(
@@ -117,14 +87,14 @@ def improve(
     # s and the constants each in its own unit.
     units = np.append(np.full(count, size), np.full(loop.constants, 1.0 / loop.constants))
     moment[np.diag_indices(len(moment))] += _ISOTROPY * units
-    coordinates = Coordinates(curvature, moment)
+    left, right = (_inverse_root(matrix) for matrix in (curvature, moment))
     gain = settings.least_gain if least_gain is None else least_gain
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
 
     before, by_theta = loop.gradient(theta, fields, weights)
     # Of a quadratic cost the step -g/2 leads to its minimum. L-BFGS begins with one of unit length.
-    unit = 0.5 * float(np.linalg.norm(coordinates.gradient(by_theta)))
+    unit = 0.5 * float(np.linalg.norm((left.T @ by_theta @ right).ravel()))
     if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):
         return Improvement(theta, before, before, 0)
     best, values = Improvement(theta, before, before, 0), [1.0]
@@ -134,14 +104,14 @@ def improve(
         nonlocal best, least
         at, cost, gradient = theta, before, by_theta  # the descent starts from known values
         if y.any():
-            at = theta + coordinates.theta(unit * y)
+            at = theta + left @ (unit * y).reshape(len(left), -1) @ right.T
             cost, gradient = loop.gradient(at, fields, weights)
         if not (cost < FAR * before and np.isfinite(gradient).all()):
             return FAR, np.zeros_like(y)
         total = cost + held * float(y @ y)
         if total < least:
             least, best = total, Improvement(at, before, cost, best.steps)
-        slope = unit * coordinates.gradient(gradient) + 2.0 * held * y
+        slope = unit * (left.T @ gradient @ right).ravel() + 2.0 * held * y
         return total / before, slope / before
 
     def stop_when_flat(_: Array) -> None:
@@ -165,6 +135,13 @@ def improve(
         },
     )
     return Improvement(best.theta, before, best.after, len(values) - 1)
+
+
+def _inverse_root(matrix: Array) -> Array:
+    """L^{-T} of a matrix L L^T."""
+    root = linalg.cholesky(matrix, lower=True)
+    inverse: Array = linalg.solve_triangular(root, np.eye(len(root)), lower=True).T
+    return inverse
 
 
 def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:

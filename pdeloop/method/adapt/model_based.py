@@ -539,7 +539,7 @@ class ModelBased(Optimizer):
             return
         self._progress.trust = 0.0
         self._progress.improved, self._progress.parts = found.improved, found.parts
-        self._progress.fraction, self._progress.change = found.fraction, found.change
+        self._progress.change = found.change
         self._progress.policy = loop.policy(found.theta, near) if found.fraction else near.copy()
         row["fraction"], row["steps"] = found.fraction, found.steps
         if np.isfinite(found.change.value):

@@ -96,14 +96,7 @@ _NUMBERS = {"stage": "U", "tells": "i", "count": "i", "kept": "i", "share": "f"}
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A law that plans.
-
-    Attributes
-    ----------
-    theta : (size,) array
-    costs, before : (F,) arrays
-        Its costs from some initial fields on the model, and those of the affine law.
-    """
+    """A law that plans, its costs (F,) from some initial fields on the model, and the affine law's."""
 
     theta: Array
     costs: Array
@@ -340,18 +333,14 @@ class ModelBasedPredictive(Optimizer):
     def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
         assert self._candidate is not None
-        base = self._base_name
+        policy, base = self._affine.policy, FIRST
+        if not np.array_equal(policy, self._first):
+            base = ADAPTED if policy.any() else NONE
         evidence = self._evidence(self._candidate, base, asked, results, row)
         verdict = choose(evidence, base, self._settings.confidence)
         if verdict.chosen == self.candidate:
             self._chosen = self._candidate.theta
         row |= verdict.row
-
-    @property
-    def _base_name(self) -> str:
-        """What the law to stay with is."""
-        policy = self._affine.policy
-        return FIRST if np.array_equal(policy, self._first) else ADAPTED if policy.any() else NONE
 
     def _evidence(
         self,

@@ -228,7 +228,7 @@ class ModelBasedSensed(ModelBasedReadings):
         none = loop.costs(loop.no_control, held_out)
         progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
         change = gained(loop.costs(theta, held_out), first if progress.safe else none)
-        progress.fraction, progress.change = 1.0, change
+        progress.change = change
         row["steps"] = steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error

@@ -242,18 +242,9 @@ class Network:
 class NetworkTraining:
     """The training of a network on the model of plans.
 
-    Parameters
-    ----------
-    network : Network
-    planner : Planner
-        Model, cost, admissible actions, V, and the plans to imitate.
-    fields : (n, n_z) array
-        Measured initial fields, of whose distribution further ones are drawn (`mixtures`).
-    noise : float
-        Standard deviation of the noise on every number of a state that the law sees.
-    seed : sequence of int
-    components, periodic : int, bool
-        As for `mixtures`.
+    planner: has model, cost, admissible actions, V, and the plans to imitate; fields (n, n_z): measured
+    initial ones, of whose distribution further ones are drawn (`mixtures`); noise: standard deviation
+    of that on every number of a state that the law sees.
     """
 
     def __init__(
@@ -265,14 +256,10 @@ class NetworkTraining:
         components: int,
         *,
         periodic: bool,
-        noise: float = 0.0,
+        noise: float,
     ) -> None:
         self._network, self._planner, self._fields, self._noise = network, planner, fields, noise
-        self._rng, self._components, self._periodic = (
-            np.random.default_rng(seed),
-            components,
-            periodic,
-        )
+        self._rng, self._of_fields = np.random.default_rng(seed), (components, periodic)
         self._part = min(PART, planner.cost.horizon)
 
     def trained(self, iterations: int) -> Array:
@@ -286,9 +273,8 @@ class NetworkTraining:
         """Initial fields (count, n_z)."""
         found = list[Array]()
         while sum(map(len, found)) < count:
-            own = mixtures(
-                self._fields, _DRAWN, self._rng, self._components, periodic=self._periodic
-            )
+            components, periodic = self._of_fields
+            own = mixtures(self._fields, _DRAWN, self._rng, components, periodic=periodic)
             found.append(own if len(own) else self._fields)
         every = np.concatenate(found)
         return every[self._rng.permutation(len(every))[:count]]

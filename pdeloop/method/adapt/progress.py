@@ -54,10 +54,8 @@ class Progress:
         The law after the last descent, with which the next one begins.
     parts : list of arrays
         The same for each part of the fields, from the other parts.
-    fraction : float
-        How far the law moved from the first one at the last renewal.
     change : Estimate
-        What it then cost more than that one on fields that did not make it.
+        What it then cost more than the first one on fields that did not make it.
     replayed : bool
         True if the law was last improved along measured rollouts, as no model predicts them.
     trust : float
@@ -78,7 +76,6 @@ class Progress:
     belief: Belief | None = None
     improved: Array | None = None
     parts: list[Array] = field(default_factory=list)
-    fraction: float = 0.0
     change: Estimate = ZERO
     replayed: bool = False
     trust: float = 0.0
@@ -91,7 +88,7 @@ class Progress:
         """All of it, as the arrays of a checkpoint."""
         arrays: State = {name: np.array(getattr(self, name)) for name in _NUMBERS}
         arrays["policy"] = self.policy.copy()
-        arrays["held_out"] = np.array([self.fraction, *astuple(self.change)])
+        arrays["held_out"] = np.array(astuple(self.change))
         if self.improved is not None:
             arrays["laws"] = np.stack([self.improved, *self.parts])
         if self.belief is not None:
@@ -109,8 +106,8 @@ class Progress:
         laws: list[Array] = []
         if "laws" in state:
             laws = [a.copy() for a in checked_array(state, "laws", "f", (None, None, None))]
-        known = checked_array(state, "held_out", "f", (4,), finite=False)
-        if (np.abs(known[np.isfinite(known)]) > LARGEST).any() or not known[3] > 0.0:
+        known = checked_array(state, "held_out", "f", (3,), finite=False)
+        if (np.abs(known[np.isfinite(known)]) > LARGEST).any() or not known[2] > 0.0:
             raise ValueError(
                 f"'held_out' is {known.tolist()}; expected numbers up to {LARGEST:g} and more than 0 "
                 "degrees of freedom"
@@ -120,8 +117,7 @@ class Progress:
             belief=Belief.of(state),
             improved=laws[0] if laws else None,
             parts=laws[1:],
-            fraction=float(known[0]),
-            change=Estimate(*known[1:].tolist()),
+            change=Estimate(*known.tolist()),
             **numbers,
         )
 

@@ -50,7 +50,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change
-from pdeloop.method.adapt.improve import cheapest, curvature_of, improve
+from pdeloop.method.adapt.improve import Improvement, cheapest, curvature_of, improve
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ImprovementSettings
 
 FRACTIONS = 4
@@ -75,23 +75,11 @@ _MOVED, _CHANGED = 1e-2, 4.5e-2
 
 @dataclass(frozen=True, eq=False)
 class Renewal:
-    """A law made on a model.
+    """A law made on a model: the fraction of the way from the first one to the improved one.
 
-    Attributes
-    ----------
-    theta : (n_a, n_s + 1) array
-        The law: the fraction of the way from the first one to the improved one.
-    improved : (n_a, n_s + 1) array
-        The law after the descent, with which the next one begins.
-    parts : list of (n_a, n_s + 1) array
-        The laws that each part of the fields did not make.
-    fraction : float
-        How far the law moved; 0: it is the first one.
-    change : Estimate
-        The mean change of the cost against the first law on fields that were left out. 0 where the law
-        is the first one.
-    steps : int
-        Of L-BFGS, all together.
+    improved: the law after the descent, with which the next one begins; parts: the laws that each part
+    of the fields did not make; change: the mean change of the cost against the first law on fields that
+    were left out, 0 where the law is that; steps: of L-BFGS, all together.
     """
 
     theta: Array
@@ -129,8 +117,8 @@ def renew(
     curvature, designed = curvature_of(loop), loop.designed()
     others = [] if designed is None else [designed]
 
-    def descend(starts: Sequence[Array], fields: Array, most: int) -> tuple[Array, int] | None:
-        """The law after a descent from the cheapest of some laws, and its steps; most: as drawn."""
+    def descend(starts: Sequence[Array], fields: Array, most: int) -> Improvement | None:
+        """The law after a descent from the cheapest of some laws; most: fields to draw."""
         drawn = mixtures(fields, most, rng, components, periodic=periodic)
         every, weights = weighted(fields, drawn)
         starts = [*starts, *others]
@@ -144,14 +132,14 @@ def renew(
             if not np.array_equal(start, found.theta):
                 again = improve(loop, start, every, weights, curvature, settings, least_gain)
                 found = again if again and again.after < found.after else found
-        return None if found is None else (found.theta, found.steps)
+        return found
 
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
         only = descend([first, improved], fields, 0)
         if only is None:
             return None
-        before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, only[0]))
-        return Renewal(only[0], only[0], [], 1.0, Estimate(after - before), only[1])
+        before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, only.theta))
+        return Renewal(only.theta, only.theta, [], 1.0, Estimate(after - before), only.steps)
 
     def from_fields(
         start: Array, starts: Sequence[Array], drawn: int, of_parts: int
@@ -164,11 +152,11 @@ def renew(
         best = descend([first, start], fields, drawn)
         if best is None:
             return None
-        made = [own if law is None else law[0] for law, own in zip(found, starts, strict=True)]
-        steps = sum(law[1] for law in found if law)
+        made = [law.theta if law else own for law, own in zip(found, starts, strict=True)]
+        steps = best.steps + sum(law.steps for law in found if law)
         fraction, change = held_out_fraction(loop, first, made, fields, settings)
-        theta = first + fraction * (best[0] - first)
-        return Renewal(theta, best[0], made, fraction, change, steps + best[1])
+        theta = first + fraction * (best.theta - first)
+        return Renewal(theta, best.theta, made, fraction, change, steps)
 
     starts, few = [first] * settings.folds, settings.mixtures // 2
     drawn, most = settings.mixtures if final else few, settings.most_mixtures

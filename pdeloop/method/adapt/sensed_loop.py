@@ -275,20 +275,10 @@ def from_estimates(of_fields: Act, known: SensedFilter, sigma: float) -> Act:
 
 @dataclass(frozen=True, eq=False)
 class WholeFieldLaw:
-    """The best law found of the whole field on a model.
+    """The best law found of the whole field on a model, theta = [K b].
 
-    Attributes
-    ----------
-    loop : ClosedLoop
-        Its U are the modes V.
-    theta : (n_a, n_s + 1) array
-        [K b].
-    simulation : Simulation
-        Of this law, from the fields that have a finite cost.
-    weights : array
-        Of these fields.
-    steps : int
-        Of L-BFGS.
+    The U of the loop are the modes V; simulation: of this law, from the fields that have a finite cost,
+    and their weights; steps: of L-BFGS.
     """
 
     loop: ClosedLoop

@@ -32,7 +32,6 @@ from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
@@ -313,16 +312,12 @@ class Law(ABC):
     @cached_property
     def theta_start(self) -> Array:
         """`start` as a vector."""
-        return self.vector({name: float64(part) for name, part in self.start().items()})
+        start = self.start().items()
+        return self.vector({name: np.asarray(part, dtype=np.float64) for name, part in start})
 
     @cached_property
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         return {name: np.shape(part) for name, part in self.start().items()}
-
-
-def float64(values: ArrayLike) -> Array:
-    """The values as an array of float64."""
-    return np.asarray(values, dtype=np.float64)
 
 
 def differentiable(kind: type[Law]) -> bool:
