@@ -164,7 +164,7 @@ def test_it_plans_within_rate_limits_from_the_action_before() -> None:
     assert planner.action_set == allowed
     plan, last, expected = np.zeros((1, 10, N_A)), None, []
     for k, z in enumerate(STATES):
-        last, plan, _ = planner.step(plan, planner.after(z[None], last), k)
+        last, plan = planner.step(plan, planner.after(z[None], last), k)
         plan = planner.shifted(plan)
         expected.append(last[0])
     acted = actions_of(own, whole)
@@ -175,13 +175,6 @@ def test_it_plans_within_rate_limits_from_the_action_before() -> None:
     np.testing.assert_array_equal(again, expected)
     moved = np.abs(np.diff(expected, axis=0, prepend=[allowed.start]))
     assert moved[:, 0].max() == pytest.approx(0.1) and moved[:, 1].max() > 0.1
-
-
-def test_a_memory_counts_how_often_the_affine_plan_was_better() -> None:
-    own = law()
-    parts, memory = own.parts(theta(own, iterations=0)), own.memory_start()
-    memory[:-1] = 50.0  # no plan of anybody
-    assert updated(own, parts, STATES[0], memory, np.zeros(N_A), 1)[-1] == 1.0
 
 
 @pytest.mark.parametrize("wrong", [{"steps": T + 60}, {"model": spectral().__class__}])

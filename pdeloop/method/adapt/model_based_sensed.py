@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.base import Record, Rollout, Row
+from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate, mean_of
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
@@ -98,8 +98,8 @@ class ModelBasedReadings(ModelBased):
         return not self._of(self._none)
 
     def _of(self, law: Array) -> list[Record]:
-        """The rollouts of a law in the order of its fields."""
-        return [own for own in self._records.all() if np.array_equal(own.policy, law)]
+        """The rollouts of a law."""
+        return of_law(self._records.all(), law)
 
     def _replay(self, model: Belief | None, row: Row, final: bool, why: str = "") -> None:
         """More rollouts may determine a model."""
@@ -227,8 +227,8 @@ class ModelBasedSensed(ModelBasedReadings):
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)
         progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
-        change = gained(loop.costs(theta, held_out), first if progress.safe else none)
-        progress.change = change
+        base = first if progress.safe else none
+        progress.change = change = gained(loop.costs(theta, held_out), base)
         row["steps"] = steps
         if np.isfinite(change.value):
             row["predicted_change"], row["deviation"] = change.value, change.error
@@ -308,8 +308,7 @@ class ModelBasedSensed(ModelBasedReadings):
             evidence = evidence_of_pairs(costs, base)
         measured = choose(evidence, base, self._settings.confidence)
         self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
-        row["chosen"], row["reason"] = measured.chosen, measured.reason
-        row["predicted_change"], row["deviation"] = measured.change, measured.deviation
+        row |= measured.row
 
 
 def _observers(

@@ -145,22 +145,16 @@ class Planner:
         last = self.action_set.start if actions is None else actions
         return np.hstack([z, np.broadcast_to(last, (len(z), self.model.n_a))])
 
-    def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array, Flags]:
-        """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan.
+    def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array]:
+        """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan (M, H, n_a).
 
         plan (M, H, n_a): that of the step before without its first action; at k = 0 it does not count.
-        Where the affine law's own plan is cheaper on the model, the search begins from that.
-
-        Returns
-        -------
-        (M, n_a), (M, H, n_a), (M,) bool
-            The last: where the affine law's plan was the cheaper one, or none is finite and the affine
-            law acts.
+        Where the affine law's own plan is cheaper on the model, the search begins from that; where no
+        plan is finite, this law acts.
         """
         H = self.length(k)
         if k == 0:
             plan, J = self.begin(z)
-            fell = np.zeros(len(z), dtype=np.bool_)
         else:
             affine = self._affine_plan(z, k, H)
             of_affine = self.costs(affine, z, k)
@@ -176,7 +170,7 @@ class Planner:
         after = z[:, self.model.n_z :] if self.action_set.rated else None
         a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]), after=after)
         plan = np.where(lost[:, None, None], 0.0, plan)
-        return a, plan, fell | lost
+        return a, plan
 
     def shifted(self, plan: Array) -> Array:
         """A plan (M, H, n_a) without its first action, and with a zero at the end."""
@@ -419,7 +413,7 @@ def planned(planner: Planner) -> Act:
 
     def act(z: Array, before: Array, k: int) -> Array:
         nonlocal plan
-        a, plan, _ = planner.step(plan, planner.after(z, before), k)
+        a, plan = planner.step(plan, planner.after(z, before), k)
         plan = planner.shifted(plan)
         return a
 

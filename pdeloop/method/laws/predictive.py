@@ -58,8 +58,7 @@ class Predictive(Extended):
     into theta, with the cost, the admissible actions, H and the constants of the search: `model_based`
     does.
 
-    Its memory is the plan for the next steps, the action applied last, and how often the plan of the
-    law that it began as was the cheaper one on the model, so that the search began with that.
+    Its memory is the plan for the next steps and the action applied last.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd ed., 2017, chapter 2.
     """
@@ -75,7 +74,7 @@ class Predictive(Extended):
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)
         self._planners: OrderedDict[tuple[int, bytes], Planner] = OrderedDict()
-        self._plans: OrderedDict[bytes, tuple[Array, Array, bool]] = OrderedDict()
+        self._plans: OrderedDict[bytes, tuple[Array, Array]] = OrderedDict()
 
     @property
     def longest(self) -> int:
@@ -84,11 +83,7 @@ class Predictive(Extended):
 
     @property
     def memory_size(self) -> int:  # type: ignore[override]
-        return self.without.memory_size + (self.longest + 1) * self.n_a + 1
-
-    def memory_start(self) -> Array:
-        own = np.zeros((self.longest + 1) * self.n_a + 1)
-        return np.concatenate([self.without.memory_start(), own])
+        return self.without.memory_size + (self.longest + 1) * self.n_a
 
     def theta_of(self, without: Array, planner: Planner) -> Array:
         """Theta of plans on a model; without: theta of the law that they are compared with.
@@ -191,10 +186,9 @@ class Predictive(Extended):
         first, own = self._split(memory)
         after = np.zeros_like(own)
         if theta["plan"].any():
-            _, plan, fell = self._planned(theta, z, memory, k)
+            _, plan = self._planned(theta, z, memory, k)
             after[: plan[1:].size] = plan[1:].ravel()
-            after[-1 - self.n_a : -1] = action
-            after[-1] = memory[-1] + fell
+            after[-self.n_a :] = action
         if not len(first):
             return after
         return np.concatenate([self.without.memory_update(theta, z, first, action, k), after])
@@ -214,8 +208,8 @@ class Predictive(Extended):
         after: Array = self.planner(theta).model.step(z[None], a[None])[0]
         return after
 
-    def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array, bool]:
-        """The action (n_a,), its plan (H, n_a), and whether that came from the affine law.
+    def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array]:
+        """The action (n_a,) and its plan (H, n_a).
 
         The same for the same arguments: it is kept for `memory_update` because it takes long.
         """
@@ -228,10 +222,10 @@ class Predictive(Extended):
             planner, H = self.planner(theta), self.longest
             first, own = self._split(memory)
             plan = own[: H * self.n_a].reshape(1, H, self.n_a)[:, : planner.steps]
-            last = own[None, H * self.n_a : -1] if k else None
+            last = own[None, H * self.n_a :] if k else None
             start = self._state(theta, z, first, k)
-            a, plan, fell = planner.step(plan, planner.after(start, last), k)
-            known = self._plans[key] = a[0], plan[0], bool(fell[0])
+            a, plan = planner.step(plan, planner.after(start, last), k)
+            known = self._plans[key] = a[0], plan[0]
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
         return known
