@@ -112,9 +112,8 @@ def test_the_final_law_is_compared_with_one_that_comes_to_an_end(diverged: bool)
     optimizer = model_based.ModelBased(first, seed=0, rollouts=20, context=_context(record))
     seen = RolloutResult(1.0, diverged, Trajectory(record.states, record.actions))
     for seed, law in ((1, first), (2, first), (1, last), (2, last)):
-        optimizer._records.add(
-            Rollout(law, seed), seen if law is first else replace(seen, diverged=False)
-        )
+        told = seen if law is first else replace(seen, diverged=False)
+        optimizer._records.add([Rollout(law, seed)], [told])
     progress = optimizer._progress
     progress.replayed, progress.stage, progress.policy = True, JUDGING, last
     asked = optimizer.ask()

@@ -95,7 +95,7 @@ def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_the
 def in_pieces(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plant itself is believed, on pieces alone."""
     model = LinearModel("k", plant.U @ plant.A @ plant.U.T, plant.U @ plant.B, np.zeros(N_Z))
-    monkeypatch.setattr(model_based, "believe", lambda *_: Belief(model, 0.01, 1, whole=False))
+    monkeypatch.setattr(model_based, "believe", lambda *_: Belief(model, 0.01, whole=False))
 
 
 def test_a_law_is_improved_on_a_model_of_pieces_from_measured_states(

@@ -87,7 +87,7 @@ def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
     known, costs = [34.0, 47.0, 103.0, 47.0, 93.0, 113.0], [55.0, 52.0, 48.0]
     for law, every in ((own._none, known), (final, costs)):
         for cost in every:
-            own._records.add(Rollout(law, -1), replace(result, cost=cost))
+            own._records.add([Rollout(law, -1)], [replace(result, cost=cost)])
     own._judge(row)
     assert row["chosen"] == "adapted"
     assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
@@ -105,7 +105,7 @@ def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
             # That of the first law on the same field, or of one that runs away.
             known = again._records.all()[int(each.field_seed) - 1].cost
             cost = known * (more if np.array_equal(each.policy, final) else 0.1)
-            again._records.add(each, replace(result, cost=cost))
+            again._records.add([each], [replace(result, cost=cost)])
         again._judge(row)
         assert same_bits(again.policy, best) and row["chosen"] == "adapted"
 
@@ -125,7 +125,7 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
             result = measured(Rollout(law, seed))
             # Alike from field to field, so that three rollouts decide.
             level = share * (np.mean(first) + 0.01 * (cost - np.mean(first)))
-            own._records.add(Rollout(law, -1), replace(result, cost=float(level)))
+            own._records.add([Rollout(law, -1)], [replace(result, cost=float(level))])
     own._judge(row)
     assert row["chosen"] == "adapted"
     assert same_bits(own.policy, before if more > 1.0 else final)
@@ -150,7 +150,7 @@ def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_bett
     for law, costs in ((own._none, [9.0, 9.1, 9.2]), (final, [5.0, np.inf if lost else 5.1, 5.2])):
         for seed, cost in enumerate(costs, start=1):
             result = replace(measured(Rollout(law, seed)), cost=cost * level)
-            own._records.add(Rollout(law, -1), result)
+            own._records.add([Rollout(law, -1)], [result])
     first = [record.cost / level for record in own._of(own._first)]
     own._look_back(row, {"none": own._none, "adapted": final}, "none")
     assert same_bits(own.policy, own._first) and row["chosen"] == "first"

@@ -401,7 +401,7 @@ def test_plans_are_closed_by_a_cost_to_go_where_that_is_cheaper_on_the_model(
     bounds = ActionSet(N_A, -1.0, 1.0)
     own._context = replace(own._context, target=np.zeros(N_Z), action_set=bounds)
     fields = 0.5 * np.stack([np.cos(x), np.sin(x)])
-    belief, policy = Belief(model, 0.0, 1), own._affine.policy
+    belief, policy = Belief(model, 0.0), own._affine.policy
     chosen, costs = own._planner(belief, policy, fields)
     assert chosen.terminal == closed
     ways = [

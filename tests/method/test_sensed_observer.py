@@ -131,7 +131,7 @@ def test_the_designed_law_of_the_newest_readings_is_an_optimum_of_their_gains() 
 
 def test_the_model_survives_a_checkpoint() -> None:
     model = model_with(CUBIC, 0.3)
-    again = Belief.of(Belief(model, 0.01, 1).state())
+    again = Belief.of(Belief(model, 0.01).state())
     assert again is not None and isinstance(again.model, SensedModel)
     z, a = field(model, 1)[None], np.ones((1, N_A))
     assert same_bits(again.model.step(z, a), model.step(z, a))

@@ -22,7 +22,7 @@ from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import FAR
 
 _MODEL = "model."
-_NUMBERS = {"error": "f", "components": "i", "whole": "b"}
+_NUMBERS = {"error": "f", "whole": "b"}
 """What is one number of a checkpoint, and its NumPy kind."""
 
 
@@ -35,8 +35,6 @@ class Belief:
     model : FieldModel
     error : float
         E on rollouts that it was not fitted to.
-    components : int
-        Fields in a state.
     whole : bool
         False: it predicts pieces of rollouts, of a chaotic plant, to E.
     noise : float
@@ -47,13 +45,12 @@ class Belief:
 
     model: FieldModel
     error: float
-    components: int
     whole: bool = True
     noise: float = 0.0
     accepted: bool = True
 
     def state(self) -> State:
-        """The model, its error and its components, as the arrays of a checkpoint."""
+        """The model and its error, as the arrays of a checkpoint."""
         arrays = {_MODEL + name: value for name, value in self.model.arrays().items()}
         return arrays | {name: np.array(getattr(self, name)) for name in _NUMBERS}
 
@@ -63,6 +60,11 @@ class Belief:
         if "error" not in state:
             return None
         return cls(model_of(part_of(state, _MODEL)), **numbers_of(state, _NUMBERS, finite=False))
+
+    @property
+    def components(self) -> int:
+        """Fields in a state."""
+        return 2 if self.model.kind.startswith("two-") else 1
 
     def check(self, context: Context) -> None:
         """ValueError if the model has another plant's size, which compiled code does not check."""
@@ -122,11 +124,9 @@ def believe(
     found = selection.select([_measured(context, own) for own in records], first)
     if found is None:
         return None
-    components = 2 if found.model.kind.startswith("two-") else 1
     return Belief(
         found.model,
         found.error,
-        components,
         found.whole,
         found.noise,
         accepted=found.predicts,
@@ -144,7 +144,7 @@ def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:
         model, error = fit_readings(rollouts, context.target, context.U.shape[1])
     except ValueError:
         return None
-    return Belief(replace(model, B=model.B @ free.T), error, 1)
+    return Belief(replace(model, B=model.B @ free.T), error)
 
 
 def _measured(context: Context, record: Record) -> Measured:

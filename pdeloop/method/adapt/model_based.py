@@ -288,15 +288,10 @@ class ModelBased(Optimizer):
         """Take the rollouts, and carry out the next stage."""
         asked, due = self.ask(), self._next_renewal()
         require_results(results, len(asked))
-        for result in results:
-            self._records.validated_samples(result)
+        added = self._records.add(asked, results)
         self._progress.tells += 1
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         with one_thread():
-            added = [
-                self._records.add(rollout, result)
-                for rollout, result in zip(asked, results, strict=True)
-            ]
             row = self._measured(added)
             if self._progress.stage != RENEWING:
                 self._judge(row)

@@ -183,7 +183,7 @@ class ModelBasedSensed(ModelBasedReadings):
         if model is not None or self._attempts_left(self._records.count):
             found = sensed_from(self._context, measured, model)
             if found is not None:
-                return Belief(*found, 1)
+                return Belief(*found)
         return believe(self._context, measured, self._settings.believed)
 
     def _fields(self) -> Array:

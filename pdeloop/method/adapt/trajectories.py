@@ -1,6 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pdeloop.messages.array_files import Arrays, checked_array
@@ -112,15 +114,15 @@ class Records:
         """The rollouts, oldest first."""
         return self._records.copy()
 
-    def add(self, rollout: Rollout, result: RolloutResult) -> Record:
-        """Remember a rollout."""
-        states, actions = self.validated_samples(result)
-        cost = float(result.cost) if result.usable else float("inf")
-        record = Record(
-            np.array(rollout.policy), cost, states, actions, self.count, rollout.field_seed
-        )
-        self._records.append(record)
-        return record
+    def add(self, rollouts: list[Rollout], results: Sequence[RolloutResult]) -> list[Record]:
+        """Remember rollouts; a ValueError, and none of them, where nothing can be learned from one."""
+        added = []
+        for stamp, (rollout, result) in enumerate(zip(rollouts, results, strict=True), self.count):
+            cost = float(result.cost) if result.usable else np.inf
+            known = np.array(rollout.policy), cost, *self._samples(result)
+            added.append(Record(*known, stamp, rollout.field_seed))
+        self._records += added
+        return added
 
     def state(self) -> State:
         """The remembered rollouts as arrays."""
@@ -137,7 +139,7 @@ class Records:
         ]
         self._limit = limit
 
-    def validated_samples(self, result: RolloutResult) -> tuple[Array, Array]:
+    def _samples(self, result: RolloutResult) -> tuple[Array, Array]:
         """The states and actions that can be learned from, or a ValueError."""
         trajectory, usable = result.trajectory, result.usable
         if trajectory is None:
