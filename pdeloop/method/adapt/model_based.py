@@ -79,7 +79,6 @@ from pdeloop.method.adapt.verdict import (
     measured_change,
     size_of,
 )
-from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.noise import cleaned_states
