@@ -17,7 +17,13 @@ from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.replay import best_measured, step
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.verdict import ADAPTED, FIRST, evidence_of, evidence_of_rollouts
+from pdeloop.method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    Replays,
+    evidence_of,
+    evidence_of_rollouts,
+)
 from pdeloop.method.design.lqg import law_of_innovations
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.files import model_of
@@ -155,6 +161,23 @@ def test_of_replays_measured_costs_alone_decide() -> None:
     own, before = (np.array([r.cost for r in records[i::2]]) for i in (1, 0))
     assert found[ADAPTED].change == mean_of(own) - mean_of(before)
     assert found[FIRST].change == ZERO
+
+
+def test_an_exact_model_tells_laws_apart_in_the_same_rollouts() -> None:
+    """One that is wrong by as much as costs vary does not: measured costs decide."""
+    loop, _, theta = loop_and_rollout()
+    first = first_law().theta_start
+    records = [rolled(20 + i, first_law(), law) for i in range(3) for law in (first, theta)]
+    fields, laws = loop.beginnings(records), {FIRST: first, ADAPTED: theta}
+    exact, wrong = (
+        evidence_of_rollouts(laws, FIRST, records, Replays(loop, fields, error))[ADAPTED].change
+        for error in (0.0, 1e4)
+    )
+    own, before = (loop.costs(loop.theta(law), fields) for law in (theta, first))
+    on_model = mean_of(own - before)
+    measured = evidence_of_rollouts(laws, FIRST, records)[ADAPTED].change
+    assert exact == on_model and on_model.error < measured.error
+    assert wrong == measured
 
 
 def test_model_based_improves_a_law_of_few_readings_and_goes_on_with_the_same_bits() -> None:

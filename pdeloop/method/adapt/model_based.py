@@ -16,7 +16,7 @@ Sources and equations: docs/optimizers.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -70,6 +70,7 @@ from pdeloop.method.adapt.verdict import (
     NAMES,
     NO_OTHER,
     NONE,
+    Replays,
     Verdict,
     beats_no_control,
     cheaper_law,
@@ -563,7 +564,7 @@ class ModelBased(Optimizer):
             evidence = evidence_of(loop, laws, base, known, fields, progress.change)
         if evidence is None:
             base = base if of_law(known, laws[base]) else FIRST  # there is nothing to compare
-            evidence = evidence_of_rollouts(laws, base, known)
+            evidence = evidence_of_rollouts(laws, base, known, self._replays(laws.values()))
         verdict = choose(evidence, base, self._settings.confidence)
         progress.policy = laws[verdict.chosen].copy()
         row |= verdict.row
@@ -581,7 +582,8 @@ class ModelBased(Optimizer):
         if progress.belief is not None and self._model_compares and not progress.replayed:
             loop = progress.belief.loop(self._context)
         confidence, fields = self._settings.confidence, self._fields()
-        found = cheaper_law(loop, progress.policy, known, fields, confidence)
+        replays = self._replays(own.policy for own in known)
+        found = cheaper_law(loop, progress.policy, known, fields, confidence, replays)
         if found is None:
             return
         law, saved = found
@@ -594,11 +596,15 @@ class ModelBased(Optimizer):
             missed = str(row["reason"]).removeprefix(f"{NO_OTHER}: ")
             within = " (within chance)" if missed != row["reason"] else ""
             reason = f"{missed}{within}; {reason}"
-        change = measured_change(known, law, laws[base])
+        change = measured_change(known, law, laws[base], replays)
         if change is None:
             change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))
         row |= Verdict(name, change.value, change.error, reason).row
         progress.policy = law.copy()
+
+    def _replays(self, laws: Iterable[Array]) -> Replays | None:
+        """Rollouts as a model replays them under these laws; None without such a model."""
+        return None
 
     def _rollouts(self) -> list[Record]:
         """The rollouts of laws, denoised."""

@@ -14,12 +14,12 @@ model of the readings (`ModelBasedReadings`), in short steps from measured laws,
 more of them. A linear model of the readings describes the plant near the fields of one law, and its
 innovations change with the law. So a step stays close to its starting point, the law with the best
 measured cost, and replays the innovations of its rollouts. Under its own law a rollout is reproduced
-exactly. Measured costs alone decide.
+exactly. Measured costs decide, or of an accepted model those of both laws in the same rollouts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,11 +48,13 @@ from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
     NONE,
+    Replays,
     choose,
     evidence_against_none,
     evidence_of_pairs,
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import SENSED_REPRODUCED
 
@@ -128,6 +130,15 @@ class ModelBasedReadings(ModelBased):
         ]
         self._progress.policy = best_measured(others, self._progress.policy).copy()
         super()._judge(row)
+
+    def _replays(self, laws: Iterable[Array]) -> Replays | None:
+        belief = self._progress.belief
+        if belief is None or not isinstance(belief.model, ReadingsModel):
+            return None
+        if belief.error > self._settings.believed or not all(map(self._is_linear, laws)):
+            return None
+        loop = belief.loop(self._context)
+        return Replays(loop, loop.beginnings(self._rollouts()), belief.error)
 
     def _is_linear(self, policy: Array) -> bool:
         """False of a law on an estimate of the field, which a model of the readings does not have."""

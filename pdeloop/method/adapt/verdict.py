@@ -11,7 +11,9 @@ rollout is as informative as many without it. The fields of that mean are the sa
 difference of two laws has little variance; for the final law, which was computed from these fields,
 the mean is over held-out fields.
 
-Where no model predicts rollouts, they alone count, by one of two rules:
+Of an accepted model that replays rollouts, the costs of two laws in the same rollouts count where their
+difference has a smaller error than that of measured costs (`Replays`). Where no model predicts
+rollouts, they alone count, by one of two rules:
 
 - the mean over pairs from the same fields (`evidence_of_pairs`), in which cancels what a field costs
   with either law,
@@ -199,14 +201,44 @@ def evidence_of(
     return evidence
 
 
+@dataclass(frozen=True, eq=False)
+class Replays:
+    """Rollouts as a model replays them, under any law.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+        That of the model.
+    beginnings : array
+        Those of all rollouts.
+    error : float
+        E of the model, whose root is taken for the relative error of a cost.
+    """
+
+    loop: ClosedLoop
+    beginnings: Array
+    error: float
+
+    def change(self, law: Array, base: Array) -> Estimate:
+        """The cost of a law less that of another in the same rollouts."""
+        costs = [self.loop.costs(self.loop.theta(own), self.beginnings) for own in (law, base)]
+        if not np.isfinite(costs).all():
+            return Estimate(np.inf)
+        doubt = np.sqrt(self.error) * np.abs(costs).mean()
+        return mean_of(costs[0] - costs[1]) + Estimate(0.0, doubt)
+
+
 def evidence_of_rollouts(
-    laws: Mapping[str, Array], base: str, records: Sequence[Record]
+    laws: Mapping[str, Array],
+    base: str,
+    records: Sequence[Record],
+    replays: Replays | None = None,
 ) -> dict[str, Evidence]:
     """The evidence of rollouts alone, except for `base` only for laws that were measured.
 
     It is the mean difference on the initial fields that a law and the base share if there are two or
     more, else the difference of their means. Where the base has no finite cost, no control takes its
-    place, and without that 0.
+    place, and without that 0. With replays, the difference in these counts if its error is smaller.
     """
     costs: dict[str, dict[int, float]] = {}
     for name, law in laws.items():
@@ -226,7 +258,11 @@ def evidence_of_rollouts(
         if name == base:
             evidence[name] = Evidence(ZERO, lost)
         elif len(values):
-            evidence[name] = Evidence(_difference(mine, stay), lost)
+            changes = [_difference(mine, stay)]
+            if replays is not None and stay is costs[base]:
+                changes.append(replays.change(laws[name], laws[base]))
+            known = [own for own in changes if np.isfinite(own.value)]
+            evidence[name] = Evidence(min(known or changes, key=lambda own: own.error), lost)
     return evidence
 
 
@@ -250,6 +286,7 @@ def cheaper_law(
     records: Sequence[Record],
     fields: Array,
     confidence: float,
+    replays: Replays | None = None,
 ) -> tuple[Array, Estimate] | None:
     """The measured law that beats the chosen one beyond chance.
 
@@ -257,7 +294,7 @@ def cheaper_law(
     `evidence_of`; the estimate with the smaller error counts. A law that was measured is so never lost
     to one that a model promised more of.
 
-    loop: of the model, or none; fields: as for `evidence_of`.
+    loop: of the model, or none; fields: as for `evidence_of`; replays: as for `evidence_of_rollouts`.
 
     Returns
     -------
@@ -267,7 +304,7 @@ def cheaper_law(
     for law in (own[0].policy for own in by_law(records) if len(own) > 1):
         if np.array_equal(law, chosen):
             continue
-        estimates = [measured_change(records, law, chosen)]
+        estimates = [measured_change(records, law, chosen, replays)]
         if loop is not None:
             pair = {"law": law, FIRST: chosen}
             evidence = evidence_of(loop, pair, FIRST, records, fields, ZERO)
@@ -280,9 +317,11 @@ def cheaper_law(
     return found
 
 
-def measured_change(records: Sequence[Record], law: Array, base: Array) -> Estimate | None:
+def measured_change(
+    records: Sequence[Record], law: Array, base: Array, replays: Replays | None = None
+) -> Estimate | None:
     """The change of a law against another by their rollouts; None where either lacks finite ones."""
-    evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records)
+    evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records, replays)
     return _change(evidence, "law", FIRST) if of_law(records, base) else None
 
 
