@@ -20,6 +20,7 @@ from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.replay import best_on_same_fields, designed_again, law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel
+from tests.support.small import FEW_FITS
 
 A = np.array([[1.1, 0.1], [0.0, 0.8]])
 B = np.array([[0.0], [1.0]])
@@ -132,9 +133,10 @@ def test_a_training_brings_convection_to_rest_from_rollouts_that_begin_with_it(
     """Also where the model has it that no control costs less than the first law."""
     if not safe:
         monkeypatch.setattr(model_based, "beats_no_control", lambda *given: False)
-    how = {"reduced_order": 20, "exploration_variance": 0.3, "law": "affine"}
-    run, spent = training(lambda: Admissible(10), 103, 20, **how)
-    plant = Admissible(10)
+    how = {"reduced_order": 20, "exploration_variance": 0.3, "law": "affine", **FEW_FITS}
+    how["optimizer_settings"] = {"mixtures": 4}
+    plant = Admissible(10, steps=60)
+    run, spent = training(lambda: plant, 103, 20, **how)
     episode = rollout(DynamicsPlant(plant), run.law(), [0])
     heat = plant.nusselt(episode.states[1:, 0])
     assert spent <= 20 and heat[-10:].mean() < 1.01 and heat.mean() < 1.2, heat

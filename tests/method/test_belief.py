@@ -10,8 +10,9 @@ from pdeloop.method.adapt.belief import believe
 from pdeloop.method.models import Measured
 from pdeloop.method.models.base import errors
 from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.settings import FieldModelSettings
 
-N_Z, N_A, STEPS = 9, 2, 40
+N_Z, N_A, STEPS = 9, 2, 20
 
 
 def rooms(rng: np.random.Generator, level: float) -> list[Record]:
@@ -33,7 +34,15 @@ def test_numbers_that_cost_nothing_have_no_say_in_the_choice_of_a_model(level: f
     cost = Cost(N_Z, N_A, STEPS, state_weight=np.append(np.ones(8), 0.0))
     known = [Trajectory(record.states, record.actions) for record in records]
     context = Context(
-        np.eye(N_Z)[:, :1], np.zeros(N_Z), 1.0, 1.0, STEPS, known[0], further=known[1:], cost=cost
+        np.eye(N_Z)[:, :1],
+        np.zeros(N_Z),
+        1.0,
+        1.0,
+        STEPS,
+        known[0],
+        further=known[1:],
+        cost=cost,
+        field_models=FieldModelSettings(folds=2, largest_degree=2),
     )
     belief = believe(context, records, 0.05)
     assert belief is not None

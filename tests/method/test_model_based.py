@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from pdeloop.method.adapt import (
     Context,
     ModelBased,
     Record,
+    Rollout,
     RolloutResult,
     Trajectory,
     model_based,
@@ -35,6 +37,8 @@ from tests.support.small import same_bits
 N_Z, N_S, N_A, T = 7, 4, 2, 30
 Q, R = 1.0, 0.2
 Bend = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+Training = list[tuple[dict[str, Any], dict[str, np.ndarray], np.ndarray]]
+"""After each tell, its row, the state of the optimiser and its policy."""
 
 
 class Plant:
@@ -146,53 +150,62 @@ def test_every_rollout_of_a_law_is_on_a_field_of_its_own_and_asking_is_pure() ->
     assert optimizer.ask() == []
 
 
+@cache
+def whole(bend: Bend | None) -> tuple[Training, list[list[Rollout]]]:
+    """A training that nothing interrupts, and what it asked for."""
+    plant = Plant(bend)
+    optimizer = make(plant, rollouts=14)
+    asked: list[list[Rollout]] = []
+    training: Training = []
+    while not optimizer.done:
+        asked.append(optimizer.ask())
+        row = optimizer.tell(measured(plant, optimizer))
+        training.append((row, optimizer.state(), optimizer.policy))
+    return training, asked
+
+
 @pytest.mark.parametrize("bend", [None, chaotic])
 def test_an_optimiser_restored_before_any_tell_goes_on_with_the_same_bits(
     bend: Bend | None,
 ) -> None:
     plant = Plant(bend)
-    whole = make(plant, rollouts=26)
-    while not whole.done:
+    state = make(plant, rollouts=14).state()
+    training, _ = whole(bend)
+    for row, expected, policy in training:
         file = io.BytesIO()
-        np.savez(file, **whole.state())  # type: ignore[arg-type]
+        np.savez(file, **state)  # type: ignore[arg-type]
         file.seek(0)
-        again = make(plant, rollouts=26)
+        again = make(plant, rollouts=14)
         with np.load(file, allow_pickle=False) as arrays:
             again.restore(dict(arrays))
-        results = measured(plant, again)
-        rows = whole.tell(results), again.tell(results)
-        assert rows[0] == rows[1]
-        one, other = whole.state(), again.state()
-        assert one.keys() == other.keys()
-        assert all(one[name].tobytes() == other[name].tobytes() for name in one)
-    assert whole.tells == again.tells
+        assert again.tell(measured(plant, again)) == row
+        state = again.state()
+        assert state.keys() == expected.keys()
+        assert all(state[name].tobytes() == expected[name].tobytes() for name in state)
+        assert same_bits(again.policy, policy)
+    assert again.done and again.tells == len(training)
 
 
 def test_steps_along_rollouts_where_no_model_predicts_them() -> None:
     plant = Plant(chaotic)
-    optimizer = make(plant, rollouts=26)
-    rows = finished(plant, optimizer)
+    training, _ = whole(chaotic)
+    rows, policy = [row for row, *_ in training], training[-1][-1]
     assert "no model" in rows[0]["reason"] and "steps along measured ones" in rows[0]["reason"]
     assert {row["role"] for row in rows} == {"renewing", "judging"}
-    assert rows[-1]["rollouts"] == 26 and "early" not in rows[-1]
+    assert rows[-1]["rollouts"] == 14 and "early" not in rows[-1]
     assert rows[-1]["chosen"] == ADAPTED
     # What acts on a linear plant is repeated exactly, so that steps lead to the best law for it.
     start, best = plant.cost(0.6 * plant.best), plant.cost(plant.best)
-    assert plant.cost(optimizer.policy) <= best + 0.35 * (start - best)
+    assert plant.cost(policy) <= best + 0.35 * (start - best)
 
 
 def test_steps_are_compared_on_the_fields_of_the_first_law_and_with_no_control() -> None:
-    plant = Plant(chaotic)
-    optimizer = make(plant, rollouts=26)
-    first = optimizer.ask()
+    _, (first, asked, after, *_) = whole(chaotic)
     known = [rollout.field_seed for rollout in first]
-    optimizer.tell(measured(plant, optimizer))
-    asked = optimizer.ask()
     own = [r.field_seed for r in asked if r.policy.any()]
     none = [r.field_seed for r in asked if not r.policy.any()]
     assert own == known[: len(own)] and len(own) == 3 and none == known[:2]
-    optimizer.tell(measured(plant, optimizer))
-    assert all(rollout.policy.any() for rollout in optimizer.ask())
+    assert all(rollout.policy.any() for rollout in after)
 
 
 def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
@@ -201,12 +214,12 @@ def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
     """Without noise that would be the same rollout; fresh fields tell more of the plant."""
     monkeypatch.setattr(model_based, "step", lambda *_: None)
     plant = Plant(chaotic)
-    optimizer = make(plant)
+    optimizer = make(plant, rollouts=12)
     known: list[tuple[bytes, int]] = []
     while not optimizer.done:
         known += [(asked.policy.tobytes(), asked.field_seed) for asked in optimizer.ask()]
         optimizer.tell(measured(plant, optimizer))
-    assert len(set(known)) == len(known) == 18
+    assert len(set(known)) == len(known) == 12
 
 
 def test_where_no_law_stays_finite_on_the_model_steps_follow_measured_rollouts(
