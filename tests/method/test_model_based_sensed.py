@@ -195,7 +195,7 @@ def test_an_equation_that_the_first_rollouts_did_not_determine_is_looked_for_aga
 
 @pytest.mark.parametrize("far", [1.0, 100.0])
 def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far: float) -> None:
-    """Its rollouts show none; those of a law that stays near may."""
+    """Its rollouts show none; those of a law that stays near may. The row tells of what follows."""
     before, *_ = told()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model_based_sensed, "sensed_from", lambda *_: None)
@@ -211,7 +211,11 @@ def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far
         )
         runs_away = far > 1.0
         assert ("no control is rolled out next" in str(row.get("reason"))) is runs_away
+        assert own.policy.any() is not np.bool_(runs_away)
         assert all(asked.policy.any() is not np.bool_(runs_away) for asked in own.ask())
+    of_a_law = {"fraction", "steps", "predicted_change", "deviation"} & {*row}
+    assert of_a_law == (set() if runs_away else {"steps"})
+    assert {"role", "cost", "model"} <= {*row}  # of the rollouts, and of what reproduces them
 
 
 def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
