@@ -36,6 +36,7 @@ from tests.method.test_predictive import (
 from tests.method.test_predictive import (
     optimizer as planned,
 )
+from tests.support.small import FEW_FITS
 from tests.tools.test_law_gradients import SEEDS, Cubic
 from tests.tools.test_law_gradients import law_of as law_of_cubic
 from tuner_node.narration import closing_lines
@@ -166,12 +167,18 @@ def test_the_gradient_through_the_model_agrees_with_finite_differences(
         assert (up - down) / 2e-6 == pytest.approx(found @ d, rel=1e-5, abs=1e-7)
 
 
-@pytest.mark.parametrize("own", [Neural(ROWS, T), moving()], ids=["fixed", "moving"])
-def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_theta(
-    own: Neural, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def small_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a network is trained on is most of what its training costs."""
     for name, number in (("IMITATIONS", 300), ("LABELLED", 6), ("VISITED", 16), ("HELD_OUT", 8)):
         monkeypatch.setattr(f"pdeloop.method.adapt.network.{name}", number)
+
+
+@pytest.mark.parametrize("own", [Neural(ROWS, T), moving()], ids=["fixed", "moving"])
+@pytest.mark.usefixtures("small_samples")
+def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_theta(
+    own: Neural,
+) -> None:
     made, network, _ = training(ANY_ACTION, own)
     first = network.first(RNG)
     numbers, others = made.trained(50), np.stack([start(seed) for seed in range(20, 40)])
@@ -200,6 +207,7 @@ def optimizer() -> ModelBasedNeural:
     return made
 
 
+@pytest.mark.usefixtures("small_samples")
 def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
     own, law, rows = optimizer(), Neural(ROWS, T), []
     cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
@@ -233,11 +241,12 @@ def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
 
 TRAINED = {
     "n_z": 32,
-    "horizon": 40,
+    "horizon": 30,
     "reduced_order": 8,
     "rollouts": 15,
     "evaluation_fields": 4,
-    "law_settings": {"neurons": 16, "iterations": 150},
+    "law_settings": {"neurons": 16, "iterations": 120},
+    **FEW_FITS,
 }
 
 
