@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pdeloop
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
-from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult
+from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult, sensed_loop
 from pdeloop.method.adapt.base import Optimizer
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictiveSensed,
@@ -24,7 +25,7 @@ from pdeloop.method.laws import ExtendedKalman
 from pdeloop.method.laws.plans import Planner, planned, simulated
 from pdeloop.method.laws.predictive import PredictiveKalman
 from pdeloop.method.laws.registry import action, along, updated
-from pdeloop.method.models.settings import DEFAULTS
+from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED
 from tests.support import sensed_optimiser
 from tests.support.estimated import (
     CUBIC,
@@ -176,7 +177,12 @@ def test_an_optimiser_continues_from_its_state_and_judges_pairs(
     assert own._law.is_extended(own.policy) == (last["chosen"] == "predictive")
 
 
-def test_where_no_equation_reproduces_the_readings_the_law_stays_and_says_why() -> None:
+def test_where_no_equation_reproduces_the_readings_the_law_stays_and_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That fits of noise have such an error is shown by those of the fit."""
+    poor = SimpleNamespace(error=1.1 * SENSED_REPRODUCED)
+    monkeypatch.setattr(sensed_loop, "fit_sensed", lambda *_, **__: poor)
     own, rng, row = optimiser(Small, 6), np.random.default_rng(0), dict[str, Any]()
     while not own.done:
         results = []
