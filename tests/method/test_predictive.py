@@ -35,6 +35,7 @@ from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.settings import Settings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
+from tests.support.small import FEW_FITS
 from tuner_node.narration import closing_lines
 
 RNG = np.random.default_rng(1)
@@ -223,13 +224,14 @@ def test_the_law_of_a_run_acts_as_it_was_measured(run: pdeloop.FinishedRun) -> N
 
 
 LINEAR = {
-    "n_z": 32,
-    "horizon": 60,
+    "n_z": 16,
+    "horizon": 40,
     "reduced_order": 6,
     "rollouts": 15,
     "evaluation_fields": 2,
+    **FEW_FITS,
 }
-CHAOTIC = LINEAR | {"horizon": 40, "reduced_order": 8}
+CHAOTIC = LINEAR | {"n_z": 32, "reduced_order": 8}
 FEW_STARTS = {"first_iterations": 20, "starts": 2}
 
 
