@@ -39,7 +39,8 @@ SINCE_1970 = 1e11
 DATES = ((25569.0, 73051.0), (719529.0, 767011.0))
 """Days of the years 1970 to 2099, as numbers of spreadsheets and of MATLAB."""
 REPEATED = 0.1
-"""Share of steps of t that are 0 from which on its clock is too coarse for the log."""
+"""Share of steps of t that are 0 from which on its clock is too coarse for the log, and of long ones
+in a row from which on they are no gaps."""
 
 
 @dataclass(frozen=True)
@@ -183,16 +184,19 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     first = np.r_[True, ~(np.diff(times) > 0.0)][: len(times)]
     if int(first.sum()) > most:
         raise ValueError(f"expected at most {most} trajectories, got {int(first.sum())}")
-    if (same := np.diff(times) == 0.0).sum() > REPEATED * len(times):
-        raise ValueError(
-            f"t is the same in rows {rows[int(np.argmax(same))]} and {rows[int(np.argmax(same)) + 1]}, "
-            f"and {int(same.sum()) - 1} times more: its clock is too coarse for the steps of this log; "
-            "write t to fractions of seconds, or take it out of the file and give --sample-time"
-        )
+    if (same := np.diff(times) == 0.0).any():
+        k, more = int(np.argmax(same)), int(same.sum()) - 1
+        text = f"t is the same in rows {rows[k]} and {rows[k + 1]}, and {more} times more: "
+        if more + 1 > REPEATED * len(times):
+            raise ValueError(
+                f"{text}its clock is too coarse for the steps of this log; write t to fractions of "
+                "seconds, or take it out of the file and give --sample-time"
+            )
+        remarks.append(f"{text}each begins another trajectory; leave out rows that are there twice")
     step = _median_step(times, first) if log.step is None else log.step
     after_gap = np.zeros(len(first), dtype=bool)
     if step is not None and timed:
-        after_gap[1:] = np.diff(times) > GAP * step
+        after_gap[1:] = np.diff(times) > GAP * max(step, remedies.resample or 0.0)
     found = findings(values, first | after_gap, rows, log.channels, step or 1.0)
     spoilt = _missing(values, first, n_z)
     dropped = list[int]()
@@ -222,7 +226,7 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     whole = [(times[p], values[p]) for p in parts]
     if remedies.resample is not None and parts:
         step = remedies.resample or _rounded(step or 1.0)
-        _refuse_gaps(times, rows, parts)
+        _refuse_gaps(times, rows, parts, step)
         whole = [_resampled(t - t[0], v, n_z, step) for t, v in whole]
         whole = [(t, v) for t, v in whole if len(v) > 1]
     elif timed and parts:
@@ -311,6 +315,13 @@ def _sample_time(times: Array, rows: NDArray[np.int64], parts: Sequence[slice]) 
                     f"{text} (all are between {every[0]:.6g} and {every[-1]:.6g} s): resample the log "
                     f"with --resample {_rounded(median):g}"
                 )
+            apart = own > GAP * median
+            if (apart[1:] & apart[:-1]).sum() > REPEATED * len(own):
+                usual = float(np.median(own[apart]))
+                raise ValueError(
+                    f"{text}, and {int(apart.sum()) - 1} times more: give --resample "
+                    f"{_rounded(usual):g}, as --cut would leave out the rows at other steps"
+                )
             raise ValueError(
                 f"{text}: fill the gap or resample the log, or cut the file in two there, as several "
                 "files can be given; --cut does so"
@@ -318,10 +329,12 @@ def _sample_time(times: Array, rows: NDArray[np.int64], parts: Sequence[slice]) 
     return median
 
 
-def _refuse_gaps(times: Array, rows: NDArray[np.int64], parts: Sequence[slice]) -> None:
-    """ValueError where rows are missing, over which nothing is interpolated."""
+def _refuse_gaps(
+    times: Array, rows: NDArray[np.int64], parts: Sequence[slice], step: float
+) -> None:
+    """ValueError where rows are missing, over which nothing is interpolated; step: the new one."""
     steps = [np.diff(times[part]) for part in parts]
-    median = float(np.median(np.concatenate(steps)))
+    median = max(float(np.median(np.concatenate(steps))), step)
     for part, own in zip(parts, steps, strict=True):
         if own.max() > GAP * median:
             k = int(np.argmax(own))

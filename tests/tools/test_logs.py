@@ -211,6 +211,26 @@ def test_rows_of_another_step_that_cut_leaves_out_are_told(tmp_path: Path) -> No
     assert found.remarks == (told,)
 
 
+def test_a_log_whose_step_changes_is_told_of_resampling_which_keeps_both_parts(
+    tmp_path: Path,
+) -> None:
+    kept = np.r_[:200, 200:ROWS:2]
+    path = write(tmp_path / "log.csv", Z[kept], U[kept // 4 * 4], T[kept])
+    with pytest.raises(ValueError, match=r"got 2 s before row 203 .* give --resample 2, as --cut"):
+        read_measurements(path)
+    for cut in (False, True):
+        found = read_measurements(path, resample=2.0, cut=cut)
+        assert [len(a) for _, a in found.trajectories] == [149]
+
+
+def test_rows_that_are_there_twice_are_told(tmp_path: Path) -> None:
+    rows = np.sort(np.r_[:ROWS, 20:ROWS:20])
+    found = read_measurements(write(tmp_path / "log.csv", Z[rows], U[rows], T[rows]))
+    assert len(found.trajectories) == 15
+    told = "t is the same in rows 22 and 23, and 13 times more: each begins another trajectory"
+    assert found.remarks[0].startswith(told)
+
+
 def test_missing_rows_are_cut_at_and_never_interpolated_over(tmp_path: Path) -> None:
     there = np.delete(np.arange(ROWS), [100, 101, 250])
     path = write(tmp_path / "own.csv", Z[there], U[there], T[there])
