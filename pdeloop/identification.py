@@ -29,10 +29,11 @@ from pdeloop.messages.parameters import as_recorded, model_order, recorded_value
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED, CostColumn
 from pdeloop.method.reduce import regression
-from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels
+from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, followed_the_state
 from pdeloop.method.reduce.identifiability import (
     Identifiability,
     NotIdentifiableError,
+    fed_back,
     require_effects,
 )
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
@@ -57,6 +58,9 @@ DEAD = 1e-12
 BETTER = 0.97
 """Product of the errors of single steps and of simulations, relative to that of another model, up to
 which a model is better."""
+MISSED = 0.5
+"""Part of the variation that simulations of held-out data miss from which inputs that are fed back
+show no effects."""
 Trajectories = Sequence[tuple[Array, Array]]
 Source = Mapping[str, int | str]
 """The name of the trajectory."""
@@ -341,6 +345,9 @@ def identify_data(
 
     first = by(given)
     if first.innovations is not None or first.residuals is None or first.residuals.white:
+        alone = fed_back(seen)
+        if alone and first.refit and held_out_errors(first.refit, seen)[-1, 1] > MISSED:
+            raise NotIdentifiableError(followed_the_state([found.channels.input(j) for j in alone]))
         return first
     return _or_subspace(first, by, seen, given)
 
@@ -365,6 +372,8 @@ def _or_subspace(
         ]
     except ValueError:  # too few steps
         return first
+    if min(known[1], found[1]) > MISSED and (alone := fed_back(trajectories)):
+        raise NotIdentifiableError(followed_the_state([first.channels.input(j) for j in alone]))
     score, better = (np.prod(one, axis=1) for one in errors)
     if not (better < score).all() or better[-1] > BETTER * score[-1]:
         return first

@@ -145,6 +145,26 @@ def test_an_input_that_acts_later_than_looked_for_is_no_effect(tmp_path: Path) -
         identified(tmp_path, rod(late, REST), u)
 
 
+@pytest.mark.parametrize("moved", [0.0, 2.0])
+def test_a_controller_with_an_integral_part_needs_set_points_that_move(
+    tmp_path: Path, moved: float
+) -> None:
+    """Noise alone moved the inputs, of which a model then shows no effect that is the plant's."""
+    rng, x, total = np.random.default_rng(3), REST, np.zeros(2)
+    z, u = np.zeros((ROWS, 4)), np.zeros((ROWS, 2))
+    for k in range(ROWS):
+        z[k] = x + 0.02 * rng.standard_normal(4)
+        error = REST[[0, 3]] + moved * np.array([k // 50 % 2, k // 35 % 2]) - z[k, [0, 3]]
+        total += 0.2 * error
+        u[k] = 50.0 + 5.0 * error + total
+        x = A @ x + B @ u[k] + 0.02 * rng.standard_normal(4)
+    if moved:
+        assert identified(tmp_path, z, u).pole[0] == pytest.approx(POLE, abs=0.02)
+        return
+    with pytest.raises(NotIdentifiableError, match="a test signal to them, or move the set points"):
+        identified(tmp_path, z, u)
+
+
 def test_an_experiment_that_is_appended_with_t_in_equal_steps_is_told_and_cut_off(
     tmp_path: Path,
 ) -> None:

@@ -111,7 +111,7 @@ def followed_the_state(names: Sequence[str]) -> str:
     return (
         f"{what} always followed from the state (feedback without excitation, or a signal that is "
         "too regular), so its effect cannot be told apart from what the plant does by itself: add "
-        f"random excitation to {'it' if one else 'them'}, or add a log that has some"
+        f"a test signal to {'it' if one else 'them'}, or move the set points, or add a log with either"
     )
 
 

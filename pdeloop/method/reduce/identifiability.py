@@ -63,6 +63,8 @@ COARSER = 4
 """Rows of which the mean is taken, again and again, to see slow effects."""
 PAST = 8
 """Rows whose inputs may have an effect on readings that do not show the whole state."""
+FED_BACK = 0.1
+"""Independence of the last `PAST` rows below which an input may be that of a controller."""
 LEVELS = 10
 """Different values from which on an input counts as rounded; below it is switched."""
 
@@ -207,6 +209,23 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
         names = [channels.input(j) for j in own]
         moves, means = y.std(axis=0)[own].tolist(), y.mean(axis=0)[own].tolist()
         raise NotIdentifiableError(words.no_effect(names, moves, means))
+
+
+def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
+    """The inputs that the states and inputs of the last `PAST` rows tell, as those of a controller.
+
+    With an integral part, at a constant set point, it has but noise that tells them from the state.
+    """
+    n_a, before, inputs = trajectories[0][1].shape[1], list[Array](), list[Array]()
+    for states, a in (_with_past(z, a) for z, a in trajectories if len(a) > PAST):
+        before.append(np.hstack([states[:-1], a[:, n_a:]]))
+        inputs.append(a[:, :n_a])
+    if not before:
+        return []
+    known = np.concatenate(before)
+    with one_thread():
+        own, _ = _inputs(Steps(known, known, np.concatenate(inputs)), known[:, :1], NUMBERED)
+    return [int(j) for j in np.flatnonzero(own < FED_BACK)]
 
 
 def _means(z: Array, a: Array) -> Trajectory:
