@@ -46,7 +46,7 @@ from pdeloop.method.models import (
     Measured,
     affine_law,
 )
-from pdeloop.method.models.base import Law, Samples, predicted, saturated
+from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
 from pdeloop.method.models.selection import (
@@ -72,6 +72,9 @@ from pdeloop.method.reduce.reduced_model import (
 from pdeloop.method.reduce.regression import fit
 from pdeloop.process.one_thread import one_thread
 
+_FIELD_STEPS = 4096
+"""Steps of a trajectory by which a model of the whole field is selected, and of the simulations by
+which laws are compared, at most."""
 _FIELD_LARGEST = 512
 """Largest state for which a model of the whole field is fitted for the first law."""
 _FIELD_THINNING = 5
@@ -199,7 +202,9 @@ def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Sele
     """
     if len(selection.target) > _FIELD_LARGEST:
         return None
-    found = selection.select([Measured(z, a) for z, a in trajectories])
+    known = [Measured(z, a) for z, a in trajectories]
+    folds = selection.settings.folds
+    found = selection.select([part for own in known for part in _spread(own, folds)])
     if found is None or found.noise or found.near < np.inf:
         return found
     if found.error <= selection.accepted < found.fitted.own.simulated:
@@ -208,6 +213,13 @@ def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Sele
         if again is not None and again.own.simulated < found.fitted.own.simulated:
             return replace(found, fitted=again)
     return found
+
+
+def _spread(rollout: Measured, count: int) -> list[Measured]:
+    """The rollout, or pieces that are spread over a long one evenly, of `_FIELD_STEPS` steps in all."""
+    if len(rollout.actions) <= _FIELD_STEPS:
+        return [rollout]
+    return [part.part(0, _FIELD_STEPS // count) for part in pieces(rollout, count)]
 
 
 def regression_kind(n_s: int, constant: bool) -> Kind:
@@ -322,7 +334,8 @@ def field_law(
         fields = list(smoothed(np.stack(fields), noise))
     best = saturated(affine_law(K, b - K @ point), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
-    visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
+    ahead = min(horizon, _FIELD_STEPS)
+    visited = [z for law in (best, none) for z in states_under(model, law, fields, ahead)]
     U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, order or n_s)
     K_a, s_r = K @ U, U.T @ target
     # There is no constant part where the target is outside of U.
@@ -332,13 +345,13 @@ def field_law(
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0
-        for states in states_under(judge, saturated(law, action_set), fields, horizon):
-            if len(states) <= horizon:
+        for states in states_under(judge, saturated(law, action_set), fields, ahead):
+            if len(states) <= ahead:
                 return np.inf
-            actions = action_set.applied(law(0, states[:horizon]))
-            total += float(cost.along(states[None, :horizon], actions[None], 0)[0][0])
+            actions = action_set.applied(law(0, states[:ahead]))
+            total += float(cost.along(states[None, :ahead], actions[None], 0)[0][0])
             total += float(cost.at_end(states[-1:])[0][0])
-        return total / (horizon * len(fields))
+        return total / (ahead * len(fields))
 
     worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
     return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)

@@ -279,26 +279,31 @@ def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
 
     They end before the first state that is not finite.
     """
+    if not rollouts:
+        return []
     z = np.array([rollout.known[0] for rollout in rollouts], dtype=np.float64)
     steps = np.array([len(rollout.actions) for rollout in rollouts])
-    alive, found = steps > 0, [[state.copy()] for state in z]
+    alive, lengths = steps > 0, np.ones(len(steps), dtype=np.int64)
+    found = np.empty((len(z), int(steps.max()) + 1, *z.shape[1:]))
+    found[:, 0] = z
+    laws = [rollout.law for rollout in rollouts]
+    taken = np.zeros((*found[:, 1:].shape[:2], *np.shape(rollouts[0].actions)[1:]))
+    for own, rollout in zip(taken, rollouts, strict=True):
+        own[: len(rollout.actions)] = rollout.actions
     with np.errstate(all="ignore"):
-        for k in range(steps.max(initial=0)):
-            rows = np.flatnonzero(alive).tolist()
-            a = np.vstack([_action(rollouts[i], k, z[i : i + 1]) for i in rows])
-            z[rows] = model.step(z[rows], a)
+        for k in range(found.shape[1] - 1):
+            rows = np.flatnonzero(alive)
+            for i in rows.tolist() if any(laws) else ():
+                if (law := laws[i]) is not None:
+                    taken[i, k] = law(k, z[i : i + 1])[0]
+            a = taken[rows, k]
+            z[rows] = found[rows, k + 1] = model.step(z[rows], a)
             finite = np.asarray(np.isfinite(z).all(axis=1))
-            for i in rows:
-                alive[i] = finite[i] and k + 1 < steps[i]
-                if finite[i]:
-                    found[i].append(z[i].copy())
+            lengths[rows] += finite[rows]
+            alive &= finite & (k + 1 < steps)
             if not alive.any():
                 break
-    return [np.array(states) for states in found]
-
-
-def _action(rollout: Measured, k: int, z: Array) -> Array:
-    return rollout.actions[k : k + 1] if rollout.law is None else rollout.law(k, z)
+    return [states[:length] for states, length in zip(found, lengths, strict=True)]
 
 
 def errors(

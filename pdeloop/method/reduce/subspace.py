@@ -34,6 +34,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,7 +43,7 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels
-from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps, explained
+from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
 from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
@@ -74,6 +76,8 @@ FOLDS = 4
 """Parts of the trajectories, each held out once."""
 RESOLVED = 1e-10
 """Least singular value of the prediction from the past, relative to the largest."""
+SEPARATE = 1e-3
+"""Part of a column, relative to it, beyond those before it from which on sums of squares will do."""
 LEAST = 1e-8
 """Least variance of an innovation, relative to that of the measurement."""
 
@@ -130,12 +134,10 @@ class InnovationModel:
             x = self.A @ x + self.B @ a + self.G @ (measured - self.C @ x) + d
             moved = self.A @ moved - self.G @ (self.C @ moved)
         first: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
-        x, e = first, np.empty_like(v)
-        for k, measured in enumerate(v):
-            e[k] = measured - self.C @ x
-            if k < len(actions):
-                x = self.A @ x + self.B @ actions[k] + self.G @ e[k] + d
-        return first, e
+        known = actions[: len(v) - 1] @ self.B.T + v[:-1] @ self.G.T + d
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = _driven(self.A - self.G @ self.C, known, first[:, None])[:, :, 0]
+            return first, v - x @ self.C.T
 
 
 def subspace_model(
@@ -204,7 +206,7 @@ def subspace_model(
         else:
             p, n, errors = _choose(tried, known, simulations, affine)
         error = float(errors[tried.index((p, n)), 0])
-        predictor = _predictor(known, p, n, channels, affine)
+        predictor = _predictor(known, p, n, channels, affine, n)
         found = _fitted(predictor, n, channels, error, constant=constant)
         table = tuple((*sizes, *own) for sizes, own in zip(tried, errors.tolist(), strict=True))
         found = replace(found, tried=table)
@@ -253,7 +255,8 @@ def _choose(
             size = p, min(n, parts[0][0].shape[1])
             try:
                 if size != made or predictor is None:
-                    made, predictor = size, _predictor(others, *size, NUMBERED, affine)
+                    made, most = size, max(other for own_p, other in tried if own_p == p)
+                    predictor = _predictor(others, *size, NUMBERED, affine, most)
                 model = _fitted(predictor, n, NUMBERED, np.nan, check=False, constant=affine)
             except (linalg.LinAlgError, ValueError):
                 sums[0, fold, i] = np.inf
@@ -303,11 +306,9 @@ def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
     y = z @ model.U
     outside = z - y @ model.U.T
     _, e = model.replay(y, a, max(begin, 1))
-    wrong = moved = 0.0
-    for k in range(begin + 1, len(z)):
-        wrong += float(e[k] @ e[k]) + float(outside[k] @ outside[k])
-        change = z[k] - z[k - 1]
-        moved += float(change @ change)
+    with np.errstate(over="ignore", invalid="ignore"):
+        wrong = float(np.sum(e[begin + 1 :] ** 2) + np.sum(outside[begin + 1 :] ** 2))
+    moved = float(np.sum(np.diff(z[begin:], axis=0) ** 2))
     return (wrong, moved) if np.isfinite(wrong) else (np.inf, moved)
 
 
@@ -352,19 +353,63 @@ def held_out_errors(
 def _from_any_start(A: Array, C: Array, inputs: Array, y: Array) -> float:
     """The least sum |y_k - C x_k|^2 over x_0, of x_{k+1} = A x_k + inputs_k."""
     n, size = len(A), y.size
-    x = np.empty((len(y), n, n + 1))
-    x[0] = np.eye(n, n + 1)
     with np.errstate(over="ignore", invalid="ignore"):
-        for k, own in enumerate(inputs):
-            x[k + 1] = A @ x[k]
-            x[k + 1, :, n] += own
-        seen = C @ x
-        left = (y - seen[:, :, n]).ravel()
-    moved = seen[:, :, :n].reshape(size, n)
-    if size <= n or not (np.isfinite(moved).all() and np.isfinite(left).all()):
+        seen = C @ _driven(A, inputs, np.eye(n, n + 1))
+        seen[:, :, n] -= y
+    if size <= n or not np.isfinite(seen).all():
         return np.inf
-    left -= moved @ linalg.lstsq(moved, left)[0]
+    R = _triangle(seen.reshape(size, n + 1))
+    left = R[:, n] - R[:, :n] @ linalg.lstsq(R[:, :n], R[:, n])[0]
     return float(left @ left) * size / (size - n)
+
+
+def _driven(A: Array, w: Array, x_0: Array) -> Array:
+    """x_0 .. x_N of x_{k+1} = A x_k + w_k, (N + 1, n, c), where w acts on the last column of x.
+
+    All blocks of about sqrt(N) steps go on at once, from 0, and then one begins where another ended.
+    """
+    count, (n, c) = len(w), x_0.shape
+    size = isqrt(count) + 1
+    blocks = count // size + 1
+    padded = np.zeros((blocks * size, n))
+    padded[:count] = w
+    inputs = padded.reshape(blocks, size, n)
+    powers, own = np.empty((size + 1, n, n)), np.zeros((size + 1, blocks, n))
+    powers[0] = np.eye(n)
+    for k in range(size):
+        powers[k + 1] = A @ powers[k]
+        own[k + 1] = own[k] @ A.T + inputs[:, k]
+    begin = np.empty((blocks, n, c))
+    begin[0] = x_0
+    for i in range(blocks - 1):
+        begin[i + 1] = powers[size] @ begin[i]
+        begin[i + 1, :, -1] += own[size, i]
+    free = powers[:size].reshape(size * n, n) @ begin.transpose(1, 0, 2).reshape(n, blocks * c)
+    x = free.reshape(size, n, blocks, c).transpose(2, 0, 1, 3)
+    x[..., -1] += own[:size].transpose(1, 0, 2)
+    found: Array = x.reshape(blocks * size, n, c)[: count + 1]
+    return found
+
+
+def _triangle(X: Array) -> Array:
+    """R of X = Q R, from sums of products where these lose few digits, or else block by block."""
+    sums = X.T @ X
+    scale = np.sqrt(sums.diagonal())
+    scale[scale == 0.0] = 1.0
+    try:
+        R = linalg.cholesky(sums / scale / scale[:, None])
+    except (linalg.LinAlgError, ValueError):  # dependent columns, or numbers that overflow
+        R = np.zeros((1, 1))
+    if R.diagonal().min() > SEPARATE:
+        found: Array = R * scale
+        return found
+    size = 4 * X.shape[1]
+    count = len(X) // size
+    if count < 2:
+        return np.asarray(np.linalg.qr(X, mode="r"))
+    # Blocks of rows fit a cache.
+    parts = np.asarray(np.linalg.qr(X[: count * size].reshape(count, size, -1), mode="r"))
+    return _triangle(np.vstack([parts.reshape(-1, X.shape[1]), X[count * size :]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,8 +417,9 @@ class _Predictor:
     """The vector ARX of p steps of trajectories, and the states that its past gives.
 
     p; U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last of each trajectory; last
-    (N,), which are the last of a trajectory; future (N, p r), the next p measurements that the past
-    predicts, and their directions over the data with their singular values.
+    (N,), which are the last of a trajectory; past (N, d), p steps before each; rows (p r, d), which
+    predict the next p measurements; their directions over the data with their singular values; most:
+    states that are asked for, at most.
     """
 
     p: int
@@ -381,24 +427,39 @@ class _Predictor:
     y: Array
     inputs: Array
     last: NDArray[np.bool_]
-    future: Array
+    past: Array
+    rows: Array
     directions: Array
     values: Array
+    most: int
+
+    def kept(self, n: int) -> int:
+        """States of a model of n: at least r, and no more than are determined."""
+        known = int(np.count_nonzero(self.values > RESOLVED * self.values[0]))
+        return max(int(self.U.shape[1]), min(n, known))
 
     def states(self, n: int) -> Array:
-        """The leading n states, of second moment I; at least r, and no more than are determined."""
-        known = int(np.count_nonzero(self.values > RESOLVED * self.values[0]))
-        kept = max(self.U.shape[1], min(n, known))
-        found: Array = self.future @ (self.directions[:, :kept] / self.values[:kept])
+        """The leading ones, of second moment I, (N, kept)."""
+        kept = self.kept(n)
+        found: Array = self.past @ (self.rows.T @ (self.directions[:, :kept] / self.values[:kept]))
         return found
+
+    @cached_property
+    def triangles(self) -> tuple[Array, Array]:
+        """R of [s_k 1 y_k], and of [s_k 1 a_k y_k s_{k+1}] without the last of each trajectory."""
+        s, y, last = self.states(self.most), self.y, self.last
+        one = np.ones((len(y), 1))
+        every = np.hstack([s, one, y])
+        steps = np.hstack([every[~last, : -y.shape[1]], self.inputs, y[~last], s[1:][~last[:-1]]])
+        return _triangle(every), _triangle(steps)
 
 
 def _predictor(
-    known: Sequence[Trajectory], p: int, r: int, channels: Channels, affine: bool
+    known: Sequence[Trajectory], p: int, r: int, channels: Channels, affine: bool, most: int
 ) -> _Predictor:
     """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread.
 
-    affine: with a constant term, without which that is a state with a pole near 1.
+    affine: with a constant term, without which that is a state with a pole near 1; most: states.
     """
     after = np.concatenate([z[1:] for z, _ in known])
     values = linalg.svdvals(after)
@@ -410,8 +471,8 @@ def _predictor(
         if len(a) < p:
             continue
         w = np.hstack([a, z[:-1] @ U])
-        rows = np.stack([w[k - p : k].ravel() for k in range(p, len(a) + 1)])
-        regressors.append(rows)
+        windows = np.lib.stride_tricks.sliding_window_view(w, p, axis=0)
+        regressors.append(windows.transpose(0, 2, 1).reshape(len(windows), -1))
         targets.append(z[p:] @ U)
         firsts.append(a[p:])
     if not regressors:
@@ -422,10 +483,14 @@ def _predictor(
     about = y
     if affine:
         past, about = past - past.mean(axis=0), y - y.mean(axis=0)
-    markov = _ridge(past / unit, about).T / unit
+    R, d = _triangle(np.hstack([past, about])), past.shape[1]
+    markov = _ridge(R[:, :d] / unit, R[:, d:], len(y)).T / unit
+    rows = _future(markov, p)
+    directions, values, _ = linalg.svd(rows @ R[:, :d].T / np.sqrt(len(y)), full_matrices=False)
     last = np.zeros(len(past), dtype=bool)
     last[np.cumsum([len(rows) for rows in regressors]) - 1] = True
-    return _Predictor(p, U, y, np.concatenate(firsts), last, *_future(past, markov, p, r))
+    inputs = np.concatenate(firsts)
+    return _Predictor(p, U, y, inputs, last, past, rows, directions, values, most)
 
 
 def _fitted(
@@ -438,27 +503,29 @@ def _fitted(
     constant: bool = False,
 ) -> InnovationModel:
     """The model of n states. Call it with one LAPACK thread."""
-    y, last = predictor.y, predictor.last
+    y, last, inputs = predictor.y, predictor.last, predictor.inputs
     if len(y) <= n:
         raise ValueError(f"{len(y)} samples do not determine {n} states")
-    states, r = predictor.states(n), y.shape[1]
-    kept = states.shape[1]
-    # What begins or ends away from the mean drifts on average, so the means are not enough.
-    one = np.ones((len(y), int(constant)))
-    C, e = explained(np.hstack([states, one]), y)
-    C = C.T
-    before, next_ = states[~last], states[1:][~last[:-1]]
-    inputs = predictor.inputs
+    kept, (count, n_a), r = predictor.kept(n), inputs.shape, y.shape[1]
     if check:
-        examine_steps(Steps(before, next_, inputs), np.eye(kept), channels).require()
-    joint, w = explained(np.hstack([before, inputs, one[: len(next_)]]), next_)
-    joint = joint.T
-    A, B, d = joint[:, :kept], joint[:, kept : kept + inputs.shape[1]], None
+        states = predictor.states(n)
+        steps = Steps(states[~last], states[1:][~last[:-1]], inputs)
+        examine_steps(steps, np.eye(kept), channels).require()
+    every, both = predictor.triangles
+    most = every.shape[1] - 1 - r
+    # What begins or ends away from the mean drifts on average, so the means are not enough.
+    one = [most] * constant
+    own = [*range(kept), *one]
+    C = linalg.lstsq(every[:, own], every[:, most + 1 :])[0].T
+    known_ = [*range(kept), *range(most + 1, most + 1 + n_a), *one]
+    after = both[:, most + 1 + n_a + r :][:, :kept]
+    joint = linalg.lstsq(both[:, known_], after)[0].T
+    e = both[:, most + 1 + n_a :][:, :r] - both[:, own] @ C.T
+    w = after - both[:, known_] @ joint.T
+    A, B, d = joint[:, :kept], joint[:, kept : kept + n_a], None
     if constant:
         C, shift = C[:, :kept], linalg.pinv(C[:, :kept]) @ C[:, kept]
         d = joint[:, -1] + shift - A @ shift
-    e = e[~last]
-    count = len(e)
     V, W, S = e.T @ e / count, w.T @ w / count, w.T @ e / count
     level = LEAST * float(np.trace(y.T @ y)) / len(y) / r
     V[np.diag_indices(r)] += level
@@ -475,15 +542,18 @@ def _fitted(
     return InnovationModel(A, B, C, G, predictor.U, innovations, predictor.p, error, d)
 
 
-def _ridge(X: Array, y: Array) -> Array:
-    """Ridge regression whose weight has the least generalised cross-validation error, (d, r)."""
+def _ridge(X: Array, y: Array, count: int) -> Array:
+    """Ridge regression whose weight has the least generalised cross-validation error, (d, r).
+
+    X, y: triangles of `count` rows.
+    """
     left, s, right = linalg.svd(X, full_matrices=False)
     projected = left.T @ y
     outside = float(np.sum(y * y) - np.sum(projected * projected))
     least, chosen = np.inf, 0.0
     for weight in s[0] ** 2 * np.logspace(-14, 0, 29):
         shrunk = weight / (s * s + weight)
-        free = len(X) - float(np.sum(1.0 - shrunk))
+        free = count - float(np.sum(1.0 - shrunk))
         if free <= 0.0:
             continue
         error = (max(outside, 0.0) + float(np.sum((shrunk[:, None] * projected) ** 2))) / free**2
@@ -493,11 +563,11 @@ def _ridge(X: Array, y: Array) -> Array:
     return found
 
 
-def _future(past: Array, markov: Array, p: int, r: int) -> tuple[Array, Array, Array]:
-    """The next p measurements that the past predicts (N, p r), their directions and singular values."""
-    block = past.shape[1] // p
-    rows = np.zeros((p * r, past.shape[1]))
+def _future(markov: Array, p: int) -> Array:
+    """The coefficients (p r, d) of the past in the next p measurements."""
+    r, width = markov.shape
+    block = width // p
+    rows = np.zeros((p * r, width))
     for j in range(p):
         rows[j * r : (j + 1) * r, j * block :] = markov[:, : (p - j) * block]
-    left, s, _ = linalg.svd(rows @ past.T / np.sqrt(len(past)), full_matrices=False)
-    return past @ rows.T, left, s
+    return rows
