@@ -319,7 +319,9 @@ def identify_data(
         )
     used = (input_delay or (0,)) * (1 if len(input_delay or ()) > 1 else n_a)
     delays = study_delays(found.trajectories, used)
-    require_effects(shifted(found.trajectories, delays.best), found.channels)
+    aligned = shifted(found.trajectories, delays.best)
+    require_effects(aligned, found.channels)
+    alone = [found.channels.input(j) for j in fed_back(aligned)]
     if input_delay is None:
         used = delays.best
     if input_delay is not None or delays.alike or delays.at_end:
@@ -345,11 +347,10 @@ def identify_data(
 
     first = by(given)
     if first.innovations is not None or first.residuals is None or first.residuals.white:
-        alone = fed_back(seen)
         if alone and first.refit and held_out_errors(first.refit, seen)[-1, 1] > MISSED:
-            raise NotIdentifiableError(followed_the_state([found.channels.input(j) for j in alone]))
+            raise NotIdentifiableError(followed_the_state(alone))
         return first
-    return _or_subspace(first, by, seen, given)
+    return _or_subspace(first, by, seen, given, alone)
 
 
 def _or_subspace(
@@ -357,12 +358,14 @@ def _or_subspace(
     by: Callable[..., Identified],
     trajectories: Trajectories,
     given: Mapping[str, Any],
+    alone: Sequence[str],
 ) -> Identified:
     """A model in innovation form in place of one whose residuals are correlated, if it is better.
 
     That is, in single steps and simulations of each held-out part of the data. Noise of measurements
     draws the poles of a regression to 0, the more so the shorter the steps are, and with fewer readings
-    than states it has none of the plant's.
+    than states it has none of the plant's. alone: inputs that may have been fed back; where neither
+    model simulates held-out data, the log is refused.
     """
     own = {name: value for name, value in given.items() if name != "dmdc_rank"}
     try:
@@ -372,8 +375,8 @@ def _or_subspace(
         ]
     except ValueError:  # too few steps
         return first
-    if min(known[1], found[1]) > MISSED and (alone := fed_back(trajectories)):
-        raise NotIdentifiableError(followed_the_state([first.channels.input(j) for j in alone]))
+    if alone and min(known[1], found[1]) > MISSED:
+        raise NotIdentifiableError(followed_the_state(alone))
     score, better = (np.prod(one, axis=1) for one in errors)
     if not (better < score).all() or better[-1] > BETTER * score[-1]:
         return first

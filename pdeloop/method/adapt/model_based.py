@@ -16,7 +16,7 @@ Sources and equations: docs/optimizers.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -564,7 +564,7 @@ class ModelBased(Optimizer):
             evidence = evidence_of(loop, laws, base, known, fields, progress.change)
         if evidence is None:
             base = base if of_law(known, laws[base]) else FIRST  # there is nothing to compare
-            evidence = evidence_of_rollouts(laws, base, known, self._replays(laws.values()))
+            evidence = evidence_of_rollouts(laws, base, known, self._replays())
         verdict = choose(evidence, base, self._settings.confidence)
         progress.policy = laws[verdict.chosen].copy()
         row |= verdict.row
@@ -582,7 +582,7 @@ class ModelBased(Optimizer):
         if progress.belief is not None and self._model_compares and not progress.replayed:
             loop = progress.belief.loop(self._context)
         confidence, fields = self._settings.confidence, self._fields()
-        replays = self._replays(own.policy for own in known)
+        replays = self._replays()
         found = cheaper_law(loop, progress.policy, known, fields, confidence, replays)
         if found is None:
             return
@@ -602,8 +602,8 @@ class ModelBased(Optimizer):
         row |= Verdict(name, change.value, change.error, reason).row
         progress.policy = law.copy()
 
-    def _replays(self, laws: Iterable[Array]) -> Replays | None:
-        """Rollouts as a model replays them under these laws; None without such a model."""
+    def _replays(self) -> Replays | None:
+        """Rollouts as a model replays them; None where it cannot."""
         return None
 
     def _rollouts(self) -> list[Record]:

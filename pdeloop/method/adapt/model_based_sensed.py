@@ -19,7 +19,7 @@ exactly. Measured costs decide, or of an accepted model those of both laws in th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -54,7 +54,6 @@ from pdeloop.method.adapt.verdict import (
     evidence_of_pairs,
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import SENSED_REPRODUCED
 
@@ -131,11 +130,10 @@ class ModelBasedReadings(ModelBased):
         self._progress.policy = best_measured(others, self._progress.policy).copy()
         super()._judge(row)
 
-    def _replays(self, laws: Iterable[Array]) -> Replays | None:
+    def _replays(self) -> Replays | None:
+        """Of few sensors there are none: the plant's cost is not that of the readings alone."""
         belief = self._progress.belief
-        if belief is None or not isinstance(belief.model, ReadingsModel):
-            return None
-        if belief.error > self._settings.believed or not all(map(self._is_linear, laws)):
+        if self._context.sensors or belief is None or belief.error > self._settings.believed:
             return None
         loop = belief.loop(self._context)
         return Replays(loop, loop.beginnings(self._rollouts()), belief.error)
