@@ -7,6 +7,7 @@ Only states, actions and the target are used, so the plant may be any, this one 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from io import BytesIO
@@ -347,7 +348,11 @@ def identify_data(
 
     first = by(given)
     if first.innovations is not None or first.residuals is None or first.residuals.white:
-        if alone and first.refit and held_out_errors(first.refit, seen)[-1, 1] > MISSED:
+        errors = np.zeros((1, 2))
+        if alone and first.refit:
+            with suppress(ValueError):  # too few steps
+                errors = held_out_errors(first.refit, seen)
+        if errors[-1, 1] > MISSED:
             raise NotIdentifiableError(followed_the_state(alone))
         return first
     return _or_subspace(first, by, seen, given, alone)

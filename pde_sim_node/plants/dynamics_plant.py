@@ -72,7 +72,8 @@ class DynamicsPlant(BatchPlant):
             self.action_set = ActionSet(self.n_a, *bounds, rate=dynamics.action_rate)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
-        if self.actuated and not self.action_set.bounded:
+        declared = np.isfinite([self.action_set.low, self.action_set.high]).any()
+        if self.actuated and not (declared or self.action_set.zero_mean):
             self.action_set = self._clipped_to() or self.action_set
         self.supports = None if dynamics.supports is None else self._checked_supports()
         self._mean: Array | None = None
@@ -231,7 +232,7 @@ class DynamicsPlant(BatchPlant):
             alike = np.allclose(self.applied(asked), known.project(asked), rtol=1e-12, atol=0.0)
         except OwnCodeError:  # a training says so where it matters
             return None
-        return known if alike else None
+        return ActionSet(self.n_a, low, high, rate=self.action_set.rate) if alike else None
 
     def _advanced(
         self, states: Array, actions: Array, totals: Array, step: int, environments: Any

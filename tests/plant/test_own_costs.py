@@ -335,6 +335,10 @@ class Stepped(Servo):
 def test_the_bounds_of_actuators_that_clip_are_those_of_the_actions() -> None:
     found = DynamicsPlant(Limited()).action_set
     assert found.low.tolist() == [0.0, -2.0] and found.high.tolist() == [4.0, np.inf]
+    slow = Limited()
+    slow.action_rate = 0.5
+    found = DynamicsPlant(slow).action_set
+    assert found.high.tolist() == [4.0, np.inf] and found.rate.tolist() == [0.5, 0.5]
     for other in (Halved(), Coupled(), Stepped(), Servo()):
         assert not DynamicsPlant(other).action_set.bounded
 
