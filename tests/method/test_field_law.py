@@ -15,13 +15,14 @@ from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.method.design import lqt
 from pdeloop.method.design.field_law import (
     FieldLaw,
+    _spread,
     aim_of,
     field_law,
     linearisation_point,
     states_under,
 )
 from pdeloop.method.design.lqt import DesignError, finite_horizon
-from pdeloop.method.models import affine_law
+from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
 from pdeloop.method.models.selection import Accuracy, FittedModel
 from pdeloop.method.models.spectral import SpectralModel
@@ -67,6 +68,18 @@ def law(true: SpectralModel, target: Array) -> ModelRows:
     found = field_law(trajectories, target, none, cost_to(target))
     assert found.better and found.rows is not None
     return found.rows
+
+
+def test_pieces_that_are_spread_over_a_long_rollout_stand_for_it() -> None:
+    numbers = np.arange(10_001.0)[:, None]
+    parts = _spread(Measured(numbers, numbers[:-1]), 4)
+    assert sum(len(part.actions) for part in parts) == 4096
+    assert [part.states[0, 0] for part in parts] == [0.0, 2500.0, 5000.0, 7500.0]
+    for part in parts:
+        np.testing.assert_array_equal(np.diff(part.states, axis=0), 1.0)
+        np.testing.assert_array_equal(part.actions, part.states[:-1])
+    short = Measured(numbers[:4097], numbers[:4096])
+    assert _spread(short, 4) == [short]
 
 
 def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
