@@ -95,26 +95,16 @@ which it is outside of the data."""
 class FieldLaw:
     """The outcome of fitting a model of the whole field.
 
-    Attributes
-    ----------
-    fitted : FittedModel or None
-        The model with its error, and the errors of all kinds; None where none can be fitted.
-    rows : ModelRows or None
-        Its law, with the linearised model on U; None if the model is not accurate enough.
-    cost, other_cost : float
-        The worst mean stage costs that accepted models predict from the initial fields of the
-        trajectories, of its law and of the law to compare with; infinite where there is none, or it
-        diverges.
-    noise : float
-        Measurement noise that the model was fitted for where another one, or none, was declared; 0:
-        what was declared. There is no law then, as the exploration was drawn for the declared noise,
-        and is too weak for the effects of the actuators where that is less.
-    regression : Accuracy
-        Of the regression, to compare with `fitted.own`.
-    judges : tuple of str
-        The models that were accepted.
-    remark : str
-        Where the model is linearised, if the target is far outside of the data.
+    fitted: the model with its error, and the errors of all kinds; None where none can be fitted. rows:
+    its law, with the linearised model on U; None if the model is not accurate enough. cost, other_cost:
+    the worst mean stage costs that accepted models predict from the initial fields of the trajectories,
+    of its law and of the law to compare with; infinite where there is none, or it diverges. regression:
+    its accuracy, to compare with `fitted.own`. judges: the models that were accepted. remark: where the
+    model is linearised, if the target is far outside of the data.
+
+    noise: that which the model was fitted for where another one, or none, was declared; 0: what was
+    declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
+    for the effects of the actuators where that is less.
     """
 
     fitted: FittedModel | None
@@ -252,30 +242,13 @@ def field_law(
     axes: tuple[int, ...] = (),
     order: int = 0,
 ) -> FieldLaw:
-    """A law from a model of the whole field, with as many modes as another has, or as asked for.
+    """A law from a model of the whole field.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        a_k is held from z_k to z_{k+1}.
-    target : (n_z,) array
-        z_r.
-    other : ModelRows
-        The law to compare with, and its model.
-    cost : Cost
-        That of the law, and that which models predict.
-    action_set : ActionSet
-        Admissible actions, in the data and under both laws.
-    noise : float
-        Standard deviation of the noise on every number of the states; 0: none.
-    settings : IdentificationSettings
-        Those whose names begin with `field_`. Errors are relative to the variation of the data.
-    models : FieldModelSettings
-        How models are fitted and one is chosen.
-    axes : tuple of int
-        Points of each axis of the fields; of one axis, or none, they need not be known.
-    order : int
-        Modes of the law; 0: as many as `other` has.
+    trajectories: (states (N + 1, n_z), actions (N, n_a)) each, a_k held from z_k to z_{k+1}; target
+    (n_z,): z_r; other: the law to compare with, and its model; cost: of the law, and predicted by
+    models; action_set: admissible actions, in the data and under both laws; noise: standard deviation
+    of that on every number of the states; axes: points of each axis of the fields, which need not be
+    known of one; order: modes of the law, 0: as many as `other` has.
     """
     weights, line = cost.state_weights, len(axes) < 2
     selection = Selection(

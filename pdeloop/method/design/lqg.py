@@ -64,16 +64,10 @@ _EXACT = 1e-12
 
 
 class Filter(NamedTuple):
-    """A steady-state Kalman filter.
+    """A steady-state Kalman filter x_k = p_k + M (y_k - C p_k).
 
-    Attributes
-    ----------
-    M : (n_s, n_y) array
-        Gain: x_k = p_k + M (y_k - C p_k).
-    P : (n_s, n_s) array
-        Covariance of the error of the prediction p_k.
-    poles : (n_s,) complex array
-        Eigenvalues of A (I - M C), which the errors follow, all inside of the unit circle.
+    M (n_s, n_y); P (n_s, n_s): covariance of the error of p_k; poles (n_s,): eigenvalues of A (I - M
+    C), which the errors follow, all inside of the unit circle.
     """
 
     M: Array
@@ -82,23 +76,12 @@ class Filter(NamedTuple):
 
 
 def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: ArrayLike) -> Filter:
-    """The steady-state Kalman filter of a linear model.
+    """The steady-state Kalman filter of A (n_s, n_s) and C (n_y, n_s).
 
-    Parameters
-    ----------
-    A, C : (n_s, n_s) and (n_y, n_s)
-        The model.
-    process, measurement : (n_s, n_s) and (n_y, n_y)
-        W and V, symmetric, V positive definite.
+    process (n_s, n_s), measurement (n_y, n_y): W and V, symmetric, V positive definite. DesignError
+    where the readings do not see a mode that does not decay, or a mode on the unit circle gets no
+    noise.
 
-    Raises
-    ------
-    DesignError
-        The readings do not see a mode that does not decay, or a mode on the unit circle gets no noise,
-        so that no steady filter exists.
-
-    Examples
-    --------
     A random walk with as much noise in the steps as in the measurements:
 
     >>> found = kalman_filter([[1.0]], [[1.0]], [[1.0]], [[1.0]])
@@ -150,16 +133,8 @@ def noise_of(
 
         E r_k r_k^T = W + V + A V A^T,        E r_{k+1} r_k^T = -A V,        V = sigma^2 U^T U,
 
-    sigma is that of the second equation, and 0 where that is not above 0 by more than chance.
-
-    Parameters
-    ----------
-    model : ModelRows
-        Its A, B and U.
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        What was measured.
-    settings : IdentificationSettings
-        `noise_evidence`: what counts as chance.
+    sigma is that of the second equation, and 0 where that is not above 0 by more than chance, which
+    `settings.noise_evidence` says. trajectories: (states (N + 1, n_z), actions (N, n_a)) each.
     """
     steps = [steps_of([one]) for one in distinct(trajectories)]
     parts = [residuals(model, own) for own in steps]
@@ -202,25 +177,11 @@ def law_of_innovations(
 ) -> ModelRows:
     """The LQG law of a model in innovation form, for the cost of the measurements.
 
-    The gains K_a are those of the state x, of which y = U C x is the target. s = C^+ U^T z is the least
-    state with a measurement z; as A M = G gives the innovations' gain in the estimate after it,
-    L = M C lets L s = M U^T z.
-
-    Parameters
-    ----------
-    model : InnovationModel
-        Of the plant as it is measured.
-    target : (n_z,) array
-        z_r, of what is measured.
-    cost : Cost
-        Of what is measured.
-    or_no_control : bool
-        Gains of 0, with the filter, where there are no stabilising ones.
-
-    Raises
-    ------
-    DesignError
-        The actuators do not reach a mode that does not decay, or the measurements do not see one.
+    The gains K_a are those of the state x, of which y = U C x is the target. s = C^+ U^T z is the
+    least state with a measurement z; as A M = G gives the innovations' gain in the estimate after it,
+    L = M C lets L s = M U^T z. target (n_z,) and cost are of what is measured. or_no_control: gains of
+    0, with the filter, where there are no stabilising ones. DesignError where the actuators do not
+    reach a mode that does not decay, or the measurements do not see one.
     """
     A, B, C = model.A, model.B, model.C
     with one_thread():
@@ -238,21 +199,8 @@ def with_dead_time(
 ) -> ModelRows:
     """A model with the last inputs in its state, its law, and the filter that it had, or L = I.
 
-    Parameters
-    ----------
-    rows : ModelRows
-        The model without delays, z_{k+1} by a_{k-n}.
-    delays : tuple of int
-        n of each input; those below 0 count as 0.
-    cost : Cost
-        That of the law.
-    or_no_control : bool
-        Gains of 0 where there are no stabilising ones.
-
-    Raises
-    ------
-    DesignError
-        There are no stabilising gains.
+    rows: the model without delays, z_{k+1} by a_{k-n}; delays: n of each input, 0 at least. DesignError
+    where there are no stabilising gains; or_no_control: they are 0 then.
     """
     late = [max(n, 0) for n in delays]
     n_s, n_a, memory = len(rows.A), len(late), sum(late)

@@ -58,16 +58,12 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.process.one_thread import one_thread
 
-# A direction that the inputs move by less than this, relative to what they move at most, counts as out
-# of reach.
 _REACH = 1e-12
-# I - (A + B K_a)^T with a smaller reciprocal condition number has no usable inverse.
+"""Effect of the inputs on a direction, relative to the largest, below which it is out of reach."""
 _RECIPROCAL_CONDITION = 1e-14
-
-
-# How many times as large inputs' effects may be as the model's own, or as small, before their unit is
-# changed for the computation.
+"""I - (A + B K_a)^T with a smaller reciprocal condition number has no usable inverse."""
 _ALIKE = 1e6
+"""Ratio of the inputs' effects to the model's own, or its inverse, above which their unit changes."""
 
 
 class DesignError(ValueError):
@@ -335,16 +331,8 @@ def _steady_state_map(closed_loop: Array) -> Array:
 def finite_horizon(
     A: Array, B: Array, drift: Array, state_weight: float, action_weight: float, horizon: int
 ) -> tuple[Array, Array]:
-    """The law a = K e + b that is optimal over a horizon, in its first step.
+    """K (n_a, n) and b (n_a,) of a = K e + b, optimal over a horizon, in its first step; drift: d (n,).
 
-    drift (n,) is d.
-
-    Returns
-    -------
-    K (n_a, n), b (n_a,)
-
-    Examples
-    --------
     >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), 1.0, 1.0, 64)
     >>> K.round(6), b
     (array([[-0.618034]]), array([-0.]))
@@ -381,8 +369,6 @@ def action_curvature(
 ) -> Array:
     """R + B^T P B (n_a, n_a): the cost of a deviation from the optimal action, to second order.
 
-    Examples
-    --------
     >>> action_curvature(np.eye(1), np.eye(1), 1.0, 1.0, 64).round(6)
     array([[2.618034]])
     """

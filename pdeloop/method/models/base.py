@@ -26,13 +26,7 @@ class FieldModel(Protocol):
     """A model z_{k+1} = step(z_k, a_k) of a plant, one sampling time a step.
 
     All results are those of one row after the other: they do not depend on how many rows there are.
-
-    Attributes
-    ----------
-    kind : str
-        How it was identified, e.g. ``"poly3"``; see `pdeloop.method.models.selection`.
-    n_z, n_a : int
-        Sizes of state and action.
+    kind: how it was identified, as "poly3" (`pdeloop.method.models.selection`).
     """
 
     @property
@@ -67,18 +61,10 @@ class FieldModel(Protocol):
 class Measured:
     """A measured rollout.
 
-    Attributes
-    ----------
-    states : (L + 1, n_z) or (L, n_z) array
-        z_0 .. z_{L-1}, and z_L if it is known.
-    actions : (L, n_a) array
-        a_k, held from z_k to z_{k+1}.
-    law : callable, optional
-        (k, states (M, n_z)) -> actions (M, n_a), that the rollout was under. A model is then judged by
-        the closed loop that it predicts; without a law, as for an exploration, by what it predicts
-        under the measured actions.
-    clean : array, optional
-        The denoised states; none: there is no noise.
+    states (L + 1, n_z) or (L, n_z): z_0 .. z_{L-1}, and z_L if it is known; actions (L, n_a): a_k,
+    held from z_k to z_{k+1}; clean: the denoised states, if there is noise. law: the one it was under.
+    A model is then judged by the closed loop that it predicts; without a law, as for an exploration,
+    by what it predicts under the measured actions.
     """
 
     states: Array
@@ -176,13 +162,8 @@ class Samples:
 class StoredModel:
     """What models made of arrays have in common.
 
-    Attributes
-    ----------
-    FORM : str
-        What its arrays are known by.
-    SHAPES : mapping of str to str
-        Axes of each array, a letter each, of which the same are equally long; before a colon the kind
-        of its numbers: c complex, i whole, inf real or infinite.
+    FORM: what its arrays are known by; SHAPES: axes of each array, a letter each, of which the same are
+    equally long, and before a colon the kind of its numbers: c complex, i whole, inf real or infinite.
     """
 
     FORM: ClassVar[str]
@@ -315,14 +296,11 @@ def errors(
     weights: Array | None = None,
     simulated: Sequence[Array] | None = None,
 ) -> Array:
-    """E = sum |W error|^2 / sum |W (z - z_r)|^2 of each rollout, at most `worst`.
+    """E = sum |W error|^2 / sum |W (z - z_r)|^2 of each rollout of two finite states, at most `worst`.
 
     weights: W, a matrix (n, n_z) or its diagonal (n_z,); None: the identity. simulated: what the model
-    predicts, if it is known.
-
-    Of a rollout that ends in values that are not finite, those before count; one without two finite
-    states is left out. The expected contribution of measurement noise is subtracted from both sums, as
-    the model is not to blame for it.
+    predicts, if it is known. The expected contribution of measurement noise is subtracted from both
+    sums, as the model is not to blame for it.
     """
     kept = usable(rollouts)
     simulated = predicted(model, kept) if simulated is None else simulated

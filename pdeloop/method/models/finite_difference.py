@@ -83,16 +83,9 @@ from pdeloop.method.models.settings import (
 
 
 class Feature(NamedTuple):
-    """A monomial and its derivative.
+    """A monomial, by the component of each factor, and the order of its derivative.
 
-    Attributes
-    ----------
-    factors : tuple of int
-        The component of each factor.
-    order : int
-        Of the derivative.
-    shifts : tuple of int
-        By how many points each factor is ahead; empty: by none.
+    shifts: by how many points each factor is ahead; empty: by none.
     """
 
     factors: tuple[int, ...]
@@ -128,23 +121,11 @@ Table = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class FiniteDifferenceModel(StoredModel):
-    """The equation above.
+    """The equation above, with C (F, components, n_x), B (n_z, n_a) and c (n_z,).
 
-    Attributes
-    ----------
-    kind : str
-    features : sequence of Feature
-        F of them; derivatives of one monomial stand together, beginning with that of order 0.
-    coefficients : (F, components, n_x) array
-        C.
-    B : (n_z, n_a) array
-    constant : (n_z,) array
-        c.
-    substeps : int
-        Runge-Kutta steps of a sampling time; 0: it is a map.
-    shape : tuple of int
-        Grid points of each axis, the last one fastest; of several axes their product is n_x. Empty:
-        there is one axis.
+    features: F of them; derivatives of one monomial stand together, beginning with that of order 0;
+    substeps: Runge-Kutta steps of a sampling time, 0: it is a map; shape: grid points of each axis, the
+    last one fastest, whose product is n_x; empty: there is one.
     """
 
     FORM = "finite-difference"
@@ -187,13 +168,9 @@ class FiniteDifferenceModel(StoredModel):
         return on_states, on_actions
 
     def means(self, states: Array, actions: Array, after: Array) -> tuple[Array, Array]:
-        """The features' means over a sampling time, and by how much the step misses `after`.
+        """The features' means over a sampling time (M, F, n_x), and how far the step misses `after`.
 
         They are those of the path bent linearly in time to end there.
-
-        Returns
-        -------
-        (M, F, n_x), (M, n_z)
         """
         z, a, end = read_only(states), read_only(actions), read_only(after)
         found = np.empty((len(z), len(self.features), self.coefficients.shape[2]))
@@ -323,14 +300,8 @@ def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
 class Columns:
     """The normal equations of each point, free of the inputs, in columns X with a sum of squares of 1.
 
-    Attributes
-    ----------
-    gram, moment : (n_x, F, F) and (n_x, F, components) arrays
-        X^T X and X^T y.
-    square : float
-        The sum of y^2 over all points.
-    scale : (F,) array
-        By which the columns were divided.
+    gram (n_x, F, F) and moment (n_x, F, components): X^T X and X^T y; square: the sum of y^2 over all
+    points; scale (F,): by which the columns were divided.
     """
 
     gram: Array
@@ -349,18 +320,10 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """What a pass regresses.
+    """What a pass regresses: y (n_x, N, components), the change, on the features' means X (n_x, N, F).
 
-    Attributes
-    ----------
-    X : (n_x, N, F) array
-        Means of the features, weighted.
-    y : (n_x, N, components) array
-        The change to be explained.
-    common : (N, n_a + 1) array
-        The inputs and 1.
-    miss : float
-        Root of the mean square of what the steps of the model missed.
+    common (N, n_a + 1): the inputs and 1; miss: root of the mean square of what the model's steps
+    missed.
     """
 
     X: Array

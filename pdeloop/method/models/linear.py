@@ -48,16 +48,7 @@ from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 @dataclass(frozen=True, eq=False)
 class LinearModel(StoredModel):
-    """z_{k+1} = A z_k + B a_k + c.
-
-    Attributes
-    ----------
-    kind : str
-    A : (n_z, n_z) array
-    B : (n_z, n_a) array
-    constant : (n_z,) array
-        c.
-    """
+    """z_{k+1} = A z_k + B a_k + c, with the constant c."""
 
     FORM = "linear"
     SHAPES: ClassVar = {"constant": "n", "A": "n n", "B": "n a"}
@@ -174,17 +165,7 @@ _INNER = "inner."
 
 @dataclass(frozen=True, eq=False)
 class ProjectedModel:
-    """The model above.
-
-    Attributes
-    ----------
-    inner : FieldModel
-        f.
-    restriction : (m, n_z) array
-        S.
-    prolongation : (n_z, m) array
-        P.
-    """
+    """The model above: the inner one f, the restriction S (m, n_z), the prolongation P (n_z, m)."""
 
     FORM = "projected"
     inner: FieldModel
@@ -270,10 +251,7 @@ def fit_coarse(
     shape: tuple[int, ...],
     ridge: float | None,
 ) -> ProjectedModel | FiniteDifferenceModel | None:
-    """The equation on as fine a grid as is affordable, or None where there is none.
-
-    shape: points of each axis; kind, ridge: as for `fit_finite_difference`.
-    """
+    """`fit_finite_difference` on as fine a grid as is affordable."""
     n_z = samples.before.shape[1]
     components = n_z // math.prod(shape)
     fit = partial(
@@ -326,15 +304,7 @@ FOREMOST = 60
 
 @dataclass(frozen=True, eq=False)
 class ReadingsModel(LinearModel):
-    """A model in innovation form, as a linear model of its state.
-
-    Attributes
-    ----------
-    C, G, U : arrays
-        As for `InnovationModel`.
-    innovations : (r, r) array
-        Covariance of e.
-    """
+    """A model in innovation form, as a linear model of its state; arrays as for `InnovationModel`."""
 
     FORM = "readings"
     SHAPES: ClassVar = LinearModel.SHAPES | {

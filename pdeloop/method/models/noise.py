@@ -138,11 +138,9 @@ def share_of_noise(
     target: Array,
     weights: Array | None = None,
 ) -> float:
-    """The part of sum |W (z - z_r)|^2 over measured states that noise of this size is.
+    """The part of sum |W (z - z_r)|^2 over measured states that noise is; weights: W, as for `errors`.
 
     Nothing predicts it, so that a model without noise that has a smaller E says that there is none.
-
-    weights: W, as for `errors`.
     """
     seen = weighing(weights)
     own = target.size if weights is None else float(np.sum(weights**2))
@@ -236,22 +234,12 @@ def is_white(residuals: Sequence[Array], level: float, tolerance: float = 0.0) -
 
 
 def denoised(states: Array, noise: float) -> Array:
-    """A trajectory with the singular values that it would have without noise, nearest in the mean.
+    """States (T, n_z) with the singular values that they would have without noise, nearest in the mean.
 
     Measurement noise is white in space and time, while the fields of a trajectory have much in common:
-    few singular values are above 1 + sqrt(beta), in units of noise sqrt(n), which are those of the
-    noise alone; those that are shrink to sqrt((y^2 - beta - 1)^2 - 4 beta) / y.
-
-    Parameters
-    ----------
-    states : (T, n_z) array
-        n is the larger of T and n_z, beta the smaller over it.
-    noise : float
-        Standard deviation of the noise on every number.
-
-    References
-    ----------
-    Gavish, Donoho, "Optimal shrinkage of singular values", IEEE Trans. Inf. Theory 63, 2017.
+    few singular values y, in units of noise sqrt(n), are above those of the noise alone, 1 +
+    sqrt(beta), and shrink to sqrt((y^2 - beta - 1)^2 - 4 beta) / y (Gavish, Donoho, IEEE Trans. Inf.
+    Theory 63, 2017). n is the larger of T and n_z, beta the smaller over it.
     """
     if not states.size:
         return states
@@ -264,18 +252,11 @@ def denoised(states: Array, noise: float) -> Array:
 
 
 def smoothed(fields: Array, noise: float) -> Array:
-    """Fields with the amplitude at each wavenumber that is nearest to that without noise in the mean.
+    """Fields (n, n_z) of one distribution without noise of this size, nearest in the mean.
 
     The Wiener filter (S - R)/S, with S the mean power of the fields at a wavenumber and R that of the
     noise. A single state among many of its trajectory, such as an initial field, says more by its
     spectrum than by singular values.
-
-    Parameters
-    ----------
-    fields : (n, n_z) array
-        Of one distribution.
-    noise : float
-        Standard deviation of the noise on every number.
     """
     spectra, n_z = np.fft.rfft(fields), fields.shape[1]
     signal, noise_power = signal_power(spectra, noise, n_z)
@@ -286,17 +267,7 @@ def smoothed(fields: Array, noise: float) -> Array:
 def cleaned_states(
     trajectories: Sequence[Array], noise: float, *, line: bool = True
 ) -> list[Array]:
-    """States of trajectories `denoised`, the initial ones `smoothed` together where they are on a line.
-
-    Parameters
-    ----------
-    trajectories : sequence of (T, n_z) arrays
-        None of them empty.
-    noise : float
-        As for `smoothed`.
-    line : bool
-        Whether the states are fields on one axis.
-    """
+    """States `denoised`, the initial ones `smoothed` together where they are on a line."""
     clean = [denoised(states, noise) for states in trajectories]
     if line and clean:
         first = smoothed(np.stack([states[0] for states in trajectories]), noise)

@@ -58,21 +58,11 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PolynomialModel(StoredModel):
-    """The model above.
+    """The model above, with the centres m (n_z,) and m_a (n_a,) and the action's scale s_a (n_a,).
 
-    Attributes
-    ----------
-    kind : str
-    V : (n_z, r) array
-        V^T diag(1/s): coordinates x = V^T (z - m).
-    centre : (n_z,) array
-        m.
-    action_centre, action_scale : (n_a,) arrays
-        m_a and s_a.
-    products : (p, 2) array of int
-        Pairs of numbers of [x; (a - m_a) / s_a] that are multiplied.
-    coefficients : (1 + r + n_a + p, n_z) array
-        Of [1; x; (a - m_a) / s_a; products], s included.
+    V (n_z, r): diag(1/s) V, coordinates x = V^T (z - m); products (p, 2): pairs of numbers of
+    [x; (a - m_a) / s_a] that are multiplied; coefficients (1 + r + n_a + p, n_z): of [1; x;
+    (a - m_a) / s_a; products], s included.
     """
 
     FORM = "polynomial"

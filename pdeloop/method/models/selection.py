@@ -131,20 +131,10 @@ Fit = Callable[[Sequence[Measured], float], FieldModel | None]
 class Kind:
     """A kind of model.
 
-    Attributes
-    ----------
-    name : str
-    fit : callable
-        The model of rollouts, whose states have noise of a standard deviation that is known or 0; or
-        None.
-    unknowns : (float, int)
-        Those of each point or wavenumber, by which kinds are compared first, and those that all share.
-    knows_noise : bool
-        Whether it is fitted to noisy states, not to denoised ones.
-    needed : float
-        It is tried only where the best E so far is larger.
-    enough : float
-        Share of `reproduced` at which it is selected before others are tried.
+    fit (rollouts, noise): their model, or None; unknowns: those of each point or wavenumber, by which
+    kinds are compared first, and those that all share; knows_noise: whether it is fitted to noisy
+    states, not to denoised ones; needed: it is tried only where the best E so far is larger; enough:
+    share of `reproduced` at which it is selected before others are tried.
     """
 
     name: str
@@ -263,10 +253,7 @@ FEWEST_SAMPLES = 4
 
 
 class Scale(NamedTuple):
-    """What errors are relative to: the variation about a state, with its numbers in units of their own.
-
-    reference, units: (n_z,) each.
-    """
+    """What errors are relative to: the variation about a state (n_z,), in units (n_z,)."""
 
     reference: Array
     units: Array
@@ -283,8 +270,8 @@ def scale_of(states: Sequence[Array]) -> Scale:
 class Accuracy(NamedTuple):
     """Errors on data that a model was not fitted to.
 
-    simulated: E from initial states, relative to sum |z - reference|^2; one_step: root of the sum of
-    squared errors of single steps, over that of squared changes.
+    simulated: E, relative to sum |z - reference|^2; one_step: root of the sum of squared errors of
+    single steps, over that of squared changes.
     """
 
     simulated: float
@@ -298,15 +285,8 @@ UNKNOWN = Accuracy(np.inf, np.inf)
 class FittedModel:
     """A model and why it is believed.
 
-    Attributes
-    ----------
-    model : FieldModel
-    error : float
-        E of its kind, the mean over rollouts that it was not fitted to.
-    candidates : list of (kind, E)
-        Those that were tried, in that order.
-    own : Accuracy
-        The same relative to what the data do, where a scale was given.
+    error: E of its kind, the mean over rollouts that it was not fitted to; candidates: kinds that were
+    tried, in that order, and their E; own: relative to what the data do, where a scale was given.
     """
 
     model: FieldModel
@@ -381,22 +361,11 @@ _GROWN = 10.0
 class Selected:
     """A model, and what it was selected by.
 
-    Attributes
-    ----------
-    fitted : FittedModel
-    rollouts : list of Measured
-        Whole ones, pieces or beginnings.
-    most : float
-        Largest error at which a model of these is accepted.
-    whole : bool
-        False: it predicts pieces of rollouts, of a chaotic plant.
-    near : float
-        Linear, of short pieces up to so many times the distance of initial states from the target;
-        infinite: it is not.
-    noise : float
-        Measurement noise that it was fitted for in place of the declared one; 0: there is none.
-    one_step : float
-        Error of single steps relative to the change in them; 0 where noise hides it.
+    rollouts: whole ones, pieces or beginnings; most: largest error at which a model of these is
+    accepted; whole: False of one that predicts pieces of rollouts, of a chaotic plant; near: of a
+    linear one, of short pieces, up to how many times the distance of initial states from the target,
+    else infinite; noise: that which it was fitted for in place of the declared one, or 0; one_step:
+    error of single steps relative to the change in them, 0 where noise hides it.
     """
 
     fitted: FittedModel
@@ -427,27 +396,14 @@ class Selected:
 class Selection:
     """How a model is selected.
 
-    Attributes
-    ----------
-    target : (n_z,) array
-        z_r; the error is measured by the distance to it.
-    accepted : float
-        Largest E of a model that is accepted without noise.
-    settings : FieldModelSettings
-        Constants of the fits.
-    noise : float
-        Standard deviation of the noise on every number of the states; 0 for none, or unknown. E is then
-        the error beyond what it explains, and kinds that know of noise are fitted as `fit_noisy` does.
-    action_set : ActionSet
-        Admissible actions, the nearest of which is applied.
-    line : bool
-        Whether the states are fields on one axis, or plain vectors.
-    shape : tuple of int
-        Points of each axis, where the states are fields on several; none: they are not.
-    weights : (n_z,) or (n, n_z) array, optional
-        W of E (`errors`), in which the numbers of a state count as in the cost.
-    undeclared : bool
-        Whether noise that was not declared is looked for.
+    target (n_z,): z_r, to which the distance is what E is relative to; accepted: largest E of a model
+    that is accepted without noise; action_set: admissible actions, the nearest of which is applied;
+    line: whether the states are fields on one axis, or plain vectors; shape: points of each axis,
+    where the states are fields on several; weights: W of E (`errors`), in which the numbers of a state
+    count as in the cost; undeclared: whether noise that was not declared is looked for.
+
+    noise: standard deviation of that on every number of the states, 0 for none, or unknown. E is then
+    the error beyond what it explains, and kinds that know of noise are fitted as `fit_noisy` does.
     """
 
     target: Array
@@ -477,18 +433,10 @@ class Selection:
     ) -> FittedModel | None:
         """The model that predicts these rollouts, or None where none can be fitted.
 
-        Parameters
-        ----------
-        rollouts : sequence of Measured
-            Whole or not; values that are not finite are left out.
-        scale : Scale, optional
-            Of the errors `own` of the result, always of rollouts or pieces that it was not fitted to.
-        first : str
-            Kind to be tried first, that of the last choice.
-        linear, knows_noise : bool
-            Try only linear models, or the kinds that are fitted for noise.
-        by_scale : bool
-            Whether E is relative to this scale instead of the distance to the target.
+        scale: of the errors `own` of the result, always of rollouts or pieces that it was not fitted
+        to, and with `by_scale` of E, in place of the distance to the target; first: kind to be tried
+        first, that of the last choice; linear, knows_noise: only linear models, or kinds that are
+        fitted for noise.
         """
         target, noise, settings = self.target, self.noise, self.settings
         rollouts = [limited(rollout, self.action_set) for rollout in rollouts]
@@ -548,9 +496,7 @@ class Selection:
         settings: FieldModelSettings,
         scale: Scale | None,
     ) -> tuple[float, Accuracy] | None:
-        """E of a kind, its mean over the rollouts, and its accuracy on a scale if there is one.
-
-        None where there is nothing to fit or to judge.
+        """E of a kind, its mean over the rollouts, and its accuracy on a scale, or None.
 
         least: that of the best kind so far. One that is far from it after the first turn gets no other.
         """
@@ -626,11 +572,8 @@ class Selection:
     ) -> tuple[FittedModel, float] | None:
         """An equation fitted for measurement noise, and the noise; None where there is no such noise.
 
-        Where some is declared another one is looked for only if it is `NOISE_MISJUDGED` times as large,
-        or as small.
-
-        rollouts: fields of one component on a periodic axis; better_than: E of the best model without
-        noise.
+        Another one than was declared must be `NOISE_MISJUDGED` times as large, or as small.
+        better_than: E of the best model without noise.
         """
         states = [np.asarray(rollout.states) for rollout in rollouts]
         noise, declared = noise_level(states), self.noise

@@ -147,15 +147,10 @@ def interpolated(readings: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Actuators:
-    """What is declared of the actuators.
+    """What is declared of the actuators: p_i and q_i (n_a,), as shares of the domain.
 
-    Attributes
-    ----------
-    centres : (n_a,) array
-        p_i, as shares of the domain.
-    widths : (n_a,) array
-        q_i, as shares of the domain; 0: not declared, and half of the domain divided among them.
-        Readings hardly tell it, as an actuator between two sensors looks weaker as well as narrower.
+    A width of 0 is not declared, and half of the domain divided among them. Readings hardly tell it, as
+    an actuator between two sensors looks weaker as well as narrower.
     """
 
     centres: Array
@@ -177,22 +172,11 @@ _FIELDS = [own.name for own in fields(SpectralModel)]
 
 @dataclass(frozen=True, eq=False)
 class SensedModel(SpectralModel):
-    """The equation on a grid of which every so many points are sensors.
+    """The equation on a grid of which every so many points are sensors, n_y in all.
 
-    Attributes
-    ----------
-    shared : (44 + n_a,) array
-        Its unknowns, in their units.
-    actuators : Actuators
-        What is declared of them.
-    sensors : int
-        n_y.
-    noise : float
-        Standard deviation of the unpredicted part of a reading, including noise.
-    spread : (33,) array
-        Standard deviations of the Fourier coefficients of an initial field: its mean, cosines, sines.
-    largest : float
-        Largest |z| that is simulated.
+    shared (44 + n_a,): its unknowns, in their units; noise: standard deviation of the unpredicted part
+    of a reading, including noise; spread (33,): those of the Fourier coefficients of an initial field,
+    its mean, cosines, sines; largest: largest |z| that is simulated.
     """
 
     FORM = "sensed"
@@ -441,20 +425,11 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SensedFilter:
-    """The filter of a model, for any number of environments at once.
+    """The filter of a model of f and H, for any number of environments at once.
 
-    Attributes
-    ----------
-    model : SensedModel
-        f and H.
-    mean : (33,) array
-        That of the Fourier coefficients of an initial field.
-    factor : (33, 33) array
-        The columns of a square root of their covariance, as rows.
-    noise : float
-        sigma: of the noise of a reading, and of what the model does not predict of it.
-    inflation : float
-        kappa.
+    mean (33,): that of the Fourier coefficients of an initial field; factor (33, 33): the columns of a
+    square root of their covariance, as rows; noise: sigma, with what the model does not predict of a
+    reading; inflation: kappa.
     """
 
     model: SensedModel

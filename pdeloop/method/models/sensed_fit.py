@@ -221,21 +221,11 @@ _WAVENUMBERS = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """An equation and the initial fields of rollouts.
+    """An equation with unknowns `shared` (44 + n_a,), the initial fields (rollouts, n), and S (33,).
 
-    Attributes
-    ----------
-    shared : (44 + n_a,) array
-        Its unknowns.
-    fields : (rollouts, n) array
-        Initial fields.
-    spread : (33,) array
-        S.
-    error : float
-        Squared error of the readings over their sum of squares, less what noise has in it; infinite
-        where nothing is finite.
-    noise : float
-        Standard deviation of what is not predicted of a reading, which is noise to a filter.
+    error: squared error of the readings over their sum of squares, less what noise has in it; infinite
+    where nothing is finite. noise: standard deviation of what is not predicted of a reading, which is
+    noise to a filter.
     """
 
     shared: Array
@@ -255,24 +245,12 @@ def fit_sensed(
     distances: Array | None = None,
     settings: FieldModelSettings = DEFAULTS,
 ) -> Fitted:
-    """Fit the equation and the initial fields of rollouts.
+    """Fit the equation and the initial fields of rollouts of one length.
 
-    Parameters
-    ----------
-    readings, actions : sequences of (T, n_y) and (T, n_a) arrays
-        Of rollouts of one length: y_k and a_k.
-    actuators : Actuators
-        What is declared of them.
-    noise : float
-        Standard deviation of the noise on every reading.
-    start : (44 + n_a,) and (33,) arrays, optional
-        The unknowns of an earlier equation and its S, to begin with in place of none.
-    target : (n_y,) array, optional
-        z_r at the sensors.
-    distances : (rollouts,) array, optional
-        d of each rollout; NaN where it is not known.
-    settings : FieldModelSettings
-        Of the simulations.
+    readings (T, n_y), actions (T, n_a): y_k and a_k of each; noise: standard deviation of that on
+    every reading; start: unknowns (44 + n_a,) of an earlier equation and its S (33,), to begin with in
+    place of none; target (n_y,): z_r at the sensors; distances (rollouts,): d of each, NaN where it is
+    not known.
     """
     data = _Data(
         np.stack(readings), np.stack(actions), actuators, noise, target, distances, settings

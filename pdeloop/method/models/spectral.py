@@ -64,28 +64,12 @@ Spectrum = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class SpectralModel(StoredModel):
-    """The equation above.
+    """The equation above: L (n_z // 2 + 1,), m_q (Q, n_z // 2 + 1) and C_qp (Q, P - 1), p = 2 .. P.
 
-    Attributes
-    ----------
-    kind : str
-    linear : (n_z // 2 + 1,) complex array
-        L.
-    multipliers : (Q, n_z // 2 + 1) complex array
-        m_q; none of a linear equation.
-    polynomials : (Q, P - 1) array
-        C_qp, p = 2 .. P.
-    B : (n_z, n_a) array
-    constant : (n_z,) array
-        c.
-    substeps : int
-        Internal steps of a sampling time.
-    clip : float
-        z is cut to +-clip in g_q and h_l; infinite: it is not.
-    fewer : (n, 2) array
-        Rows max |z|, steps, both ascending: as many are enough where the field begins no larger.
-    factors, coefficients : (N, n_z // 2 + 1) complex and (N, P, n_z) arrays, or None
-        n_l and c_lp; None: there are none.
+    B (n_z, n_a) and the constant c (n_z,); substeps: internal steps of a sampling time; clip: z is cut
+    to +-clip in g_q and h_l; fewer: rows max |z|, steps, both ascending: as many are enough where the
+    field begins no larger; factors (N, n_z // 2 + 1), coefficients (N, P, n_z): n_l and c_lp, if there
+    are any.
     """
 
     FORM = "spectral"
@@ -206,20 +190,9 @@ Symbols = tuple[Spectrum, Spectrum, Array]
 class Form:
     """The choice of an equation's symbols.
 
-    Attributes
-    ----------
-    name : str
-    degree : int
-        P.
-    linear_order : int
-        Highest power of ik in L.
-    shares : sequence of int
-        For each pass, n: the lowest 1/n of the wavenumbers is compared. The last entry also holds
-        for all further passes.
-    hilbert : bool
-        Whether L also has the Hilbert transforms of its derivatives.
-    free : bool
-        Whether all symbols are free at every wavenumber.
+    degree: P; linear_order: highest power of ik in L; shares: n of each pass, the last one of all
+    further ones, too: the lowest 1/n of the wavenumbers is compared; hilbert: whether L also has the
+    Hilbert transforms of its derivatives; free: whether all symbols are free at every wavenumber.
     """
 
     name: str

@@ -135,10 +135,7 @@ def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
 
 
 def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
-    """Numbers of the state that never moved, are multiples of others, or are lost in their rounding.
-
-    states : (N, n_z) array
-    """
+    """Numbers of states (N, n_z) that never moved, are multiples of others, or are lost in rounding."""
     found = []
     still = constant(states)
     if still.size:

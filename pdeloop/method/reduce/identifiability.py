@@ -81,20 +81,10 @@ class IdentifiabilityWarning(UserWarning):
 class Identifiability:
     """How well data determine the model to be identified from them.
 
-    Attributes
-    ----------
-    unknowns : int
-        In a row of [A B], n_s + n_a.
-    rank : int
-        Of the scaled regressors.
-    smallest_singular_value : float
-        Of the scaled regressors, relative to the largest; 0 if there are fewer steps than unknowns.
-    independence : (n_a,) array
-        Of every input, from 0 to about 1.
-    faults : tuple of str
-        Why the data do not determine the model; empty if they do.
-    remarks : tuple of str
-        What comes close to that, or is suspicious.
+    unknowns: in a row of [A B], n_s + n_a; rank, smallest_singular_value: of the scaled regressors, the
+    latter relative to the largest, 0 if there are fewer steps than unknowns; independence (n_a,): of
+    every input, from 0 to about 1; faults: why the data do not determine the model; remarks: what comes
+    close to that, or is suspicious.
     """
 
     unknowns: int
@@ -113,16 +103,9 @@ class Identifiability:
 def examine(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], U: Array, channels: Channels = NUMBERED
 ) -> Identifiability:
-    """Examine whether trajectories determine a model on given modes, copies and states included.
+    """Examine whether trajectories determine a model on modes U (n_z, n_s), copies and states included.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        a_k is held from z_k to z_{k+1}.
-    U : (n_z, n_s) array
-        Modes of the reduced state.
-    channels : Channels
-        What the sentences call states and inputs.
+    channels: what the sentences call states and inputs.
     """
     data = steps_of(trajectories)
     with one_thread():  # as in the identification itself
@@ -137,10 +120,7 @@ def examine(
 
 
 def examine_excitation(trajectory: Trajectory) -> Identifiability:
-    """Examine whether an exploration separates the effects of its inputs, for a model of any order.
-
-    trajectory : (states (N + 1, n_z), actions (N, n_a))
-    """
+    """Examine whether an exploration separates the effects of its inputs, for a model of any order."""
     data = steps_of([trajectory])
     with one_thread():
         U = linalg.svd(data.after, full_matrices=False)[2][:1].T
@@ -303,9 +283,7 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
         return independence, faults
     basis = _state_basis(data.before, s, drift, len(own))
     left = unit[:, own] - basis @ (basis.T @ unit[:, own])
-    left -= basis @ (
-        basis.T @ left
-    )  # again, as the first time leaves rounding errors of the large part
+    left -= basis @ (basis.T @ left)  # again, as the first time leaves rounding errors
     left *= np.sqrt((steps - drift) / max(steps - drift - basis.shape[1], 1))
     fed: dict[int, None] = {}
     for place, j in enumerate(own):

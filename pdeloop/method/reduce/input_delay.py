@@ -151,14 +151,9 @@ def shifted(trajectories: Sequence[Trajectory], delays: Delays) -> list[Trajecto
 def study_delays(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], used: Delays = ()
 ) -> DelayStudy:
-    """The delays of the inputs that predict held-out steps best.
+    """The delays of the inputs that predict held-out steps of trajectories, as logged, best.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        As they were logged.
-    used : tuple of int
-        The delay of each input that others are compared with; 0 by default.
+    used: the delay of each input that others are compared with; 0 by default.
     """
     known = distinct(trajectories)
     n_a = known[0][1].shape[1]

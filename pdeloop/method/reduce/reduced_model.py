@@ -357,11 +357,7 @@ def _independent(columns: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of one or more trajectories, a row each.
-
-    before, after (N, n_z): z_k and z_{k+1}, the transposes of Z and Z'; inputs (N, n_a): a_k, that
-    of Y.
-    """
+    """Steps of trajectories, a row each: z_k and z_{k+1} (N, n_z), and the inputs a_k (N, n_a)."""
 
     before: Array
     after: Array
@@ -369,10 +365,9 @@ class Steps:
 
 
 def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
-    """The steps of trajectories (states (N + 1, n_z), actions (N, n_a)) of one plant, pooled.
+    """The steps of trajectories of one plant; a duplicated one counts once.
 
-    A duplicated trajectory counts once. ValueError for shapes that do not fit, NaN and
-    infinity.
+    ValueError for shapes that do not fit, NaN and infinity.
     """
     befores, afters, inputs = [], [], []
     if (
@@ -442,13 +437,10 @@ def turns(parts: Sequence[T], folds: int) -> Iterator[tuple[list[T], list[T]]]:
 
 
 def leading_modes(after: Array, n_s: int, channels: Channels = NUMBERED) -> tuple[Array, Array]:
-    """The first n_s left singular vectors of Z', (n_z, n_s), and all its singular values.
+    """The first n_s left singular vectors of Z', that is of after^T (n_z, N), and all singular values.
 
-    after : (N, n_z) array
-        The transpose of Z'.
-
-    ValueError if the states have fewer modes than that; it names the channels that are the reason.
-    Call it with one LAPACK thread.
+    ValueError if the states have fewer modes; it names the channels that are the reason. Call it with
+    one LAPACK thread.
     """
     left, values, _ = linalg.svd(after.T, full_matrices=False)
     rank = numerical_rank(values, *after.shape)

@@ -91,31 +91,12 @@ def exact_regression(
 ) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
-    n_s : int
-        Modes of the reduced state. All steps together must be at least n_s + n_a, as many as there are
-        unknowns in a row of [A B].
-    channels : Channels
-        Names of states and inputs in error messages.
-    constant : bool, optional
-        Whether the model has a constant term; None: as `needs_constant` says.
+    trajectories: (states (N + 1, n_z), actions (N, n_a)) each, a_k held from z_k to z_{k+1}; n_s:
+    modes; channels: names in error messages; constant: whether there is a constant term, None: as
+    `needs_constant` says. ValueError for shapes that do not fit, NaN or infinity, fewer steps than the
+    n_s + n_a unknowns in a row of [A B], more modes than the states have, or inputs whose effects
+    cannot be told apart.
 
-    Returns
-    -------
-    ReducedModel
-        With U from all z_1 .. z_N.
-
-    Raises
-    ------
-    ValueError
-        Shapes that do not fit, NaN or infinity, fewer steps than unknowns, more modes than the
-        states have, or inputs whose effects cannot be told apart.
-
-    Examples
-    --------
     A plant z_{k+1} = 0.9 z_k + 2 a_k is found again:
 
     >>> a = np.array([[1.0], [-1.0], [0.5], [2.0]])

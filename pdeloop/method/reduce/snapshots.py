@@ -33,8 +33,6 @@ and one outside of the basis is left out."""
 def factored(states: Array) -> tuple[Array, Array]:
     """C (N, r) and orthonormal rows V (r, n_z) with states (N, n_z) = C V, strongest direction first.
 
-    Examples
-    --------
     >>> C, V = factored(np.outer([1.0, 2.0, 3.0], [0.6, 0.8, 0.0]))
     >>> C.shape, bool(np.allclose(C @ V, np.outer([1.0, 2.0, 3.0], [0.6, 0.8, 0.0])))
     ((3, 1), True)
@@ -46,15 +44,8 @@ def factored(states: Array) -> tuple[Array, Array]:
 
 
 class SnapshotBasis:
-    """Orthonormal rows, extended by the components of new states outside their span.
+    """Orthonormal rows (r, n_z), extended by the components of new states outside their span.
 
-    Parameters
-    ----------
-    rows : (r, n_z) array
-        Those to begin with.
-
-    Examples
-    --------
     >>> basis = SnapshotBasis(np.eye(1, 5))
     >>> basis.extend(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]]))
     >>> np.abs(basis.coordinates(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]])))[0, :3]

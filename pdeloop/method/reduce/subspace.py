@@ -84,24 +84,12 @@ LEAST = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class InnovationModel:
-    """A model in innovation form.
+    """A (n, n), B (n, n_a), C (r, n), G (n, r) and U (n_z, r), whose columns are orthonormal.
 
-    Attributes
-    ----------
-    A, B, C, G : (n, n), (n, n_a), (r, n) and (n, r) arrays
-    U : (n_z, r) array
-        Orthonormal columns; U^T z is predicted by C x.
-    innovations : (r, r) array
-        Covariance of e.
-    past : int
-        p.
-    error : float
-        Of predicting held-out measurements one step ahead, relative to their changes in a step; NaN
-        where past and order were given.
-    d : (n,) array or None
-        The constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data.
-    tried : tuple of (p, n, error) or (p, n, error, error of simulations)
-        Those among which it was chosen.
+    innovations (r, r): covariance of e; past: p; error: of predicting held-out measurements one step
+    ahead, relative to their changes in a step, NaN where past and order were given; d (n,), or None:
+    the constant term, x_{k+1} = A x_k + B a_k + d + G e_k, of a model about the means of the data;
+    tried: p, n, error and, with simulations, that of simulations, of those among which it was chosen.
     """
 
     A: Array
@@ -151,26 +139,12 @@ def subspace_model(
 ) -> InnovationModel:
     """Identify a model in innovation form.
 
-    Parameters
-    ----------
-    trajectories : sequence of (measurements (N + 1, n_z), actions (N, n_a))
-        a_k is held from z_k to z_{k+1}. All numbers of z may be of a few points only.
-    order : int
-        n, or less where the data do not determine as many; 0: that of the least error on held-out data.
-    past : int
-        p; 0: that of the least error.
-    channels : Channels
-        Names of states and inputs in error messages.
-    constant : bool
-        Identify the model about the means of measurements and inputs, from which its constant term
-        follows: degrees and per cent of a machine at rest are then no mode that never decays.
-    simulations : bool
-        p and n have the least geometric mean of the errors of single steps and of simulations.
-
-    Raises
-    ------
-    ValueError
-        Shapes that do not fit, NaN or infinity, or data that do not determine a model.
+    trajectories: (measurements (N + 1, n_z), actions (N, n_a)) each, a_k held from z_k to z_{k+1};
+    order: n, or less where the data do not determine as many; past: p; 0: those of the least error on
+    held-out data, or, with `simulations`, of the least geometric mean with that of simulations;
+    channels: names in error messages; constant: identify it about the means, from which its constant
+    term follows: degrees and per cent of a machine at rest are then no mode that never decays.
+    ValueError for shapes that do not fit, NaN or infinity, or data that do not determine a model.
     """
     data = steps_of(trajectories)
     known = distinct(trajectories)
@@ -416,10 +390,9 @@ def _triangle(X: Array) -> Array:
 class _Predictor:
     """The vector ARX of p steps of trajectories, and the states that its past gives.
 
-    p; U (n_z, r); y (N, r), what is predicted; inputs (N, n_a) with the last of each trajectory; last
-    (N,), which are the last of a trajectory; past (N, d), p steps before each; rows (p r, d), which
-    predict the next p measurements; their directions over the data with their singular values; most:
-    states that are asked for, at most.
+    y (N, r): what is predicted; inputs (N, n_a); last (N,): which are the last of a trajectory; past
+    (N, d): p steps before each; rows (p r, d) predict the next p measurements, with the directions and
+    singular values over the data; most: states that are asked for, at most.
     """
 
     p: int
