@@ -39,13 +39,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqt import finite_horizon, finite_horizon_of, target_gain
-from pdeloop.method.models import (
-    FieldModel,
-    FieldModelSettings,
-    FittedModel,
-    Measured,
-    affine_law,
-)
+from pdeloop.method.models import FieldModel, FieldModelSettings, FittedModel, Measured, affine_law
 from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
@@ -355,10 +349,7 @@ def aim_of(mean: Array, target: Array, weights: Array) -> Array:
 
 
 def linearisation_point(
-    trajectories: Sequence[Trajectory],
-    target: Array,
-    fitted: FittedModel,
-    exact: float,
+    trajectories: Sequence[Trajectory], target: Array, fitted: FittedModel, exact: float
 ) -> tuple[Array, str]:
     """Where a model is linearised, and what to say of a target that is far outside of the data.
 

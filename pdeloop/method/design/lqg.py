@@ -44,12 +44,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqt import DesignError, output_law, target_gain, unreached
 from pdeloop.method.reduce.input_delay import Delays
-from pdeloop.method.reduce.reduced_model import (
-    DEFAULTS,
-    IdentificationSettings,
-    distinct,
-    steps_of,
-)
+from pdeloop.method.reduce.reduced_model import DEFAULTS, IdentificationSettings, distinct, steps_of
 from pdeloop.method.reduce.regression import residuals
 from pdeloop.method.reduce.subspace import InnovationModel
 from pdeloop.process.one_thread import one_thread

@@ -132,11 +132,7 @@ class Gains(NamedTuple):
 
 
 def track(
-    model: ReducedModel,
-    *,
-    state_weight: float,
-    action_weight: float,
-    cost: Cost | None = None,
+    model: ReducedModel, *, state_weight: float, action_weight: float, cost: Cost | None = None
 ) -> Gains:
     """Design the tracking gains of a reduced model.
 
@@ -229,13 +225,7 @@ def target_gain(b: Array, s_r: Array) -> tuple[Array, Array | None]:
 
 
 def output_law(
-    A: Array,
-    B: Array,
-    U: Array,
-    cost: Cost,
-    d: Array | None = None,
-    *,
-    or_no_control: bool = False,
+    A: Array, B: Array, U: Array, cost: Cost, d: Array | None = None, *, or_no_control: bool = False
 ) -> tuple[Array, Array]:
     """K_a and b of a = K_a s + b for the cost of z = U s; or_no_control: 0 where none stabilises."""
     try:

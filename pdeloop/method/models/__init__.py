@@ -5,11 +5,4 @@ from pdeloop.method.models.base import FieldModel, Measured, affine_law
 from pdeloop.method.models.selection import FittedModel, Selection
 from pdeloop.method.models.settings import FieldModelSettings
 
-__all__ = [
-    "FieldModel",
-    "FieldModelSettings",
-    "FittedModel",
-    "Measured",
-    "Selection",
-    "affine_law",
-]
+__all__ = ["FieldModel", "FieldModelSettings", "FittedModel", "Measured", "Selection", "affine_law"]

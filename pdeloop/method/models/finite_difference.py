@@ -75,11 +75,7 @@ from pdeloop.method.models.finite_difference_kernels import (
     mean_features,
     pull_back,
 )
-from pdeloop.method.models.settings import (
-    COEFFICIENT_RIDGE,
-    POINT_SAMPLES,
-    SPARSE_TERMS,
-)
+from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES, SPARSE_TERMS
 
 
 class Feature(NamedTuple):
@@ -419,11 +415,7 @@ _NEAR_NEGLIGIBLE = 1e-12
 
 
 def fit_neighbours(
-    samples: Samples,
-    *,
-    kind: str,
-    components: int = 1,
-    ridge: float | None = None,
+    samples: Samples, *, kind: str, components: int = 1, ridge: float | None = None
 ) -> FiniteDifferenceModel | None:
     """The equation, or None where the plant is of another kind.
 
@@ -443,9 +435,7 @@ def fit_neighbours(
 
 
 def fitted(
-    model: FiniteDifferenceModel,
-    samples: Samples,
-    ridge: float | None,
+    model: FiniteDifferenceModel, samples: Samples, ridge: float | None
 ) -> FiniteDifferenceModel | None:
     """The equation of the terms of an empty one, which has substeps of its own then, or None."""
     size = largest_of(samples)
@@ -477,9 +467,7 @@ def fitted(
 
 
 def _passes(
-    model: FiniteDifferenceModel,
-    samples: Samples,
-    ridge: float | None,
+    model: FiniteDifferenceModel, samples: Samples, ridge: float | None
 ) -> FiniteDifferenceModel | None:
     """The best equation of passes that regress what steps miss."""
     size = largest_of(samples)

@@ -245,21 +245,12 @@ def fit_low_rank(samples: Samples, *, kind: str, most: int) -> ProjectedModel | 
 
 
 def fit_coarse(
-    samples: Samples,
-    *,
-    kind: str,
-    shape: tuple[int, ...],
-    ridge: float | None,
+    samples: Samples, *, kind: str, shape: tuple[int, ...], ridge: float | None
 ) -> ProjectedModel | FiniteDifferenceModel | None:
     """`fit_finite_difference` on as fine a grid as is affordable."""
     n_z = samples.before.shape[1]
     components = n_z // math.prod(shape)
-    fit = partial(
-        fit_finite_difference,
-        kind=kind,
-        components=components,
-        ridge=ridge,
-    )
+    fit = partial(fit_finite_difference, kind=kind, components=components, ridge=ridge)
     points, few = coarse_points(shape, _COARSE_POINTS)
     if few == shape:
         return fit(samples, shape=shape)

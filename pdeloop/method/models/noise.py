@@ -133,10 +133,7 @@ def contradicting_noise(trajectories: Sequence[Array], declared: float) -> float
 
 
 def share_of_noise(
-    noise: float,
-    trajectories: Sequence[Array],
-    target: Array,
-    weights: Array | None = None,
+    noise: float, trajectories: Sequence[Array], target: Array, weights: Array | None = None
 ) -> float:
     """The part of sum |W (z - z_r)|^2 over measured states that noise is; weights: W, as for `errors`.
 
@@ -404,12 +401,7 @@ class WindowRegression(Regression):
         return found
 
 
-def significant(
-    columns: Spectrum,
-    values: Spectrum,
-    free: float,
-    strictness: float = 1.0,
-) -> Array:
+def significant(columns: Spectrum, values: Spectrum, free: float, strictness: float = 1.0) -> Array:
     """Real coefficients of complex columns, 0 where they are within a few standard errors of it.
 
     free: share of the values that nothing else was fitted to; strictness: multiple of the significance.

@@ -266,11 +266,7 @@ class SensedEquation:
     """The equation in Fourier space, for unknowns (44 + n_a,)."""
 
     def __init__(
-        self,
-        shared: Array,
-        n: int,
-        actuators: Actuators,
-        settings: FieldModelSettings = DEFAULTS,
+        self, shared: Array, n: int, actuators: Actuators, settings: FieldModelSettings = DEFAULTS
     ) -> None:
         derivatives, self._settings = _derivatives(n), settings
         used = [i for i in range(len(TERMS)) if shared[i]]

@@ -57,11 +57,7 @@ from pdeloop.method.models.sensed import (
     unknowns,
     well_posed,
 )
-from pdeloop.method.models.settings import (
-    DEFAULTS,
-    SENSED_REPRODUCED,
-    FieldModelSettings,
-)
+from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED, FieldModelSettings
 from pdeloop.solver.polynomial_step import PolynomialStep, PolynomialSteps
 
 # A rate per sampling time beyond which no coefficient of a step can be computed.

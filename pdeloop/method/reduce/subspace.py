@@ -211,10 +211,7 @@ def _narrow(p: int, n: int, known: Sequence[Trajectory]) -> bool:
 
 
 def _choose(
-    tried: Sequence[tuple[int, int]],
-    known: Sequence[Trajectory],
-    simulations: bool,
-    affine: bool,
+    tried: Sequence[tuple[int, int]], known: Sequence[Trajectory], simulations: bool, affine: bool
 ) -> tuple[int, int, Array]:
     """p and n with the least error on parts that were held out, and the errors of all, (K, 1 or 2)."""
     parts, units = _parts(known), units_of(known)
