@@ -2,10 +2,9 @@
 """A first law from a model of the whole field, linearised at the target.
 
 POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
-the directions that it senses, also for other fields: a plant that is unstable at its target is
-saturated by the end of the episode, and an episode has only one initial field. A model of the whole
-field (`pdeloop.method.models`) that predicts the episodes is linearised at the target, with e = z - z_r
-(if that is far outside of the data and the model not exact, at the measured state nearest to it),
+those that it senses, also for other fields. A model of the whole field (`pdeloop.method.models`) that
+predicts the episodes is linearised at the target, with e = z - z_r (if that is far outside of the data
+and the model not exact, at the measured state nearest to it),
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
 

@@ -8,9 +8,8 @@ With P the stabilising solution of the filter's Riccati equation
     P = W + A P A^T - A P C^T (C P C^T + V)^{-1} C P A^T,
 
 the estimate x_k = p_k + M (y_k - C p_k), M = P C^T (C P C^T + V)^{-1}, of the prediction p_{k+1} =
-A x_k + B a_k has the least covariance. With the tracking gains of `pdeloop.method.design.lqt`, which
-are designed as if the state were known, it is the optimal law: LQG, by the separation of estimation and
-control.
+A x_k + B a_k has the least covariance. With the tracking gains of `pdeloop.method.design.lqt` it is the
+optimal law, LQG, by the separation of estimation and control.
 
 Where inputs act late, with delays n_j, s_{k+1} = A s_k + sum_j B_j a_{j,k-n_j} + d is a model without
 delays of the state with all inputs that have not acted yet,

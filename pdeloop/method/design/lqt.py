@@ -11,9 +11,8 @@ The law a = K_a s + K_b s_r + b with
     K_a = -S^{-1} B^T P A,        K_b = S^{-1} B^T (I - (A + B K_a)^T)^{-1} Q,
     b = -S^{-1} B^T (I - (A + B K_a)^T)^{-1} P d
 
-is optimal over an infinite horizon. The weights are multiples of the identity on the full state and
-the actions, so Q = U^T (state_weight I) U = state_weight I, as U has orthonormal columns, and R =
-action_weight I.
+is optimal over an infinite horizon. Of the full state and the actions Q = U^T (state_weight I) U =
+state_weight I, as U has orthonormal columns, and R = action_weight I.
 
 Over a finite horizon, for any quadratic cost
 
@@ -26,13 +25,11 @@ const,
     P  <- E'E + A'P (A + B K_k),
     p  <- E'w_k + (A + B K_k)'(p - P (d + B a_r)),
 
-backwards from P = E_T'E_T and p = E_T'w_T. b_k looks ahead: it knows the targets that are still to
-come.
+backwards from P = E_T'E_T and p = E_T'w_T. b_k knows the targets that are still to come.
 
 `finite_horizon`, about a point that need not be an equilibrium, and with one target: the first step's
 law a = K e + b of the deviation e. The Riccati recursion of [e; 1] is doubled until it covers the
-horizon, which is rounded up to a power of two. Unlike the algebraic equation it needs no stabilisable
-model.
+horizon, rounded up to a power of two; it needs no stabilisable model.
 
 References
 ----------

@@ -3,14 +3,11 @@
 
     dz_c/dt (x) = sum_f C_fc(x) D^{j_f} M_f(z)(x) + (B a + c)(x),
 
-for every component c of the field; M_f is a monomial of the components, and D^j a central
-difference on a ring of grid points of distance 1: none for j = 0, the first and second one along
-the last axis for j = 1, 2, along the axis before for j = 3, 4, and so on. Anything else (walls) has
-coefficients of its own where that shows. Time is in sampling times, each of equal Runge-Kutta steps
-of order 4.
-
-On one axis the factors of M_f may be of neighbours, each at a distance of its own from x: products
-that are no difference of any monomial, such as those of chains and rings of oscillators or species.
+for every component c of the field; M_f is a monomial of the components, and D^j a central difference
+on a ring of grid points of distance 1: none for j = 0, the first and second one along the last axis
+for j = 1, 2, along the axis before for j = 3, 4, and so on. Walls have coefficients of their own. Time
+is in sampling times, each of equal Runge-Kutta steps of order 4. On one axis the factors of M_f may be
+of neighbours, each at a distance of its own from x, as of chains of oscillators or species.
 
 Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
 its numbers, has products of any of them.
@@ -32,10 +29,9 @@ are often chaotic, so that a small error of a step is a large one of a rollout:
 - After two passes, others regress what the model's own steps miss. The error of the means along its
   paths has no effect on where they end: of a plant without noise the coefficients are exact.
 - Monomials that explain nothing are then left out, one by one, as long as the residual stays what it
-  is. A simulation takes as long as there are monomials, and what is left out cannot mislead a law that
-  goes beyond the data.
-- Plants of other kinds, of which these products do not explain nearly all of a step, end the fit after
-  the first passes, which take a hundredth of the work.
+  is: they take time, and may mislead a law that goes beyond the data.
+- The fit ends after the first passes, which take a hundredth of the work, where these products do not
+  explain nearly all of a step.
 
 References
 ----------

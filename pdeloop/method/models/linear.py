@@ -7,18 +7,15 @@ A model of some directions or points of a state is one of the whole state,
 
 Of a large state S and P are POD modes, and f is linear. Fields on several axes may be modelled on a
 coarser grid: S takes the values at some of the grid points, and P, the least-squares interpolation of
-measured states, gives the whole field. Fields that a law can influence are smooth, whereas the work of
-a step of f grows with the number of points, times that of the internal steps, which on half the spacing
-is four times as large.
+measured states, gives the whole field. Fields that a law can influence are smooth.
 
 Of few sensors' readings y it is, with innovations e_k,
 
     x_{k+1} = A x_k + B a_k + G e_k,        U^T y_k = C x_k + e_k
 
-(`pdeloop.method.reduce.subspace`). The unknown initial state x_0 of a measured rollout is its most
-likely value. It gives the innovations e_k, with which the model reproduces the readings. Under another
-law the model uses the same innovations: the noise, the dynamics beyond the order and, as an
-approximation, the nonlinearity.
+(`pdeloop.method.reduce.subspace`). The likeliest x_0 of a measured rollout gives the e_k with which the
+model reproduces the readings. Under another law it uses the same ones: the noise, the dynamics beyond
+the order and, as an approximation, the nonlinearity.
 
 References
 ----------

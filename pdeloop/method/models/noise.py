@@ -6,29 +6,24 @@ Of the coefficients X_k of any orthonormal wave at step k,
     P_d = mean |D^d X_k|^2 / binom(2 d, d),        D: difference of successive states,
 
 is sigma^2 for white noise, whatever the order d, and what the field adds to it is never negative. So
-the least P_d over bands of short waves and orders is the largest sigma^2 that the states allow, and
-sigma^2 itself where a band has no waves of the field.
+the least P_d over bands of short waves and orders is the largest sigma^2 that the states allow. The
+short waves of a front that moves over several points between two states are white in time as well, but
+not in space, as they gather around it. A model decides then whether there is noise (`selection`).
 
-That alone is no evidence of noise: the short waves of a front that moves over several points between
-two states are white in time as well. But they are not white in space, as they gather around the front.
-Whether there is noise is then decided by a model (`selection`).
+Whether residuals are white in time and space is a portmanteau test (`is_white`). Those of a wrong model
+are smooth, or gather where the field is steep, so that they or their squares are correlated with their
+neighbours, whereas of independent noise each of m sample correlations rho of N numbers is N(0, 1/N),
+and Q = N sum rho^2 chi-square (Box and Pierce; McLeod and Li for the squares). As even the best model
+errs by a small part of the noise, correlations of up to a tolerance tau are accepted, too,
 
-Whether residuals are white in time and space, as noise is, is a portmanteau test (`is_white`). The
-residuals of a wrong model are smooth, or gather where the field is steep, so that they or their
-squares are correlated with their neighbours, whereas of independent noise each of m sample
-correlations rho of N numbers is N(0, 1/N), and Q = N sum rho^2 chi-square with m degrees of freedom
-(Box and Pierce; McLeod and Li for the squares). As even the best model errs by a small part of the
-noise, correlations with a root sum of squares of up to a tolerance tau are accepted, too:
+    sqrt(Q) <= tau sqrt(N) + sqrt(chi-square quantile of m at 1 - level),
 
-    sqrt(Q) <= tau sqrt(N) + sqrt(chi-square quantile of m at 1 - level).
-
-With tau = 0 independent noise is rejected at the rate `level`, and with tau > 0 at most at that
-rate by the triangle inequality.
+which rejects independent noise at most at the rate `level`, by the triangle inequality.
 
 In the fit of an equation with constant coefficients to noisy rollouts (`fit_noisy`) the regression of
-`fit_spectral` fails for two reasons: within one sampling time the plant changes the field hardly more
-than the noise does, and at wavenumbers without signal the noise of a state, which is absent from the
-next one, looks like fast decay. Therefore
+`fit_spectral` fails: within one sampling time the plant changes the field hardly more than the noise
+does, and at wavenumbers without signal the noise of a state, absent from the next one, looks like fast
+decay. Therefore
 
 1. the terms of the equation are integrated along filtered states: at every wavenumber k a share g of
    the innovation, measured minus predicted, corrects the prediction,
@@ -37,8 +32,7 @@ next one, looks like fast decay. Therefore
 
    With white noise of the power R the innovations have the power P + R, P being that of the error of
    the prediction, and g = P/(P + R) minimises the error (the steady-state Kalman filter of independent
-   wavenumbers). So g is 1 while the model is poor and falls as it improves. Once the equation is nearly
-   right the error of the states is a small part of the noise, and hardly biases the coefficients;
+   wavenumbers). So g is 1 while the model is poor and falls as it improves;
 2. the equation is compared with the measured states over windows of m sampling times with unknown
    initial state x,
 

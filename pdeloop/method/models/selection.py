@@ -13,15 +13,13 @@ The model is that which predicts whole rollouts, where one is accepted, or else
 
 - one fitted for measurement noise that nobody declared (`Selection.undeclared_noise`), which is looked
   for first, as any model that takes noise for the state seems to predict pieces;
-- of a chaotic plant, one that predicts pieces of rollouts, where small errors have not grown yet. They
-  are then far smaller than those of whole rollouts; those of a plant that is described badly add up;
-- of an unstable plant, one that predicts the beginnings of rollouts, near to the target. Explorations,
-  and a wrong law, lead to where no model follows, and no good law leads;
+- of a chaotic plant, one that predicts pieces of rollouts, where small errors have not grown yet;
+- of an unstable plant, one that predicts the beginnings of rollouts, near to the target;
 - where the plant leaves the target at once, a linear model of short pieces near to it: the beginning
   of a law that keeps it there, of which more is measured.
 
-Any model predicts what rests, as at a stop, and it costs much: a model that does not predict the change
-within single steps is not accepted either.
+A model that does not predict the change within single steps is not accepted either: any predicts what
+rests, as at a stop.
 
 Noise that nobody declared is accepted only where a model says so. It cannot be predicted: unless a
 model without noise predicts the rollouts better than noise of the level that their differences allow

@@ -8,11 +8,8 @@
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i and widths
 q_i of the actuators. r_p, w and D are sums of the first two cosines and sines, and zero where constant
-coefficients reproduce the readings. There are a few dozen unknowns and one for each actuator, however
-fine the grid. `pdeloop.method.models.sensed_fit` finds them.
-
-A sampling time has internal steps, the more the larger the field: a front moves through several grid
-points in it. Below the grid the second derivative does what a finer one would: it is fitted as well.
+coefficients reproduce the readings. `pdeloop.method.models.sensed_fit` finds the unknowns. A sampling
+time has internal steps, the more the larger the field: a front moves through several grid points in it.
 
 In the extended Kalman filter of the field, of an equation z_{k+1} = f(z_k, a_k) and readings y_k = H
 z_k + v_k, v_k ~ N(0, sigma^2 I), the estimate is z_k ~ N(x_k, S_k S_k^T). Plants without process noise

@@ -11,8 +11,8 @@ over the first m steps of the rollouts r, and for whole rollouts also the error 
 coefficients with the standard deviations S.
 
 m grows from a twentieth of the rollouts to all of their steps: over a whole rollout at once, a front
-makes J flat in most unknowns, and the field between the sensors is observed later, when it passes one.
-Each is the method of Levenberg and Marquardt. As z_0 moves its own rollout alone, it is eliminated,
+makes J flat in most unknowns. Each is the method of Levenberg and Marquardt. As z_0 moves its own
+rollout alone, it is eliminated,
 
     A_r = J_z^T J_z + S^-2,  B_r = J_z^T J_phi,
     (sum_r J_phi^T J_phi + s^-2 - sum_r B_r^T A_r^-1 B_r) dphi = g_phi - sum_r B_r^T A_r^-1 g_z.

@@ -18,13 +18,11 @@ time, the unit of time,
 is linear in the symbols sigma_p and, through sigma_1 W_1, in a change of L. The path between two
 samples is integrated with the current equation (at first there is none), and corrected linearly in
 time so that it ends in the measured z_{k+1}. So a pass is a linear regression, and a few passes
-suffice without an initial guess: the field changes much within a sampling time, but corrected paths
-of a wrong equation already give a nearly right one. B and c are free at every wavenumber and are
-projected out first. Symbols are, by their number of unknowns: polynomials of ik with real
-coefficients (`poly`, and `front` with fewer terms), compared on low wavenumbers only, where a steep
-front has no influence; with a fifth derivative in L (`fifth`), or the Hilbert transforms of the others
-(`nonlocal`); free at every wavenumber (`free`). A pass need not be a contraction where the field
-changes fast, so the equation with the smallest residual of all passes is selected.
+suffice without an initial guess. B and c are free at every wavenumber and are projected out first.
+Symbols are, by their number of unknowns: polynomials of ik with real coefficients (`poly`, and `front`
+with fewer terms), compared on low wavenumbers only, where a steep front has no influence; with a fifth
+derivative in L (`fifth`), or the Hilbert transforms of the others (`nonlocal`); free at every
+wavenumber (`free`). The equation with the smallest residual of all passes is selected.
 
 References
 ----------

@@ -10,27 +10,24 @@ with d = 0 unless a constant term predicts all held-out parts of the data better
 degrees and per cent is not the plant's rest, so it has one (`has_offset`) whatever the data say:
 without it a pole that they hardly tell from 1 is at 1.
 
-Data that do not determine it are refused (`pdeloop.method.reduce.identifiability`). States are
-projected and inputs are kept whole, so that there is no second rank to choose and nothing depends on
-the unit of the inputs.
+Data that do not determine it are refused (`pdeloop.method.reduce.identifiability`). Inputs are kept
+whole, so that there is no second rank to choose and nothing depends on their unit.
 
 The paper's method is DMD with control (DMDc): with the p-truncated SVD [Z; Y] ~ Psi Xi Lambda^T,
 
     A = U^T Z' Lambda Xi^{-1} Psi_Z^T U,        B = U^T Z' Lambda Xi^{-1} Psi_Y^T,
 
-where Psi_Z are the first n_z rows of Psi and Psi_Y its last n_a. It is the same where the states have
-no more than n_s modes and p keeps everything; with p < n_s + n_a it cuts into the inputs.
+where Psi_Z are the first n_z rows of Psi and Psi_Y its last n_a; with p < n_s + n_a it cuts into the
+inputs.
 
-The order n_s that the data support (`study_orders`) follows from errors of models on held-out steps.
-Every trajectory is cut into pieces; in each of four folds every fourth piece is held out, and the
-others give U, A and B. The errors of the model on a held-out piece z_0 .. z_N are
+The order n_s that the data support (`study_orders`) follows from errors of models on pieces of
+trajectories z_0 .. z_N that were held out,
 
     one step    z_{k+1} - U (A U^T z_k + B a_k)
-    rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0,
+    rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0.
 
-so they include the part outside the modes. An error is the root of the sum of squares over all
-held-out steps, relative to that of z_{k+1} - z_k for one step and z_{k+1} - z_0 for the rollout: 1 is
-as good as a model in which nothing changes.
+An error is the root of the sum of squares over all held-out steps, relative to that of z_{k+1} - z_k
+and of z_{k+1} - z_0: 1 is as good as a model in which nothing changes.
 
 References
 ----------
