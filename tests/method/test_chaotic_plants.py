@@ -82,7 +82,8 @@ def test_a_model_of_pieces_is_believed_where_small_errors_grow_and_not_where_the
         error = float(errors(model, rollouts, self.target, 2.0).mean())
         whole_ones = len(rollouts[0].actions) == 80
         best = by_accident if whole_ones else model
-        return FittedModel(best, error, [], Accuracy(error, error))
+        own = Accuracy(error, error)
+        return FittedModel(best, error, [], own, rollouts, self.most)
 
     monkeypatch.setattr(Selection, "fit", judged)
     found = believe(context, records, SETTINGS.believed)

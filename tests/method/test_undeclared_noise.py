@@ -49,7 +49,7 @@ def found_in(rollouts: Rollouts, target: np.ndarray, declared: float = 0.0) -> f
     """The noise that is found in rollouts; 0: none."""
     known = [Measured(states, actions) for states, actions in rollouts]
     found = Selection(target=target, noise=declared).undeclared_noise(known)
-    return 0.0 if found is None else found[1]
+    return 0.0 if found is None else found.noise
 
 
 def test_white_residuals_are_rejected_at_the_level_of_the_test() -> None:

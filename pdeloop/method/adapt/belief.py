@@ -124,13 +124,7 @@ def believe(
     found = selection.select([_measured(context, own) for own in records], first)
     if found is None:
         return None
-    return Belief(
-        found.model,
-        found.error,
-        found.whole,
-        found.noise,
-        accepted=found.predicts,
-    )
+    return Belief(found.model, found.judged, found.whole, found.noise, accepted=found.predicts)
 
 
 def _of_readings(context: Context, records: Sequence[Record]) -> Belief | None:

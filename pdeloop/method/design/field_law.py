@@ -46,7 +46,6 @@ from pdeloop.method.models.selection import (
     UNKNOWN,
     Accuracy,
     Kind,
-    Selected,
     Selection,
     limited,
     scale_of,
@@ -176,7 +175,7 @@ def _cost(cost: float) -> str:
     return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
 
 
-def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Selected | None:
+def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> FittedModel | None:
     """The model of the whole field that predicts trajectories best; None where there is none.
 
     A target far outside of the data makes every error small, so a model that does not reproduce what
@@ -188,13 +187,13 @@ def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Sele
     known = [Measured(z, a) for z, a in trajectories]
     folds = selection.settings.folds
     found = selection.select([part for own in known for part in _spread(own, folds)])
-    if found is None or found.noise or found.near < np.inf:
+    if found is None or found.noise or found.near is not None:
         return found
-    if found.error <= selection.accepted < found.fitted.own.simulated:
+    if found.error <= selection.accepted < found.own.simulated:
         scale = scale_of([states for states, _ in trajectories])
         again = selection.fit(found.rollouts, scale, by_scale=True)
-        if again is not None and again.own.simulated < found.fitted.own.simulated:
-            return replace(found, fitted=again)
+        if again is not None and again.own.simulated < found.own.simulated:
+            return replace(again, whole=found.whole)
     return found
 
 
@@ -254,26 +253,23 @@ def field_law(
         shape=() if line or len(target) % math.prod(axes) else axes,
         weights=weights,
     )
-    selected = best_model(selection, trajectories)
-    if selected is None:
-        return FieldLaw(None)
-    if selected.noise:
-        return FieldLaw(selected.fitted, noise=selected.noise)
-    fitted, rollouts, most = selected.fitted, selected.rollouts, selected.most
+    fitted = best_model(selection, trajectories)
+    if fitted is None or fitted.noise:
+        return FieldLaw(fitted, noise=fitted.noise if fitted else 0.0)
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
-    limits = [limited(rollout, action_set) for rollout in rollouts]
+    limits = [limited(rollout, action_set) for rollout in fitted.rollouts]
     with one_thread():
         kind = regression_kind(n_s, constant=other.d is not None)
         held = selection.judged(kind, limits, np.inf, models, scale)
     regression = held[1] if held else UNKNOWN
     known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    accepted = _accepted(known, most)
+    accepted = _accepted(known, fitted.most)
     model = fitted.model
     own = fitted.own
     predicts = own.simulated < min(1.0, regression.simulated) and own.one_step < regression.one_step
     if not accepted and predicts:  # more than nothing, and all of it better than the other one does
         accepted = [model]
-    elif fitted.error > most:
+    elif fitted.error > fitted.most:
         accepted = [judge for judge in accepted if judge is not model]
     report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
     if not any(judge is model for judge in accepted):

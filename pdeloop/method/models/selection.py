@@ -279,20 +279,6 @@ class Accuracy(NamedTuple):
 UNKNOWN = Accuracy(np.inf, np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class FittedModel:
-    """A model and why it is believed.
-
-    error: E of its kind, the mean over rollouts that it was not fitted to; candidates: kinds that were
-    tried, in that order, and their E; own: relative to what the data do, where a scale was given.
-    """
-
-    model: FieldModel
-    error: float
-    candidates: list[tuple[str, float]]
-    own: Accuracy = UNKNOWN
-
-
 def with_clean(rollouts: Sequence[Measured], noise: float, *, line: bool = True) -> list[Measured]:
     """The rollouts with denoised states."""
     rollouts = usable(rollouts)
@@ -356,38 +342,37 @@ _GROWN = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
+class FittedModel:
     """A model, and what it was selected by.
 
+    error: E of its kind, the mean over rollouts that it was not fitted to; candidates: kinds that were
+    tried, in that order, and their E; own: relative to what the data do, where a scale was given;
     rollouts: whole ones, pieces or beginnings; most: largest error at which a model of these is
-    accepted; whole: False of one that predicts pieces of rollouts, of a chaotic plant; near: of a
-    linear one, of short pieces, up to how many times the distance of initial states from the target,
-    else infinite; noise: that which it was fitted for in place of the declared one, or 0; one_step:
-    error of single steps relative to the change in them, 0 where noise hides it.
+    accepted; whole: False of one that predicts pieces of rollouts, of a chaotic plant; noise: that
+    which it was fitted for in place of the declared one, or 0; near: of a linear one, of short pieces
+    up to some distance from the target, the error of single steps (0 where noise hides it), which
+    counts in place of E.
     """
 
-    fitted: FittedModel
-    rollouts: list[Measured]
-    most: float
+    model: FieldModel
+    error: float
+    candidates: list[tuple[str, float]]
+    own: Accuracy = UNKNOWN
+    rollouts: Sequence[Measured] = ()
+    most: float = np.inf
     whole: bool = True
-    near: float = np.inf
     noise: float = 0.0
-    one_step: float = 0.0
+    near: float | None = None
 
     @property
-    def model(self) -> FieldModel:
-        """The model."""
-        return self.fitted.model
-
-    @property
-    def error(self) -> float:
-        """E, or of short pieces that of single steps."""
-        return self.one_step if self.near < np.inf else self.fitted.error
+    def judged(self) -> float:
+        """The error that counts."""
+        return self.error if self.near is None else self.near
 
     @property
     def predicts(self) -> bool:
         """True if its error is small enough."""
-        return self.error <= self.most
+        return self.judged <= self.most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -436,7 +421,7 @@ class Selection:
         first, that of the last choice; linear, knows_noise: only linear models, or kinds that are
         fitted for noise.
         """
-        target, noise, settings = self.target, self.noise, self.settings
+        target, noise, settings, given = self.target, self.noise, self.settings, rollouts
         rollouts = [limited(rollout, self.action_set) for rollout in rollouts]
         if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
             return None
@@ -483,7 +468,7 @@ class Selection:
                         held = self.judged(kind, parts, np.inf, settings, scale)
                         own[kind] = held[1] if held else UNKNOWN
                     seen = [(kind.name, error) for kind, error in tried.items()]
-                    return FittedModel(model, tried[kind], seen, own[kind])
+                    return FittedModel(model, tried[kind], seen, own[kind], given, self.most)
         return None
 
     def judged(
@@ -525,7 +510,7 @@ class Selection:
             one = float(np.sqrt(sums[0] / sums[1]))
         return float(np.mean(found)), Accuracy(float(np.mean(relative)), one)
 
-    def select(self, rollouts: Sequence[Measured], first: str = "") -> Selected | None:
+    def select(self, rollouts: Sequence[Measured], first: str = "") -> FittedModel | None:
         """The model, which need not be accepted; None where none can be fitted.
 
         rollouts: measured ones; first: kind that is tried first, that of the last selection.
@@ -534,41 +519,27 @@ class Selection:
         if not rollouts:
             return None
         scale = scale_of([own.states for own in rollouts])
-        whole = self._selected(self.fit(rollouts, scale, first), rollouts)
-        if (noisy := self._of_noise(rollouts, whole)) is not None:
-            return noisy
-        if whole is not None and whole.predicts and whole.one_step <= ONE_STEP:
+        whole = self.fit(rollouts, scale, first)
+        if self.undeclared and self.line and not self.shape:  # fields on one axis
+            # E without another noise is no measure for E with it.
+            better_than = np.inf if self.noise or whole is None else whole.error
+            if noisy := self.undeclared_noise(rollouts, better_than):
+                return noisy
+        if whole is not None and whole.predicts and self._one_step(whole) <= ONE_STEP:
             return whole
         found = [self._near(rollouts, scale, linear=False)]
         if whole is not None and not whole.predicts:
             found.append(self._of_pieces(rollouts, scale, whole))
-        best = min((own for own in found if own), key=lambda own: own.error, default=None)
+        best = min((own for own in found if own), key=lambda own: own.judged, default=None)
         return best or self._near(rollouts, scale, linear=True) or whole
 
-    def _selected(
-        self, fitted: FittedModel | None, rollouts: list[Measured], near: float = np.inf
-    ) -> Selected | None:
-        if fitted is None:
-            return None
-        most = ACCEPTED_NOISY if near < np.inf else self.most
-        one_step = 0.0 if self.noise else fitted.own.one_step
-        return Selected(fitted, rollouts, most, near=near, one_step=one_step)
-
-    def _of_noise(self, rollouts: list[Measured], whole: Selected | None) -> Selected | None:
-        """An equation for noise that was not declared, of fields on one axis."""
-        if not (self.undeclared and self.line) or self.shape:
-            return None
-        # E without another noise is no measure for E with it.
-        better_than = np.inf if self.noise or whole is None else whole.error
-        found = self.undeclared_noise([replace(own, law=None) for own in rollouts], better_than)
-        if found is None:
-            return None
-        return Selected(found[0], rollouts, ACCEPTED_NOISY, noise=found[1])
+    def _one_step(self, fitted: FittedModel) -> float:
+        return 0.0 if self.noise else fitted.own.one_step
 
     def undeclared_noise(
         self, rollouts: Sequence[Measured], better_than: float = np.inf
-    ) -> tuple[FittedModel, float] | None:
-        """An equation fitted for measurement noise, and the noise; None where there is no such noise.
+    ) -> FittedModel | None:
+        """An equation fitted for measurement noise; None where there is no such noise.
 
         Another one than was declared must be `NOISE_MISJUDGED` times as large, or as small.
         better_than: E of the best model without noise.
@@ -580,10 +551,11 @@ class Selection:
             return None
         if better_than < PREDICTED * share_of_noise(noise, states, self.target, self.weights):
             return None
-        found = replace(self, noise=noise).fit(rollouts, knows_noise=True)
+        known = [replace(rollout, law=None) for rollout in rollouts]
+        found = replace(self, noise=noise).fit(known, knows_noise=True)
         if found is None or found.error > ACCEPTED_NOISY or not found.error < better_than:
             return None
-        known = with_clean([limited(rollout, self.action_set) for rollout in rollouts], noise)
+        known = with_clean([limited(rollout, self.action_set) for rollout in known], noise)
         with one_thread():
             left = innovations(found.model, known, noise)
         if left is None:
@@ -592,11 +564,13 @@ class Selection:
         if not is_white(short, _WHITE_LEVEL, _WHITE_TOLERANCE):
             return None
         size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
-        return (found, noise) if size <= _NOISE_EXCESS * noise else None
+        if size > _NOISE_EXCESS * noise:
+            return None
+        return replace(found, rollouts=rollouts, most=ACCEPTED_NOISY, noise=noise)
 
     def _of_pieces(
-        self, rollouts: list[Measured], scale: Scale, whole: Selected
-    ) -> Selected | None:
+        self, rollouts: list[Measured], scale: Scale, whole: FittedModel
+    ) -> FittedModel | None:
         """A model that predicts pieces of rollouts of a chaotic plant."""
         most = min(self.most, whole.error / CHAOTIC_GROWTH)
         parts = [part for rollout in rollouts for part in pieces(rollout, PIECES)]
@@ -604,10 +578,10 @@ class Selection:
         worst = self.settings.worst
         known = errors(whole.model, parts, self.target, worst, self.noise, self.weights)
         kind = whole.model.kind if len(known) and known.mean() <= most else ""
-        found = self._selected(self.fit(parts, scale, kind), parts)
+        found = self.fit(parts, scale, kind)
         return replace(found, whole=False) if found and found.error <= most else None
 
-    def _near(self, rollouts: list[Measured], scale: Scale, *, linear: bool) -> Selected | None:
+    def _near(self, rollouts: list[Measured], scale: Scale, *, linear: bool) -> FittedModel | None:
         """The best model of beginnings near to the target, of regions of several sizes."""
         regions: dict[int, float] = {}
         for near in (np.inf, *NEAR):  # of several in which the same is measured the largest
@@ -618,9 +592,12 @@ class Selection:
             if near < np.inf:
                 parts = beginnings(rollouts, self.target, near, self.weights, short=linear)
                 fitted = self.fit(parts, scale, linear=linear)
-                found.append(self._selected(fitted, parts, near if linear else np.inf))
-        good = [own for own in found if own and own.predicts and own.one_step <= ONE_STEP]
-        return min(good, key=lambda own: own.error, default=None)
+                if fitted and linear:
+                    own = self._one_step(fitted)
+                    fitted = replace(fitted, most=ACCEPTED_NOISY, near=own)
+                found.append(fitted)
+        good = [own for own in found if own and own.predicts and self._one_step(own) <= ONE_STEP]
+        return min(good, key=lambda own: own.judged, default=None)
 
 
 def innovations(
