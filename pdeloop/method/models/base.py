@@ -218,10 +218,10 @@ def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, A
     return model.pull_back(states, actions, eye)
 
 
-def checked_substeps(steps: int, least: int = 1) -> int:
+def checked_substeps(steps: int) -> int:
     """The internal steps of a sampling time; ValueError for none or too many."""
-    if not least <= steps <= MAX_SUBSTEPS:
-        raise ValueError(f"a model has {steps} internal steps; expected {least} to {MAX_SUBSTEPS}")
+    if not 1 <= steps <= MAX_SUBSTEPS:
+        raise ValueError(f"a model has {steps} internal steps; expected 1 to {MAX_SUBSTEPS}")
     return steps
 
 

@@ -9,22 +9,14 @@ for j = 1, 2, along the axis before for j = 3, 4, and so on. Walls have coeffici
 is in sampling times, each of equal Runge-Kutta steps of order 4. On one axis the factors of M_f may be
 of neighbours, each at a distance of its own from x, as of chains of oscillators or species.
 
-Without internal steps it is the map z_{k+1} = z_k + dz/dt. A state of one point, whose components are
-its numbers, has products of any of them.
-
 In a fit, as in `fit_spectral`, a sampling time is integrated with the current equation and bent to end
 in the measured state; the change z_{k+1} - z_k is then linear in the coefficients, each with the mean
 of its feature on the way. Coefficients are the sum of one that all points share and a part of each
 point's own, which a ridge holds at zero where the data say nothing of it.
 
 Of states that are values of cells, not fields, the features are all monomials of a few neighbours
-to begin with (`fit_neighbours`). Of states that are neither, as of networks whose parts act on each
-other in no order, there are far too many products to be fitted together: for each number those are
-chosen, one by one, that explain most of what a model linear in states and actions leaves over of
-its change, as long as each halves that (`fit_sparse`, orthogonal matching pursuit). No differential
-equation keeps what happened some samples ago, such as inputs that act late: of a state that holds
-it, the map z_{k+1} - z_k of the same terms is fitted. Three things differ in both, as such plants
-are often chaotic, so that a small error of a step is a large one of a rollout:
+to begin with (`fit_neighbours`). Three things differ, as such plants are often chaotic, so that a small
+error of a step is a large one of a rollout:
 
 - After two passes, others regress what the model's own steps miss. The error of the means along its
   paths has no effect on where they end: of a plant without noise the coefficients are exact.
@@ -37,8 +29,7 @@ References
 ----------
 Brunton, Proctor, Kutz, "Discovering governing equations from data by sparse identification of
 nonlinear dynamical systems", PNAS 113(15), 2016. Miller, "Subset Selection in Regression", 2nd ed.,
-Chapman & Hall 2002, chapter 3 (backward elimination). Pati, Rezaiifar, Krishnaprasad, "Orthogonal
-matching pursuit", Asilomar Conference, 1993.
+Chapman & Hall 2002, chapter 3 (backward elimination).
 """
 
 from __future__ import annotations
@@ -71,7 +62,7 @@ from pdeloop.method.models.finite_difference_kernels import (
     mean_features,
     pull_back,
 )
-from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES, SPARSE_TERMS
+from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 
 
 class Feature(NamedTuple):
@@ -116,7 +107,7 @@ class FiniteDifferenceModel(StoredModel):
     """The equation above, with C (F, components, n_x), B (n_z, n_a) and c (n_z,).
 
     features: F of them; derivatives of one monomial stand together, beginning with that of order 0;
-    substeps: Runge-Kutta steps of a sampling time, 0: it is a map; shape: grid points of each axis, the
+    substeps: Runge-Kutta steps of a sampling time; shape: grid points of each axis, the
     last one fastest, whose product is n_x; empty: there is one.
     """
 
@@ -197,7 +188,7 @@ class FiniteDifferenceModel(StoredModel):
             )
             for row, ahead in zip(table.tolist(), shifts.tolist(), strict=True)
         )
-        checked_substeps(own["substeps"], least=0)
+        checked_substeps(own["substeps"])
         kind, shape = text_of(arrays, "kind"), tuple(axes) if len(axes) > 1 else ()
         return cls(kind=kind, features=features, shape=shape, **own)
 
@@ -271,12 +262,7 @@ def largest_of(samples: Samples) -> float:
 
 
 def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
-    """Enough internal steps for a field of that size, of `reach` over its fastest rate each.
-
-    None for a map.
-    """
-    if not model.substeps:
-        return 0
+    """Enough internal steps for a field of that size, of `reach` over its fastest rate each."""
     # Of a second difference on a unit grid the largest rate is 4, of others 1.
     growth = np.array(
         [
@@ -508,70 +494,4 @@ def explaining(columns: Columns, shared: bool) -> list[int]:
         inverse = inverse - ratio[:, :, None] * inverse[:, f, None, :]
         inverse = np.delete(np.delete(inverse, f, axis=1), f, axis=2)
         del kept[f]
-    return kept
-
-
-_SPARSE_PRODUCTS = 2500
-"""Number of products above which products of three different numbers are not tried."""
-_SPARSE_LEFT = 0.5
-"""Share of the remaining squared change that another product may leave."""
-
-Product = tuple[int, ...]
-"""The numbers of a state that are multiplied."""
-_ROUNDING = 1e-7
-"""Size of what a linear model leaves over of a product that is one itself, relative to the product."""
-
-
-def fit_sparse(samples: Samples, *, kind: str, is_map: bool) -> FiniteDifferenceModel | None:
-    """The equation or the map, or None where no product is found, or the plant is of another kind."""
-    samples = samples.thinned(_NEAR_SAMPLES)
-    found = chosen(samples)
-    if not found:
-        return None
-    n_z = samples.before.shape[1]
-    features = tuple(Feature(factors) for factors in [*((i,) for i in range(n_z)), *found])
-    empty = nothing(kind, features, samples, n_z)
-    return fitted(replace(empty, substeps=0 if is_map else 1), samples, None)
-
-
-def products(n_z: int, most: int) -> list[Product]:
-    """Those of two numbers and of three, or if they are more than `most`, of three with a square."""
-    two: list[Product] = list(combinations_with_replacement(range(n_z), 2))
-    three: list[Product] = list(combinations_with_replacement(range(n_z), 3))
-    if len(two) + len(three) > most:
-        three = [own for own in three if len(set(own)) < 3]
-    return two + three
-
-
-def chosen(samples: Samples) -> list[Product]:
-    """The products that some number's change is explained by, in the order of `products`."""
-    candidates = products(samples.before.shape[1], _SPARSE_PRODUCTS)
-    size = np.sqrt(np.mean(samples.before**2, axis=0))
-    z = samples.before / np.where(size > 0.0, size, 1.0)
-    root = samples.weights()[:, None]
-    linear = orthonormal(np.hstack([np.ones((len(z), 1)), z, samples.actions]) * root)
-    X = np.stack([np.prod(z[:, own], axis=1) for own in candidates], axis=1) * root
-    before = np.linalg.norm(X, axis=0)
-    X, y = (
-        values - linear @ (linear.T @ values)
-        for values in (X, (samples.after - samples.before) * root)
-    )
-    left = np.linalg.norm(X, axis=0)
-    X = X / np.where(left > _ROUNDING * before, left, np.inf)
-    found = {p for change in y.T for p in _pursued(X, change)}
-    return [candidates[p] for p in sorted(found)]
-
-
-def _pursued(X: Array, y: Array) -> list[int]:
-    """The columns of X, each of length 1 or 0, that explain y."""
-    kept: list[int] = []
-    rest = y
-    while len(kept) < SPARSE_TERMS:
-        likely = int(np.argmax(np.abs(rest @ X)))
-        together = X[:, [*kept, likely]]
-        left = y - together @ np.linalg.lstsq(together, y)[0]
-        if likely in kept or not left @ left < _SPARSE_LEFT * (rest @ rest):
-            break
-        kept.append(likely)
-        rest = left
     return kept

@@ -37,7 +37,7 @@ def forcing(action: Array, B: Array, constant: Array, force: Array) -> None:
 
 @jit
 def multiply(z: Array, table: Table, f: int, without: int, value: Array) -> None:
-    """Multiply by all factors of a monomial but one."""
+    """Multiply by all factors of a monomial but one, if that is among them."""
     n_x = z.shape[1]
     for factor in range(table[f, 0]):
         if factor == without:
@@ -58,15 +58,9 @@ def multiply(z: Array, table: Table, f: int, without: int, value: Array) -> None
 @jit
 def monomial(z: Array, table: Table, f: int, value: Array) -> None:
     """A monomial at all points."""
-    n_x = z.shape[1]
-    c, ahead = table[f, 1], table[f, 1 + MOST_FACTORS]
-    if ahead == 0:
-        for i in range(n_x):
-            value[i] = z[c, i]
-    else:
-        copy(z[c, ahead:], value[: n_x - ahead])
-        copy(z[c, :ahead], value[n_x - ahead :])
-    multiply(z, table, f, 0, value)
+    for i in range(value.size):
+        value[i] = 1.0
+    multiply(z, table, f, -1, value)
 
 
 @jit
@@ -147,10 +141,6 @@ def transposed_rate(
             continue
         for own in range(table[f, 0]):
             c, ahead = table[f, 1 + own], table[f, 1 + MOST_FACTORS + own]
-            if table[f, 0] == 1 and ahead == 0:
-                for i in range(n_x):
-                    out[c, i] += on_m[i]
-                continue
             for i in range(n_x):
                 value[i] = on_m[i]
             multiply(z, table, f, own, value)
@@ -185,19 +175,6 @@ def runge_kutta(
             z[c, i] += h / 6.0 * (k[0, c, i] + 2.0 * k[1, c, i] + 2.0 * k[2, c, i] + k[3, c, i])
 
 
-@jit
-def mapped(
-    z: Array, table: Table, shape: Table, C: Array, force: Array, value: Array, moved: Array,
-    change: Array,
-) -> None:  # fmt: skip
-    """The step of a map in place."""
-    components, n_x = z.shape
-    rate(z, table, shape, C, force, value, moved, change)
-    for c in range(components):
-        for i in range(n_x):
-            z[c, i] += change[c, i]
-
-
 @cached_njit()
 def advance(
     states: Array, actions: Array, table: Table, axes: Table, C: Array, B: Array, constant: Array,
@@ -212,8 +189,6 @@ def advance(
         copy(states[m], after[m])
         z = after[m].reshape(shape)
         forcing(actions[m], B, constant, force)
-        if substeps == 0:
-            mapped(z, table, axes, C, force, value, moved, k[0])
         for _ in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, value, moved)
 
@@ -225,7 +200,7 @@ def pull_back(
 ) -> None:  # fmt: skip
     """Write the transposed products."""
     components, n_x = C.shape[1], C.shape[2]
-    shape, h = (components, n_x), 1.0 / max(substeps, 1)
+    shape, h = (components, n_x), 1.0 / substeps
     force, value, moved = np.empty(shape), np.empty(n_x), np.empty(n_x)
     tape, k = np.empty((substeps, 4, components, n_x)), np.empty((4, components, n_x))
     z, on_m, on_force = np.empty(shape), np.empty(n_x), np.empty(shape)
@@ -238,12 +213,6 @@ def pull_back(
             runge_kutta(z, table, axes, C, force, h, tape[n], k, value, moved)
         copy(covectors[m], flat_own)
         on_force[:] = 0.0
-        if substeps == 0:
-            copy(flat_own, on_force.reshape(on_force.size))
-            transposed_rate(z, on_force, table, axes, C, value, moved, on_m, g)
-            for c in range(components):
-                for i in range(n_x):
-                    own[c, i] += g[c, i]
         for n in range(substeps - 1, -1, -1):
             g[:] = 0.0
             copy(flat_own, total.reshape(total.size))
@@ -285,8 +254,6 @@ def mean_features(
         copy(states[m], flat)
         copy(flat, path[0].reshape(z.size))
         forcing(actions[m], B, constant, force)
-        if substeps == 0:  # its features are those of its beginning
-            mapped(z, table, axes, C, force, value, moved, k[0])
         for n in range(substeps):
             runge_kutta(z, table, axes, C, force, 1.0 / substeps, stages, k, value, moved)
             copy(flat, path[n + 1].reshape(z.size))
@@ -295,10 +262,7 @@ def mean_features(
             miss[m, i] = after[m, i] - flat[i]
         found[m] = 0.0
         for n in range(substeps + 1):
-            weight, share = 1.0, 0.0
-            if substeps > 0:
-                weight = (0.5 if n in (0, substeps) else 1.0) / substeps
-                share = n / substeps
+            weight, share = (0.5 if n in (0, substeps) else 1.0) / substeps, n / substeps
             for c in range(components):
                 for i in range(n_x):
                     bent[c, i] = path[n, c, i] + share * (end[c, i] - z[c, i])

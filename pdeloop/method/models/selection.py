@@ -60,7 +60,6 @@ from pdeloop.method.models.finite_difference import (
     features_of,
     fit_finite_difference,
     fit_neighbours,
-    fit_sparse,
     neighbour_features,
 )
 from pdeloop.method.models.linear import fit_coarse, fit_convolution, fit_linear, fit_low_rank
@@ -79,7 +78,6 @@ from pdeloop.method.models.settings import (
     DEFAULTS,
     LEAST_CORRECTION,
     NOISE_MISJUDGED,
-    SPARSE_TERMS,
     FieldModelSettings,
 )
 from pdeloop.method.models.spectral import Form, fit_spectral
@@ -92,8 +90,6 @@ NEAR_NEEDED = 0.05
 """Least E of the other kinds above which models of neighbours are tried."""
 DENSE = 512
 """Largest state for the kinds whose cost grows with its square, and for models of neighbours."""
-_SPARSE_NUMBERS = 40
-"""Largest state for models of few products of any of its numbers."""
 _CONVOLUTION_RIDGE = 1e-9
 """Ridge of convolution models."""
 
@@ -113,7 +109,6 @@ _POINT_DEGREE = 3
 LINEAR = "linear"
 _LINEAR_RIDGE, _LINEAR_MODES = 1e-6, 64
 """Ridge of a linear model of the whole state; POD modes of one of a large state, at most."""
-SPARSE = {"sparse-map": True, "sparse": False}
 SQUARES_ENOUGH = 0.01
 """`enough` of an equation with squares alone, as cubes may be small where it was measured."""
 SIMPLEST = 3
@@ -157,13 +152,7 @@ def kinds_of(
         linear = [_of_samples(LINEAR, fit_linear, (n_z, 0), ridge=_LINEAR_RIDGE)]
     if shape:
         return linear + _finite_difference(n_z // math.prod(shape), settings, shape=shape)
-    last = list[Kind]()  # products of any numbers, where nothing simpler describes the plant
-    if n_z <= _SPARSE_NUMBERS:
-        unknowns = n_z + SPARSE_TERMS, 0
-        last += [
-            _of_samples(name, fit_sparse, unknowns, NEAR_NEEDED, is_map=is_map)
-            for name, is_map in SPARSE.items()
-        ]
+    last = list[Kind]()
     if n_z <= LARGEST_STATE:
         last.append(Kind("polynomial", lambda own, _: fit_polynomial(own), (n_z + 1.0, 0)))
     if not line:

@@ -11,8 +11,6 @@ COEFFICIENT_RIDGE = 1e-9
 """Ridge of the normal equations in normalised columns."""
 POINT_SAMPLES = 800
 """Maximum number of data steps in a fit of finite differences."""
-SPARSE_TERMS = 8
-"""Maximum number of products for each number."""
 LEAST_CORRECTION = 0.02
 """Minimum share of an innovation that corrects a filtered state."""
 FAR = 1e3
