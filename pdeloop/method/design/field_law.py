@@ -320,10 +320,7 @@ def field_law(
 
 
 def _accepted(models: Sequence[tuple[FieldModel, Accuracy]], most: float) -> list[FieldModel]:
-    """The models whose errors are small, and not several times as large as those of another one.
-
-    Errors of less than a millionth of the variation are equal.
-    """
+    """The models whose errors are small, and not several times as large as those of another one."""
     simulated, once = (
         BETTER * max(min(own[i] for _, own in models), level)
         for i, level in enumerate((EXACT, np.sqrt(EXACT)))

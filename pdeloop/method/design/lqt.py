@@ -237,10 +237,7 @@ def output_law(
 def _feedback(
     A: Array, inputs: Array, B: Array, Q: Array, R: Array
 ) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
-    """P, S, K_a and the poles; DesignError where there is no stabilising feedback.
-
-    B: the matrix `inputs`, in the units of R.
-    """
+    """P, S, K_a and the poles, or DesignError; B: the matrix `inputs`, in the units of R."""
     _require_stabilisable(A, inputs)
     try:
         P = linalg.solve_discrete_are(A, B, Q, R)
@@ -264,10 +261,7 @@ def _feedback(
 
 
 def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:
-    """Units of the inputs and of the cost in which the Riccati solver has numbers of one size.
-
-    1 each where they have that already, so that the bits are those of the model as it is.
-    """
+    """Units of inputs and cost with which Riccati has numbers of one size, 1 each where it has them."""
     ratio = float(linalg.norm(model.B, 2)) / max(float(linalg.norm(model.A, 2)), 1e-300)
     if 1.0 / _ALIKE < ratio < _ALIKE or ratio == 0.0:
         return 1.0, 1.0

@@ -39,10 +39,7 @@ class FieldModel(Protocol):
     def n_a(self) -> int: ...
 
     def step(self, states: Array, actions: Array) -> Array:
-        """The states (M, n_z) a sampling time later, under actions (M, n_a).
-
-        What the model makes of a state far from the data may be NaN or infinite.
-        """
+        """The states (M, n_z) a sampling time later; NaN or infinite ones may be far from the data."""
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         """(d step/dz)^T y and (d step/da)^T y, (M, n_z) and (M, n_a), of covectors y (M, n_z).
@@ -256,10 +253,7 @@ _SHORT = 8
 
 
 def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
-    """z_0 .. z_L of each rollout from its z_0 as it is best known, under its law or else its actions.
-
-    They end before the first state that is not finite.
-    """
+    """z_0 .. z_L of each rollout, as far as finite, from its best known z_0, by law or actions."""
     if not rollouts:
         return []
     z = np.array([rollout.known[0] for rollout in rollouts], dtype=np.float64)

@@ -66,10 +66,7 @@ from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 
 
 class Feature(NamedTuple):
-    """A monomial, by the component of each factor, and the order of its derivative.
-
-    shifts: by how many points each factor is ahead; empty: by none.
-    """
+    """A monomial: components of its factors, order of the derivative, points that factors are ahead."""
 
     factors: tuple[int, ...]
     order: int = 0
@@ -151,10 +148,7 @@ class FiniteDifferenceModel(StoredModel):
         return on_states, on_actions
 
     def means(self, states: Array, actions: Array, after: Array) -> tuple[Array, Array]:
-        """The features' means over a sampling time (M, F, n_x), and how far the step misses `after`.
-
-        They are those of the path bent linearly in time to end there.
-        """
+        """The features' means (M, F, n_x) on the path bent to end in `after`, and how far it misses."""
         z, a, end = read_only(states), read_only(actions), read_only(after)
         found = np.empty((len(z), len(self.features), self.coefficients.shape[2]))
         miss = np.empty_like(z)
@@ -276,10 +270,10 @@ def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The normal equations of each point, free of the inputs, in columns X with a sum of squares of 1.
+    """The normal equations of each point, free of the inputs, in columns X of the norm 1.
 
-    gram (n_x, F, F) and moment (n_x, F, components): X^T X and X^T y; square: the sum of y^2 over all
-    points; scale (F,): by which the columns were divided.
+    gram (n_x, F, F), moment (n_x, F, components): X^T X, X^T y; square: sum y^2; scale (F,): of
+    columns.
     """
 
     gram: Array
@@ -300,8 +294,7 @@ class Columns:
 class Regression:
     """What a pass regresses: y (n_x, N, components), the change, on the features' means X (n_x, N, F).
 
-    common (N, n_a + 1): the inputs and 1; miss: root of the mean square of what the model's steps
-    missed.
+    common (N, n_a + 1): the inputs and 1; miss: root mean square of what the model's steps missed.
     """
 
     X: Array
@@ -402,9 +395,7 @@ def fit_neighbours(
     """The equation, or None where the plant is of another kind.
 
     Of several components second neighbours, with half as many terms again, are tried where the first
-    ones do not describe the plant.
-
-    ridge: of the points' own parts in normalised columns; None: all points share their coefficients.
+    ones do not describe the plant. ridge: as for `fit_finite_difference`.
     """
     samples = samples.thinned(_NEAR_SAMPLES)
     for reach in (1, 2) if components > 1 else (2,):

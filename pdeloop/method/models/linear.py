@@ -82,10 +82,7 @@ def add_products(rows: Array, matrix: Array, totals: Array) -> None:
 
 
 def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | None:
-    """Least squares on the change of the state, about the mean state and action.
-
-    ridge: of normalised columns; those of the state have one unit, each input its own.
-    """
+    """Least squares on the change of the state, about the means; ridge: of normalised columns."""
     n_z, change = samples.before.shape[1], samples.after - samples.before
     columns = np.hstack([samples.before, samples.actions])
     mean, moved = columns.mean(axis=0), change.mean(axis=0)  # an offset is nothing to hold at zero
@@ -111,12 +108,7 @@ def _ridged(columns: Array, values: Array, scale: Array, ridge: float) -> Array:
 def fit_convolution(
     samples: Samples, *, kind: str, ridge: float, components: int
 ) -> LinearModel | None:
-    """Least squares where A is the same at every place of a ring: circulant blocks.
-
-    Each wavenumber has its own regression, with `components` unknowns in addition to the inputs.
-
-    ridge: of normalised columns.
-    """
+    """Least squares of each wavenumber: A is the same at every place of a ring, in circulant blocks."""
     count, n_z = samples.before.shape
     n_x, n_a = n_z // components, samples.actions.shape[1]
 

@@ -268,10 +268,7 @@ def cleaned_states(
 
 
 def signal_power(spectra: NDArray[Any], noise: float, points: int) -> tuple[Array, float]:
-    """Mean power of fields without noise at each wavenumber, and that of the noise.
-
-    spectra (n, ..): Fourier transforms of fields of so many points.
-    """
+    """Mean power at each wavenumber, of spectra (n, ..), without noise, and that of the noise."""
     noise_power = noise**2 * points
     power = np.mean(np.abs(spectra) ** 2, axis=0)
     return np.maximum(power - noise_power, 0.0), noise_power
@@ -281,9 +278,8 @@ def signal_power(spectra: NDArray[Any], noise: float, points: int) -> tuple[Arra
 class Filtered:
     """States of rollouts, (L + 1, n_z) each, and the model's predictions of them.
 
-    innovations: measured minus predicted states, (L, n_z) each; power: their mean at each wavenumber,
-    of Fourier transforms over the number of points; lost: predictions that were not finite, in whose
-    place the last state stood.
+    innovations: measured minus predicted states, (L, n_z) each; power: their mean at each wavenumber;
+    lost: predictions that were not finite, in whose place the last state stood.
     """
 
     states: list[Array]
@@ -302,9 +298,8 @@ def filtered(
 ) -> Filtered:
     """The states of rollouts, each with one state more than actions.
 
-    first: their initial states; shares: g, of each wavenumber; settling: at the beginning no less than
-    that of an unknown state that rests, 1/(k + 2). A prediction far beyond the measured states is
-    rejected.
+    first: their initial states; shares: g, of each wavenumber; settling: at least 1/(k + 2), that of an
+    unknown state that rests. A prediction far beyond the measured states is rejected.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]
@@ -357,9 +352,8 @@ STRICTNESS = (1.0, 3.0, 9.0, 27.0)
 class WindowRegression(Regression):
     """The regression of a pass over windows; y and W of the wavenumbers that are compared alone.
 
-    common (modes, N, n_a + 1) and free_of_common, its orthonormal columns, are of each wavenumber;
-    lost: numbers of each wavenumber that the initial states of the windows take; strictness: multiple
-    of the significance that a coefficient must have.
+    common (modes, N, n_a + 1) and free_of_common are of each wavenumber; lost: numbers of each that the
+    initial states take; strictness: multiple of the significance that a coefficient must have.
     """
 
     common: Spectrum
@@ -378,10 +372,7 @@ class WindowRegression(Regression):
         return significant(columns, values, max(count / len(self.y), 0.1), self.strictness)
 
     def inputs(self, left: Spectrum) -> Spectrum:
-        """F of B and c, (n_a + 1, modes), from what the other terms leave (N, modes).
-
-        A wavenumber of B whose size is no larger than the error of its entries is 0.
-        """
+        """F of B and c (n_a + 1, modes), from (N, modes); 0 where B is no larger than its error."""
         found = np.empty((self.common.shape[2], left.shape[1]), complex)
         for k, columns in enumerate(self.common):
             found[:, k] = least_squares(columns, left[:, k : k + 1])[:, 0]
@@ -427,8 +418,7 @@ def fit_noisy(
 ) -> SpectralModel | None:
     """The equation of that form, all of whose symbols are polynomials; None where none is finite.
 
-    rollouts: with `clean`, the initial state of which is where the filter begins; noise: standard
-    deviation of the noise on every number of their states.
+    rollouts: with `clean`, where the filter begins; noise: on every number of their states.
     """
     rollouts = _thinned(usable(rollouts))
     n_z, n_a = rollouts[0].states.shape[1], rollouts[0].actions.shape[1]

@@ -141,11 +141,7 @@ class Kind:
 def kinds_of(
     n_z: int, settings: FieldModelSettings, *, line: bool = True, shape: tuple[int, ...] = ()
 ) -> list[Kind]:
-    """The kinds for states of that size.
-
-    line: whether a point has one neighbour at each side, which is not so on several axes; shape: points
-    of each axis, where there are several and the states are fields on them.
-    """
+    """The kinds for states of that size; line, shape: as for `Selection`."""
     if n_z > DENSE:
         linear = [_of_samples(LINEAR, fit_low_rank, (_LINEAR_MODES, 0), most=_LINEAR_MODES)]
     else:
@@ -500,10 +496,7 @@ class Selection:
         return float(np.mean(found)), Accuracy(float(np.mean(relative)), one)
 
     def select(self, rollouts: Sequence[Measured], first: str = "") -> FittedModel | None:
-        """The model, which need not be accepted; None where none can be fitted.
-
-        rollouts: measured ones; first: kind that is tried first, that of the last selection.
-        """
+        """The model, which need not be accepted, or None; first: kind that is tried first."""
         rollouts = [own for own in rollouts if len(own.actions)]
         if not rollouts:
             return None
@@ -592,10 +585,7 @@ class Selection:
 def innovations(
     model: FieldModel, rollouts: Sequence[Measured], noise: float
 ) -> list[Array] | None:
-    """Measured minus predicted states of each rollout, along its filtered states, but for the first.
-
-    rollouts: with `clean`, where the filter begins; None where the model runs away.
-    """
+    """Measured minus predicted states along filtered ones, but for the first; None: it runs away."""
     power = noise**2 / model.n_z
     shares = np.full(model.n_z // 2 + 1, 0.5)
     for _ in range(_TURNS):

@@ -328,9 +328,8 @@ class SensedEquation:
     def compiled(self, substeps: int, supports: Array, clip: float = np.inf) -> PolynomialStep:
         """The step, with these internal steps and supports, and a constant forcing of 1.
 
-        clip: z is cut to it in powers above the first, and where coefficients depend on x, so that a
-        wrong equation is far off but finite.
-        ValueError if the unknowns are not finite.
+        clip: z is cut to it in powers above the first, and where coefficients depend on x: a wrong
+        equation stays finite. ValueError if the unknowns are not finite.
         """
         equation = Polynomials(
             self.symbols[0],

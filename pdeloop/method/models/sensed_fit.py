@@ -109,8 +109,7 @@ class SensedFlow:
     def path(self, fields: Array, actions: Array, steps: int) -> Iterator[Array]:
         """The spectra (F + unknowns, R, 2, modes), step by step, in one array that changes.
 
-        fields (F, R, 33): initial ones of R rollouts, of which the first also begin the rollouts with
-        other unknowns; actions (R, T, n_a).
+        fields (F, R, 33): initial ones, the first also with other unknowns; actions (R, T, n_a).
         """
         count = len(fields)
         start = np.concatenate([fields, np.repeat(fields[:1], len(self._gains) - 1, axis=0)])
@@ -219,9 +218,8 @@ _WAVENUMBERS = np.r_[0, 1 : WAVES + 1, 1 : WAVES + 1]
 class Fitted:
     """An equation with unknowns `shared` (44 + n_a,), the initial fields (rollouts, n), and S (33,).
 
-    error: squared error of the readings over their sum of squares, less what noise has in it; infinite
-    where nothing is finite. noise: standard deviation of what is not predicted of a reading, which is
-    noise to a filter.
+    error: squared error of the readings over their sum of squares, less the noise's share; noise:
+    standard deviation of what is not predicted of a reading.
     """
 
     shared: Array
@@ -270,10 +268,7 @@ def fit_sensed(
 
 
 def _of_first_terms(data: _Data) -> tuple[_Fit, _Fit]:
-    """Of fits from nothing, until one is not lost, that which others are compared with, and the best.
-
-    The former is the first one, or the best where that was abandoned.
-    """
+    """Of fits from nothing, until one is not lost: the first, if not abandoned, and the best."""
     fits = list[_Fit]()
     for loose, dispersion in _STARTS:
         fit = _Fit(data, *_LIBRARIES[0][:2], loose=loose)
@@ -540,11 +535,7 @@ class _Fit:
         self.varied, self.deviations = self.varied[kept], self.deviations[kept]
 
     def _expansion(self, m: int) -> tuple[Array, Array, Array, Array, Array] | None:
-        """Curvatures A (R, 33, 33), B (R, 33, varied) and that of phi (varied, varied), and slopes.
-
-        Those of J by the fields (R, 33) and the varied unknowns (varied,); None where they are not
-        finite.
-        """
+        """Curvatures A (R, 33, 33), B (R, 33, varied), that of phi, and slopes of J, or None."""
         e, Jz, Jp = self._derivatives(m)
         if not (np.isfinite(Jz).all() and np.isfinite(Jp).all()):
             return None
@@ -577,7 +568,7 @@ class _Fit:
     def _errors(self, shared: Array, fields: Array, m: int, varied: Sequence[int] = ()) -> Array:
         """Errors (P, R, errors) of the first m readings and of d, in standard deviations.
 
-        P: fields (P, R, 33), then the first of them with each of the varied unknowns less by a
+        P: of the fields, then of the first of them with each of the varied unknowns less by a
         difference.
         """
         data, stride, told = self.data, -(-m // _COMPARED), self._told(m)

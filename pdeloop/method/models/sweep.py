@@ -50,10 +50,7 @@ class Sweep:
         self._before = action_set.start
 
     def each(self, count: int, work: Callable[[Sweep, slice], None]) -> None:
-        """Call `work` with the rows that go together, until all of `count` are done.
-
-        And with what rolls them: `roll_back` is of its last `roll`.
-        """
+        """Call `work` with the rows that go together, and what rolls them, until all are done."""
         work(self, slice(0, count))
 
     def roll(
@@ -179,10 +176,7 @@ class SpectralSweep(Sweep):
 def sweep_of(
     model: FieldModel, action_set: ActionSet, horizon: int, B: Array | None = None
 ) -> Sweep:
-    """Compiled where the model is a spectral one, each row by itself; else step by step.
-
-    horizon: most steps; B (n_p, n_a), or None: there is no memory.
-    """
+    """Compiled where the model is a spectral one; horizon: most steps; B (n_p, n_a): of a memory."""
     B = np.zeros((0, model.n_a)) if B is None else B
     separate = not (action_set.zero_mean or action_set.rated)
     if separate and isinstance(model, SpectralModel) and model.compiled.compiled_spectra:

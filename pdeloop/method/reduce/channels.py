@@ -172,11 +172,8 @@ def _copies(states: Array, names: Sequence[str]) -> list[str]:
 
 
 def _first_alike(unit: Array) -> NDArray[np.int64]:
-    """For each column of norm 1, the first one that is the same up to its sign and rounding.
-
-    Columns that are the same have the same weighted sum, so that only those whose sums are next to each
-    other are compared: a matrix of all products would grow with the square of a state.
-    """
+    """For each column of norm 1, the first one that is the same up to its sign and rounding."""
+    # Only those of the same weighted sum are compared: all products would be the square of a state.
     first = np.arange(unit.shape[1])
     weights = np.random.default_rng(0).standard_normal(len(unit))
     sums = np.abs(weights @ unit)

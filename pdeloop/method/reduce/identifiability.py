@@ -222,11 +222,7 @@ def _with_past(z: Array, a: Array) -> Trajectory:
 
 
 def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
-    """Inputs of which z_{k+1} tells more than as many columns of noise would, all else being known.
-
-    This is Hotelling's test of a column of B, on the leading 4, 8, 16, ... modes: many are noise, and
-    few may miss an effect.
-    """
+    """Inputs of which z_{k+1} tells more than noise would: Hotelling's test of a column of B."""
     from scipy import special  # here, as no training needs it
 
     before, after, y = (part - part.mean(axis=0) for part in (data.before, data.after, data.inputs))
@@ -330,10 +326,7 @@ def _rounding(left: Array, channel: Array, size: float) -> bool:
 
 
 def _step(channel: Array) -> float:
-    """The step in which a channel was written, as 1 for whole numbers.
-
-    0 if there is none, or if there are so few levels that the channel is switched, not rounded.
-    """
+    """The step in which a channel was written; 0: there is none, or it is switched, not rounded."""
     levels = np.unique(channel)
     if len(levels) < LEVELS:
         return 0.0

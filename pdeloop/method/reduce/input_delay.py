@@ -206,8 +206,7 @@ def _best(data: _Regression, used: Delays) -> DelayStudy:
 class _Regression:
     """Moments of the regressors 1, z_k, z_{k-1} and the inputs of all lags, and of what they predict.
 
-    of_x (F, r, r), of_xy (F, r, c), of_yy (F, c): of each fold; counts (F,); n, n_a: channels and
-    inputs; lags: of the inputs.
+    of_x (F, r, r), of_xy (F, r, c), of_yy (F, c), counts (F,): of each fold; n: channels.
     """
 
     of_x: Array

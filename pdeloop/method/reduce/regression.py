@@ -424,13 +424,13 @@ def study_orders(
                 continue
             tried = [n for n in tried if n <= most]
             errors.append([_held_out(by, data, modes[:, :n], held) for n in tried])
-            scales += _summed(_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held)
+            scales += np.sum([_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held], axis=0)
     if not (tried and errors):
         raise ValueError(
             f"the {len(everything.inputs)} steps with {everything.inputs.shape[1]} inputs are too few, "
             "or vary too little, to hold some of them out; record a longer trajectory"
         )
-    total = _summed(np.array(fold[: len(tried)]) for fold in errors)
+    total = np.sum([fold[: len(tried)] for fold in errors], axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         one_step, rollout = np.sqrt(np.nan_to_num(total / scales, nan=np.inf)).T
     digits = -np.log10(np.clip(one_step, ROUNDING, 1.0 / ROUNDING))
@@ -442,12 +442,22 @@ def study_orders(
 def _held_out(
     by: Callable[[Steps, Array], ReducedModel], data: Steps, U: Array, held: Sequence[Trajectory]
 ) -> Array:
-    """Sums of squared errors of a model on held-out pieces; infinite where there is none."""
+    """Sums of squared errors on held-out pieces: of one step, and rolled out; infinite: no model."""
     try:
         model = by(data, U)
     except ValueError:
         return np.full(2, np.inf)
-    return _summed(_errors(model, *piece) for piece in held)
+    total, (A, U) = np.zeros(2), (model.A, model.U)
+    for states, actions in held:
+        inputs = actions @ model.B.T + model.d
+        rolled = np.empty((len(states), model.n_s))
+        rolled[0] = states[0] @ U
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, forced in enumerate(inputs):
+                rolled[k + 1] = A @ rolled[k] + forced
+            once = states[:-1] @ U @ A.T + inputs
+            total += _squares(states[1:] - once @ U.T, states[1:] - rolled[1:] @ U.T)
+    return total
 
 
 def _determined(data: Steps, modes: Array) -> int:
@@ -460,23 +470,5 @@ def _determined(data: Steps, modes: Array) -> int:
     return most
 
 
-def _errors(model: ReducedModel, states: Array, actions: Array) -> Array:
-    """Sums of squared errors on one piece: of one step, and rolled out."""
-    A, B, U = model.A, model.B, model.U
-    inputs = actions @ B.T + model.d
-    rolled = np.empty((len(states), model.n_s))
-    rolled[0] = states[0] @ U
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k, forced in enumerate(inputs):
-            rolled[k + 1] = A @ rolled[k] + forced
-        once = states[:-1] @ U @ A.T + inputs
-        return _squares(states[1:] - once @ U.T, states[1:] - rolled[1:] @ U.T)
-
-
 def _squares(*residuals: Array) -> Array:
     return np.array([np.sum(residual**2) for residual in residuals])
-
-
-def _summed(parts: Iterable[Array]) -> Array:
-    total: Array = np.sum(list(parts), axis=0)
-    return total

@@ -192,10 +192,7 @@ def subspace_model(
 
 
 def _determined(p: int, n: int, known: Sequence[Trajectory]) -> bool:
-    """True if p steps can show n states, and there are more samples than unknowns in a row.
-
-    They are those after p steps, while a quarter of the data is held out.
-    """
+    """True if p steps can show n states, and three quarters of the data have samples enough."""
     n_z, n_a = known[0][0].shape[1], known[0][1].shape[1]
     parts = _parts(known)
     held = max(sum(max(len(a) - p, 0) for _, a in parts[i::FOLDS]) for i in range(FOLDS))
@@ -268,11 +265,8 @@ def _parts(known: Sequence[Trajectory]) -> list[Trajectory]:
 
 
 def _missed(model: InnovationModel, z: Array, a: Array) -> tuple[float, float]:
-    """Sums of squares of the filter's one-step errors, and of the changes in a step.
-
-    The first steps, eight at most, tell the state that it begins with: a filter of data without noise
-    may take far longer to forget a wrong one.
-    """
+    """Sums of squares of the filter's one-step errors, and of the changes in a step."""
+    # The first steps tell the state: a filter of data without noise may take long to forget another.
     begin = min(max(PASTS), len(a) // 2)
     y = z @ model.U
     outside = z - y @ model.U.T
@@ -427,10 +421,7 @@ class _Predictor:
 def _predictor(
     known: Sequence[Trajectory], p: int, r: int, channels: Channels, affine: bool, most: int
 ) -> _Predictor:
-    """The predictor of r modes of the measurements, or of all that there are. One LAPACK thread.
-
-    affine: with a constant term, without which that is a state with a pole near 1; most: states.
-    """
+    """The predictor of at most r modes of the measurements, for at most `most` states."""
     after = np.concatenate([z[1:] for z, _ in known])
     values = linalg.svdvals(after)
     floor = max(after.shape) * np.finfo(np.float64).eps * values[0]
@@ -513,10 +504,7 @@ def _fitted(
 
 
 def _ridge(X: Array, y: Array, count: int) -> Array:
-    """Ridge regression whose weight has the least generalised cross-validation error, (d, r).
-
-    X, y: triangles of `count` rows.
-    """
+    """Ridge regression (d, r) of least generalised cross-validation, from triangles of `count` rows."""
     left, s, right = linalg.svd(X, full_matrices=False)
     projected = left.T @ y
     outside = float(np.sum(y * y) - np.sum(projected * projected))
