@@ -19,10 +19,10 @@ from pdeloop.method.models.base import errors, pieces, predicted
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
     FiniteDifferenceModel,
+    advance,
     features_of,
     neighbour_features,
 )
-from pdeloop.method.models.finite_difference_kernels import advance
 from pdeloop.method.models.linear import LinearModel, add_products
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.sweep import sweep_of

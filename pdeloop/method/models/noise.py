@@ -333,8 +333,6 @@ _NOISY_POWER = 3.0
 """Mean power of a wavenumber, relative to the noise, from which it is compared."""
 _FEWEST_MODES = 4
 """Wavenumbers that are always compared, whatever their power."""
-_LARGEST_WINDOW = 16
-"""Maximum number of sampling times in a window."""
 _GROWTH = 1.5
 """Largest growth of the linear part within a window, as an exponent of e."""
 _RELATIVE_ERROR = 0.02
@@ -429,8 +427,7 @@ def fit_noisy(
     model = nothing(form, n_z, n_a, largest)
     best, least = None, np.inf
     known = filtered(model, rollouts, first, shares)
-    for window, share in PASSES:
-        steps = min(window, _LARGEST_WINDOW)
+    for steps, share in PASSES:
         growth = max(float(model.linear.real[:cut].max()), 0.0)
         if growth * steps > _GROWTH:
             steps = max(int(_GROWTH / growth), 1)
