@@ -75,12 +75,6 @@ def kalman_filter(A: ArrayLike, C: ArrayLike, process: ArrayLike, measurement: A
     process (n_s, n_s), measurement (n_y, n_y): W and V, symmetric, V positive definite. DesignError
     where the readings do not see a mode that does not decay, or a mode on the unit circle gets no
     noise.
-
-    A random walk with as much noise in the steps as in the measurements:
-
-    >>> found = kalman_filter([[1.0]], [[1.0]], [[1.0]], [[1.0]])
-    >>> found.M.round(6), found.P.round(6)
-    (array([[0.618034]]), array([[1.618034]]))
     """
     A, C, W, V = (np.asarray(part, dtype=np.float64) for part in (A, C, process, measurement))
     with one_thread():

@@ -128,18 +128,7 @@ def examine_excitation(trajectory: Trajectory) -> Identifiability:
 
 
 def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Identifiability:
-    """Examine whether the steps determine a model on the modes U (n_z, n_s), with one LAPACK thread.
-
-    Examples
-    --------
-    Two inputs of which one is twice the other:
-
-    >>> rng = np.random.default_rng(0)
-    >>> z, a = rng.normal(size=(51, 1)), rng.normal(size=(50, 1)) @ [[1.0, 2.0]]
-    >>> found = examine_steps(Steps(z[:-1], z[1:], a), np.eye(1))
-    >>> found.rank, found.unknowns, found.faults[0][:60]
-    (2, 3, 'the inputs a1 and a2 always moved together (a2 = 2 a1), so t')
-    """
+    """Examine whether the steps determine a model on the modes U (n_z, n_s), with one LAPACK thread."""
     s, y = data.before @ U, data.inputs
     values = linalg.svdvals(scaled(np.hstack([s, y]))[0])
     unknowns = s.shape[1] + y.shape[1]

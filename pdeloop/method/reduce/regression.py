@@ -93,16 +93,6 @@ def exact_regression(
     `needs_constant` says. ValueError for shapes that do not fit, NaN or infinity, fewer steps than the
     n_s + n_a unknowns in a row of [A B], more modes than the states have, or inputs whose effects
     cannot be told apart.
-
-    A plant z_{k+1} = 0.9 z_k + 2 a_k is found again:
-
-    >>> a = np.array([[1.0], [-1.0], [0.5], [2.0]])
-    >>> z = [np.array([1.0])]
-    >>> for a_k in a:
-    ...     z.append(0.9 * z[-1] + 2.0 * a_k)
-    >>> model = exact_regression([(z, a)], n_s=1)
-    >>> model.A.round(12), model.B.round(12)
-    (array([[0.9]]), array([[2.]]))
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape
@@ -279,9 +269,6 @@ def check_truncated_sizes(p: int, n_s: int, *, n_z: int, n_a: int, steps: int) -
         )
 
 
-_ORDER_PIECES = 8
-"""Number of pieces of an exploratory episode from which an order is suggested."""
-
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
 MOST = 8
 """The highest order by which it is decided whether models have a constant term."""
@@ -416,7 +403,7 @@ def study_orders(
         if constant is None:
             constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
         by = fitted_by or (lambda data, U: fit(data, U, constant))
-        for fitted, held in turns(pieces(known, _ORDER_PIECES), settings.order_folds):
+        for fitted, held in turns(pieces(known, 2 * FOLDS), settings.order_folds):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
             most = min(numerical_rank(values, *data.after.shape), _determined(data, modes))

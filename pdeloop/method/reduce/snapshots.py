@@ -31,12 +31,7 @@ and one outside of the basis is left out."""
 
 
 def factored(states: Array) -> tuple[Array, Array]:
-    """C (N, r) and orthonormal rows V (r, n_z) with states (N, n_z) = C V, strongest direction first.
-
-    >>> C, V = factored(np.outer([1.0, 2.0, 3.0], [0.6, 0.8, 0.0]))
-    >>> C.shape, bool(np.allclose(C @ V, np.outer([1.0, 2.0, 3.0], [0.6, 0.8, 0.0])))
-    ((3, 1), True)
-    """
+    """C (N, r) and orthonormal rows V (r, n_z) with states (N, n_z) = C V, strongest direction first."""
     with one_thread():  # a threaded LAPACK rounds differently
         left, values, right = linalg.svd(states, full_matrices=False)
     kept = max(int(np.count_nonzero(values > ROUNDED * linalg.norm(values))), 1)
@@ -44,13 +39,7 @@ def factored(states: Array) -> tuple[Array, Array]:
 
 
 class SnapshotBasis:
-    """Orthonormal rows (r, n_z), extended by the components of new states outside their span.
-
-    >>> basis = SnapshotBasis(np.eye(1, 5))
-    >>> basis.extend(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]]))
-    >>> np.abs(basis.coordinates(np.array([[3.0, 4.0, 0.0, 0.0, 0.0]])))[0, :3]
-    array([3., 4., 0.])
-    """
+    """Orthonormal rows (r, n_z), extended by the components of new states outside their span."""
 
     def __init__(self, rows: Array) -> None:
         self.rows = rows
