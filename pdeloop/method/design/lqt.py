@@ -238,7 +238,12 @@ def _feedback(
     A: Array, inputs: Array, B: Array, Q: Array, R: Array
 ) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
     """P, S, K_a and the poles, or DesignError; B: the matrix `inputs`, in the units of R."""
-    _require_stabilisable(A, inputs)
+    for eigenvalue, reach in unreached(A, inputs, _REACH):
+        raise DesignError(
+            "the reduced model is not stabilisable: no actuator reaches the mode with eigenvalue "
+            f"magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I - A, B] "
+            f"{reach:.1e}); place actuators that reach it or identify with another seed or n_s."
+        )
     try:
         P = linalg.solve_discrete_are(A, B, Q, R)
     except (linalg.LinAlgError, ValueError) as error:
@@ -266,15 +271,6 @@ def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:
     if 1.0 / _ALIKE < ratio < _ALIKE or ratio == 0.0:
         return 1.0, 1.0
     return 1.0 / ratio, state_weight
-
-
-def _require_stabilisable(A: Array, B: Array) -> None:
-    for eigenvalue, reach in unreached(A, B, _REACH):
-        raise DesignError(
-            "the reduced model is not stabilisable: no actuator reaches the mode with eigenvalue "
-            f"magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I - A, B] "
-            f"{reach:.1e}); place actuators that reach it or identify with another seed or n_s."
-        )
 
 
 def unreached(A: Array, B: Array, least: float) -> Iterator[tuple[complex, float]]:

@@ -332,14 +332,12 @@ def one_step(model: FieldModel, rollouts: Sequence[Measured], units: Array) -> A
 
 def usable(rollouts: Sequence[Measured]) -> list[Measured]:
     """The rollouts up to their first value that is not finite, without those of no step."""
-    return [short for rollout in rollouts if len((short := finite(rollout)).actions)]
-
-
-def finite(rollout: Measured) -> Measured:
-    """The rollout up to the first value that is not finite, with one state more than actions."""
-    states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
-    steps = min(_leading(np.isfinite(actions)), max(_leading(np.isfinite(states)) - 1, 0))
-    return rollout.part(0, steps)
+    found = []
+    for own in rollouts:
+        states, actions = (_leading(np.isfinite(part)) for part in (own.states, own.actions))
+        if (steps := min(actions, states - 1)) > 0:
+            found.append(own.part(0, steps))
+    return found
 
 
 def _leading(good: NDArray[np.bool_]) -> int:

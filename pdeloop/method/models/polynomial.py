@@ -197,12 +197,8 @@ class _Scaled:
         moment = features.T @ change / len(features)
         found = []
         for linear, of_products in ridges:
-            penalty = np.full(len(size), of_products)
-            penalty[0], penalty[1 : 1 + r], penalty[1 + r : 1 + r + n_a] = (
-                0.0,
-                linear,
-                _ACTION_RIDGE,
-            )
+            counts = [1, r, n_a, len(size) - 1 - r - n_a]
+            penalty = np.repeat([0.0, linear, _ACTION_RIDGE, of_products], counts)
             matrix = gram.copy()
             matrix[np.diag_indices(len(size))] += penalty + 1e-13
             solved = linalg.solve(matrix, moment, assume_a="pos") / size[:, None]

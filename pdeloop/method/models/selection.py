@@ -116,7 +116,6 @@ SIMPLEST = 3
 ACCURATE, TRIED = 5e-3, "front2"
 """E at which no kind after this form is tried: hardly one is `BETTER` times better."""
 
-
 Fit = Callable[[Sequence[Measured], float], FieldModel | None]
 
 
@@ -307,7 +306,6 @@ CHAOTIC_GROWTH = 20.0
 """Least ratio of the errors on whole rollouts and on pieces of a chaotic plant."""
 NEAR = (10.0, 3.0, 1.0)
 """Distances from the target, relative to the largest of initial states, of beginnings."""
-
 
 _NOISE_EXCESS = 1.3
 """Largest root mean square of the innovations of an equation, relative to the noise."""

@@ -38,7 +38,7 @@ Anderson, Moore, "Optimal Filtering", 1979, section 8.2 (extended Kalman filter)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import ClassVar
 
@@ -50,7 +50,7 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import Arrays, shaped
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
-from pdeloop.method.models.spectral import ORDERS, SpectralModel, fewer_of, substeps_of
+from pdeloop.method.models.spectral import ORDERS, SpectralModel, Spectrum, fewer_of, substeps_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 
 FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
@@ -73,9 +73,7 @@ EQUATION = len(TERMS) + len(VARIATIONS)
 """Number of the coefficients of both."""
 COEFFICIENTS = EQUATION + 1
 """The same, and 1 for the constant."""
-# b, x_0, s and w.
-_ACTUATORS = 4
-SHARED = COEFFICIENTS + _ACTUATORS
+SHARED = COEFFICIENTS + 4  # b, x_0, s and w
 """Unknowns that all rollouts share, besides one for each actuator."""
 # The least share of a coefficient of x that a bound leaves, so that it stays an unknown.
 _KEPT = 1e-6
@@ -111,8 +109,6 @@ def well_posed(shared: Array) -> Array:
             found[waves] *= max(most / reached, _KEPT)
     return found
 
-
-Spectrum = NDArray[np.complex128]
 
 KIND = "sensed"
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
@@ -164,9 +160,6 @@ class Actuators:
         return np.where(self.widths > 0.0, self.widths, 0.5 / len(self.centres))
 
 
-_FIELDS = [own.name for own in fields(SpectralModel)]
-
-
 @dataclass(frozen=True, eq=False)
 class SensedModel(SpectralModel):
     """The equation on a grid of which every so many points are sensors, n_y in all.
@@ -209,14 +202,13 @@ class SensedModel(SpectralModel):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
         own = shaped(arrays, cls.OWN)
         own["shared"] = checked_array(arrays, "shared", "f", (unknowns(whole.n_a),))
-        known = {name: getattr(whole, name) for name in _FIELDS}
         size = (whole.n_a,)
         where = {name: checked_array(arrays, name, "f", size) for name in ("centres", "widths")}
         if (where["widths"] < 0.0).any():
             raise ValueError(
                 f"a model has actuators of the width {where['widths'].min():g}; expected at least 0"
             )
-        return SensedModel(**known, **own, actuators=Actuators(**where))
+        return SensedModel(**vars(whole), **own, actuators=Actuators(**where))
 
 
 def sensed_model(

@@ -96,11 +96,6 @@ class SpectralModel(StoredModel):
     coefficients: Array | None = None
 
     @property
-    def degree(self) -> int:
-        """P."""
-        return int(self.polynomials.shape[1]) + 1
-
-    @property
     def symbols(self) -> Spectrum:
         """sigma_p = L for p = 1 and sum_q m_q C_qp for the powers above, (P, n_z // 2 + 1)."""
         return np.vstack([self.linear, self.polynomials.T @ self.multipliers])
@@ -165,8 +160,9 @@ class SpectralModel(StoredModel):
         checked_substeps(model.substeps)
         if len(model.linear) != model.n_z // 2 + 1:
             raise ValueError(f"a model of {model.n_z} points has {len(model.linear)} wavenumbers")
-        if model.coefficients is not None and model.coefficients.shape[1] != model.degree:
-            raise ValueError(f"a model of degree {model.degree} has other coefficients of x")
+        degree = model.polynomials.shape[1] + 1
+        if model.coefficients is not None and model.coefficients.shape[1] != degree:
+            raise ValueError(f"a model of degree {degree} has other coefficients of x")
         if ((model.fewer[:, 1] < 1) | (model.fewer[:, 1] > model.substeps)).any():
             raise ValueError(
                 f"a model has other than 1 to {model.substeps} internal steps for some fields"
@@ -253,17 +249,11 @@ class Regression:
         found: Spectrum = least_squares(self.common, left) / self.phi
         return found
 
-    @property
-    def k(self) -> Spectrum:
-        """ik, in units of the highest wavenumber."""
-        modes = self.symbols.shape[1]
-        wavenumbers: Spectrum = 1j * np.arange(modes) / modes
-        return wavenumbers
-
 
 def polynomial(data: Regression, form: Form, turn: int) -> Symbols:
     """Polynomials of ik."""
-    k = data.k
+    modes = data.symbols.shape[1]
+    k: Spectrum = 1j * np.arange(modes) / modes  # in units of the highest wavenumber
     compared = min(form.compared(len(k), turn), data.y.shape[1])
     low = slice(compared)
     rests = [data.rest(W[:, low]) for W in data.W]

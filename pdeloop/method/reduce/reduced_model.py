@@ -450,7 +450,9 @@ def leading_modes(after: Array, n_s: int, channels: Channels = NUMBERED) -> tupl
             f"n_s must be at most the numerical rank of the states, {rank}, but n_s is {n_s}"
             f"{': ' if reasons else ''}{', '.join(reasons)}; lower n_s or excite more."
         )
-    return _unique_signs(left[:, :n_s]), values
+    columns = left[:, :n_s]
+    largest = columns[np.argmax(np.abs(columns), axis=0), np.arange(n_s)]
+    return columns * np.where(largest < 0.0, -1.0, 1.0), values
 
 
 def _matrix(name: str, values: ArrayLike) -> Array:
@@ -473,9 +475,3 @@ def numerical_rank(singular_values: Array, rows: int, columns: int) -> int:
     """Number of singular values of a matrix above the rounding errors of the largest."""
     threshold = max(rows, columns) * np.finfo(np.float64).eps * singular_values[0]
     return int(np.count_nonzero(singular_values > threshold))
-
-
-def _unique_signs(columns: Array) -> Array:
-    largest = np.argmax(np.abs(columns), axis=0)
-    signs = np.where(columns[largest, np.arange(columns.shape[1])] < 0.0, -1.0, 1.0)
-    return columns * signs

@@ -31,7 +31,7 @@ and one outside of the basis is left out."""
 
 
 def factored(states: Array) -> tuple[Array, Array]:
-    """C (N, r) and orthonormal rows V (r, n_z) with states (N, n_z) = C V, strongest direction first."""
+    """C (N, r) and orthonormal rows V (r, n_z) with states (N, n_z) = C V, strongest first."""
     with one_thread():  # a threaded LAPACK rounds differently
         left, values, right = linalg.svd(states, full_matrices=False)
     kept = max(int(np.count_nonzero(values > ROUNDED * linalg.norm(values))), 1)
