@@ -110,16 +110,13 @@ def well_posed(shared: Array) -> Array:
     return found
 
 
-KIND = "sensed"
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
-# The size of the field that does so above the third power.
-_SIZE = 4.0
+_SIZE = 4.0  # of the field, above the third power
 WAVES = 16
 """Cosines and sines of an initial field, in addition to its mean."""
-# The least number of grid points.
-_POINTS = 64
+_POINTS = 64  # of the grid, at least
 
 
 def grid_points(sensors: int) -> int:
@@ -233,7 +230,7 @@ def sensed_model(
         fewer = np.column_stack([fewer[:, 0], fewer[:, 1] + more[:-1]])
         fewer = fewer[fewer[:, 1] < substeps]
     return SensedModel(
-        KIND,
+        SensedModel.FORM,
         symbols[0],
         symbols[1:],
         np.eye(len(symbols) - 1),
