@@ -34,7 +34,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.parameters import INSTRUMENTS
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.seeds import Purpose, derive
 from pdeloop.process.one_thread import one_thread
 
@@ -134,7 +134,7 @@ def best_law(
     """
     few = fields[: -(-len(fields) // 4)]
     coarse, fine = (
-        ImprovementSettings(iterations=ITERATIONS, least_gain=gain)
+        ModelBasedSettings(iterations=ITERATIONS, least_gain=gain)
         for gain in (COARSER * tolerance, tolerance)
     )
     zero = grown = np.zeros_like(first)
@@ -148,7 +148,7 @@ def best_law(
 
 
 def descended(
-    loop: ClosedLoop, theta: Array, fields: Array, settings: ImprovementSettings
+    loop: ClosedLoop, theta: Array, fields: Array, settings: ModelBasedSettings
 ) -> Array:
     """The law after repeated descents, each in the coordinates of where the last one ended."""
     even, curvature = np.full(len(fields), 1.0 / len(fields)), curvature_of(loop)

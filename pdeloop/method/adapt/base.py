@@ -94,20 +94,10 @@ class RolloutResult:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A rollout that was measured, with its trajectory.
+    """A rollout that was measured: its theta, and its mean stage cost, infinite if it diverged.
 
-    Attributes
-    ----------
-    policy : array
-        Theta, of the shape of the optimiser's.
-    cost : float
-        Mean stage cost; infinite if it diverged.
-    states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
-        What can be learned from: all of the episode, or its samples before it ran away.
-    stamp : int
-        Its number among the rollouts of the optimiser, from 0; -1: from before the optimisation.
-    field_seed : int
-        Seed of its initial field; -1: not known.
+    states (L + 1, n_z) or (L, n_z), actions (L, n_a): all of the episode, or before it ran away; stamp:
+    its number among the rollouts of the optimiser; -1: from before; field_seed: -1: not known.
     """
 
     policy: Array
@@ -147,16 +137,12 @@ class Context:
 
     Attributes
     ----------
-    U : (n_z, n_s) array
-        Basis of the projected state.
-    target : (n_z,) array
-        z_r.
-    state_weight, action_weight : float
-        Q = state_weight I, R = action_weight I.
-    horizon : int
-        T, the steps of an episode.
-    exploration : Trajectory
-        The exploratory trajectory that the reduced model was identified from.
+    U, target : (n_z, n_s) and (n_z,) arrays
+        Basis of the projected state, and z_r.
+    state_weight, action_weight, horizon : float, float, int
+        Q = state_weight I, R = action_weight I, and T, the steps of an episode.
+    exploration, further : Trajectory and sequence of it
+        That of the reduced model, and others, from other initial fields.
     measured : sequence of Record
         Rollouts from before the optimisation: those that checked the first law, and no control.
     action_set : ActionSet
@@ -166,18 +152,12 @@ class Context:
     sensors : int
         n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
         consist; 0: the states are whole.
-    actuator_positions : sequence of float
-        Centres of the actuators as shares of the domain; none: equally spaced.
-    actuator_widths : sequence of float
-        Width of each as a share of the domain; none: not declared.
-    periodic : bool
-        Whether the states are fields on one periodic axis, which models of the whole field assume.
-    line : bool
-        Whether they are fields on one axis, or plain vectors.
+    actuator_positions, actuator_widths : sequences of float
+        Shares of the domain; none: equally spaced, and not declared.
+    periodic, line : bool
+        Whether the states are fields on one periodic axis; fields on one axis, or plain vectors.
     shape : tuple of int
         Points of each axis, where they are fields on several; none: they are not.
-    further : sequence of Trajectory
-        Other explorations, from other initial fields.
     cost : Cost or None
         The whole cost, where the weights and the target do not say it.
     law : Law, optional

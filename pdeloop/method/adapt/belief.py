@@ -28,19 +28,10 @@ _NUMBERS = {"error": "f", "whole": "b"}
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A model of the plant.
+    """A model of the plant, and its E on rollouts that it was not fitted to.
 
-    Attributes
-    ----------
-    model : FieldModel
-    error : float
-        E on rollouts that it was not fitted to.
-    whole : bool
-        False: it predicts pieces of rollouts, of a chaotic plant, to E.
-    noise : float
-        Measurement noise that it was fitted for in place of the declared one; 0: there is none.
-    accepted : bool
-        True if laws are improved on it.
+    whole: False where it predicts only pieces of rollouts, of a chaotic plant; noise: that it was
+    fitted for in place of the declared one, or 0; accepted: whether laws are improved on it.
     """
 
     model: FieldModel
@@ -102,11 +93,9 @@ class Belief:
 def believe(
     context: Context, records: Sequence[Record], accepted: float, first: str = ""
 ) -> Belief | None:
-    """The model that predicts the rollouts, as `Selection` says; None where none can be fitted.
+    """The model that predicts explorations and rollouts, as `Selection` says; None: none can be fitted.
 
-    records: explorations, whose policy is zero and whose cost is infinite, and rollouts of laws;
-    accepted: largest E of a model that is accepted without noise; first: the kind that is tried first,
-    the one selected before; empty: none.
+    accepted: largest E without noise; first: the kind that is tried first, if any.
     """
     if context.of_readings:
         return _of_readings(context, records)

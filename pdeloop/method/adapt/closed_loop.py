@@ -51,18 +51,10 @@ LARGEST = 512
 class ClosedLoop:
     """A model of the plant under laws a = K_a U^T z + b, and their cost on it.
 
-    A class derived from it says how a law remembers, or what of a model's state is seen.
-
-    Attributes
-    ----------
-    U, target, state_weight, action_weight, horizon, action_set, cost
-        As of a `Context`.
-    model : FieldModel
-    noise : float
-        Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
-        is the same in every simulation of as many fields.
-    reach : float
-        Magnitude of a state beyond which a simulation counts as not finite.
+    The other arguments are those of a `Context`; noise: on every number of the state that the law sees,
+    the same in every simulation of as many fields; reach: magnitude of a state beyond which a
+    simulation counts as not finite. A derived class says how a law remembers, or what of a model's
+    state is seen.
     """
 
     U: Array
@@ -117,10 +109,9 @@ class ClosedLoop:
         return np.stack([record.states[0] for record in records])
 
     def replays_of(self, records: Sequence[Record]) -> Array:
-        """Initial fields with which a simulation repeats measured rollouts under their own laws.
+        """Rows [z_0, e_0, .., e_{T-1}], (n, n_z (T + 1)), that repeat rollouts under their laws.
 
-        Rows [z_0, e_0, .., e_{T-1}], (n, n_z (T + 1)), with e_k = z_{k+1} - f(z_k, a_k); 0 where
-        nothing was measured, or the model is not finite.
+        e_k = z_{k+1} - f(z_k, a_k); 0 where nothing was measured, or the model is not finite.
         """
         found = np.zeros((len(records), self.horizon + 1, self.model.n_z))
         for row, record in zip(found, records, strict=True):
@@ -174,10 +165,7 @@ class ClosedLoop:
         return Simulation(states[..., :n_z], actions, costs, features)
 
     def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
-        """The weighted sum of the costs, and its gradient, of the shape of theta.
-
-        Infinite, with a gradient of zero, where a cost of positive weight is.
-        """
+        """The weighted sum of the costs, and its gradient by theta; infinite and 0 where a cost is."""
         fields, weights = fields[weights > 0.0], weights[weights > 0.0]
         costs, g, features = self.slopes(theta, fields)
         if not (np.isfinite(costs).all() and np.isfinite(g).all()):
@@ -190,11 +178,9 @@ class ClosedLoop:
     def slopes(
         self, theta: Array, fields: Array, added: Array | float = 0.0
     ) -> tuple[Array, Array, Array]:
-        """J from each of the fields, (F,), and its slopes by what is added to the law's outputs [r; u].
+        """J (F,), its slopes by what is added to the law's outputs [r; u], and [s; p] of each step.
 
-        And [s; p] of each step, (F, T, n_s + n_p). What is not finite is NaN or infinite.
-
-        added: (F, T, n_a + n_p).
+        The latter are (F, T, n_a + n_p) and (F, T, n_s + n_p), and may be NaN or infinite.
         """
         offsets, n_f = self._offsets(fields), theta.shape[1] - self.constants
         begin, v, K, b, e = self._rolled(theta, fields, offsets)
@@ -277,10 +263,9 @@ class ClosedLoop:
         return np.concatenate([s if offsets is None else s + offsets, states[:, :-1, n_z:]], axis=2)
 
     def unsaturated(self, theta: Array, fields: Array, weights: Array) -> Array:
-        """The law with less excess where an action is at a bound from all fields, nearly the same one.
+        """The law without the mean excess over a bound that an action is at from all fields.
 
-        There the cost does not depend on theta. The mean excess over the bound is taken from the
-        constants, so that actions are on both sides of it.
+        There the cost does not depend on theta; then actions are on both sides of the bound.
         """
         simulation, n_a = self.simulate(theta, fields), self.model.n_a
         n_f = theta.shape[1] - self.constants
@@ -297,10 +282,7 @@ class ClosedLoop:
         return changed
 
     def designed(self) -> Array | None:
-        """The LQ-tracking law of the model linearised at the target, as far as U knows the state.
-
-        None for a law with memory, and where the model has none.
-        """
+        """The LQ-tracking law of the model linearised at the target; None where there is none."""
         cost, model = self.stage, self.model
         if len(self.memory_input) or model.n_z != len(self.U) or model.n_z > LARGEST:
             return None
@@ -375,10 +357,9 @@ def _of(rows: Array | None, some: Any) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """States (T + 1, F, n_z), actions (T, F, n_a), mean stage costs (F,) and features (T, F, n_f).
+    """States (T + 1, F, n_z), actions (T, F, n_a), costs (F,) and features [s_k; p_k; 1], (T, F, n_f).
 
-    The features are what the law was of, [s_k; p_k; 1]. From where a field's simulation is not finite
-    its states, its actions and what the law knew of it are zero.
+    From where a field's simulation is not finite, all of it but the cost is zero.
     """
 
     states: Array
@@ -402,12 +383,9 @@ ROUND = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop(ClosedLoop):
-    """A model under laws whose constants, and memory where they have one, are parts of their own.
+    """A model under a law whose constants, and memory where it has one, are parts of its own.
 
-    Attributes
-    ----------
-    law : Linear
-        That of the reduced model; policies are its theta, and theta here is Theta.
+    Policies are the law's theta, and theta here is Theta.
     """
 
     law: Linear = field(kw_only=True)
@@ -447,10 +425,7 @@ class LinearLoop(ClosedLoop):
         return self.law.model.B[: self.law.memory_size]
 
     def curvature(self, own: Array) -> Array:
-        """Cost matrix of a change of [a; u], from that of an action alone, (n_a, n_a).
-
-        A prediction that is wrong by one moves the action by K.
-        """
+        """Of a change of [a; u]: a prediction that is wrong by one moves the action by K."""
         if not self.law.remembers:
             return own
         K = self.law.model.K_a

@@ -30,15 +30,7 @@ from pdeloop.messages.arrays import Array
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimated difference or mean.
-
-    Attributes
-    ----------
-    value, error : float
-        The estimate and its standard error.
-    degrees : float
-        Degrees of freedom of the error; they do not matter where it is 0.
-    """
+    """An estimated difference or mean, its standard error, and the degrees of freedom of that."""
 
     value: float = 0.0
     error: float = 0.0
@@ -62,11 +54,7 @@ class Estimate:
         return self + Estimate(-other.value, other.error, other.degrees)
 
     def is_negative(self, confidence: float, times: float = 1.0) -> bool:
-        """True if the value is below zero by more than chance.
-
-        confidence: the level, as the standard errors of a normal distribution; times: by how many times
-        as much.
-        """
+        """True if it is below 0 by `times` as much as chance: `confidence` exact standard errors."""
         return self.value + times * errors_for(confidence, self.degrees) * self.error < 0.0
 
 
@@ -120,10 +108,7 @@ def mean_difference(own: Array, before: Array, others: Array) -> Estimate:
 
 
 def mean_change(costs: Array, before: Array) -> Estimate:
-    """The mean change of the costs, with the costs before as control variate.
-
-    The error is that of the ratio of their means, times the mean before: 0 where each falls by the same
-    share.
+    """The mean change of the costs; the error is that of the ratio of means, times the mean before.
 
     >>> mean_change(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
     Estimate(value=-1.5, error=0.0, degrees=1.0)

@@ -24,7 +24,7 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import LARGEST, ClosedLoop
-from pdeloop.method.adapt.settings import ImprovementSettings
+from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import action_curvature
 
 _MEMORY = 40
@@ -59,16 +59,15 @@ def improve(
     fields: Array,
     weights: Array,
     curvature: Array,
-    settings: ImprovementSettings,
+    settings: ModelBasedSettings,
     least_gain: float | None = None,
     trust: float = 0.0,
 ) -> Improvement | None:
     """The law after a descent, or None where no law to begin with is finite on the model.
 
-    theta: the law to begin with, which is halved where it is not finite from any field; fields (F, n_z)
-    and weights: initial fields, of which those from which it is not finite are left out; curvature: G;
-    least_gain: in place of that of the settings; trust: weight of the added cost |x - x_0|^2, with x_0
-    the initial law: for a linear plant the step is 1/(1 + trust) of the whole one.
+    theta is halved where it is not finite from any field (F, n_z), and single such fields are left out;
+    curvature: G; trust: weight of the added cost |x - x_0|^2: for a linear plant the step is
+    1/(1 + trust) of the whole one.
     """
     for _ in range(_HALVINGS + 1):
         simulation = loop.simulate(theta, fields)

@@ -117,8 +117,7 @@ class InCoordinates(Optimizer):
 class CostInCoordinates(Cost):
     """A cost of whole states z = W x, of their coordinates x.
 
-    |E W x - w_k|^2 = |R x - Q^T w_k|^2 + |w_k - Q Q^T w_k|^2 with E W = Q R, which is made again
-    when W has grown.
+    |E W x - w_k|^2 = |R x - Q^T w_k|^2 + |w_k - Q Q^T w_k|^2 with E W = Q R, made again as W grows.
     """
 
     def __init__(self, whole: Cost, basis: SnapshotBasis) -> None:

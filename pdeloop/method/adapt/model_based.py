@@ -106,10 +106,7 @@ _MIXTURE_STREAM = 0x4D4958  # "MIX"
 
 
 class ModelBased(Optimizer):
-    """Policy optimisation on a model of the whole field; parameters as of `Optimizer`.
-
-    The budget is without the rollouts that the context has already.
-    """
+    """Policy optimisation on a model; parameters as of `Optimizer`, its context with trajectories."""
 
     name = "model_based"
     Settings = ModelBasedSettings
@@ -252,10 +249,10 @@ class ModelBased(Optimizer):
         return [self._rollout(law, own + i) for i, law in enumerate(laws)]
 
     def _on_known_fields(self) -> list[Rollout]:
-        """Rollouts of a step along measured ones, on fields of the first law.
+        """Rollouts of a step along measured ones, on fields of the first law, and once of no control.
 
-        No control follows once, and the final law comes to fresh fields together with the first one, or
-        with no control where all rollouts of that diverged.
+        The final law comes to fresh fields together with the first one, or with no control if that is
+        lost.
         """
         progress, judging = self._progress, self._schedule.judging
         known = list(costs_by_field(self._records.all(), self._first))
@@ -451,10 +448,7 @@ class ModelBased(Optimizer):
     _unpredicted = "no model of the whole field predicts the rollouts"
 
     def _replay(self, model: Belief | None, row: Row, final: bool, why: str = "") -> None:
-        """A step along measured rollouts from the law that is best on fields of the first one.
-
-        why: no law is improved on a model; default: none predicts the rollouts.
-        """
+        """A step along measured rollouts from the law that is best on fields of the first one."""
         why = why or self._unpredicted
         progress, records = self._progress, self._records.all()
         best = best_on_same_fields(records, self._first)
@@ -487,10 +481,7 @@ class ModelBased(Optimizer):
             progress.policy, row["steps"] = found
 
     def _designed_again(self, best: Array) -> Array | None:
-        """A first law of all that was measured, where the first one diverged and none is better.
-
-        While each of them costs less than the one before.
-        """
+        """A first law of all that was measured, while each one diverged or cost less than the last."""
         laws = by_law(self._records.all())
         own = [rolled for rolled in laws if not np.array_equal(rolled[0].policy, self._none)]
         costs = [float(np.mean([record.cost for record in rolled])) for rolled in own]
@@ -574,10 +565,7 @@ class ModelBased(Optimizer):
     """Whether laws of earlier rollouts are compared on the model as well."""
 
     def _look_back(self, row: Row, laws: Mapping[str, Array], base: str) -> None:
-        """Return another measured law in place of the chosen one where it is better beyond chance.
-
-        laws: that were compared, that to stay with as `base`.
-        """
+        """Return another measured law in place of the chosen one where it is better beyond chance."""
         progress, loop, known = self._progress, None, self._rollouts()
         if progress.belief is not None and self._model_compares and not progress.replayed:
             loop = progress.belief.loop(self._context)

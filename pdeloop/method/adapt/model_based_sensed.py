@@ -184,10 +184,7 @@ class ModelBasedSensed(ModelBasedReadings):
         return own // self._settings.judging < _ATTEMPTS
 
     def _believe(self) -> Belief | None:
-        """In an equation where one reproduces the readings, else in a model of the readings.
-
-        More rollouts may determine one that the first ones did not.
-        """
+        """In an equation where one reproduces the readings, else in a model of the readings."""
         measured, model = self._measurements(), self._sensed
         if model is not None or self._attempts_left(self._records.count):
             found = sensed_from(self._context, measured, model)
@@ -343,9 +340,6 @@ def _observers(
 
 
 def gained(costs: Array, base: Array) -> Estimate:
-    """The mean change against the costs of another law, where both are finite.
-
-    NaN where neither ever is.
-    """
+    """The mean change against the costs of another law, where both are finite; NaN where none is."""
     known = np.isfinite(costs) & np.isfinite(base)
     return mean_of(costs[known] - base[known]) if known.any() else Estimate(np.nan, np.nan)

@@ -165,10 +165,7 @@ class Whitened:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """The coordinates in which it is trained; K, b and E as above, b (n, n_a) with one row or T.
-
-    r: of b where it has rows for steps, else None.
-    """
+    """The coordinates in which it is trained; b (n, n_a) with one row, or T and coordinates r."""
 
     U: Array
     K: Array
@@ -242,9 +239,8 @@ class Network:
 class NetworkTraining:
     """The training of a network on the model of plans.
 
-    planner: has model, cost, admissible actions, V, and the plans to imitate; fields (n, n_z): measured
-    initial ones, of whose distribution further ones are drawn (`mixtures`); noise: standard deviation
-    of that on every number of a state that the law sees.
+    fields (n, n_z): measured initial ones, of whose distribution further ones are drawn; noise: on
+    every number of a state that the law sees.
     """
 
     def __init__(
@@ -356,10 +352,7 @@ class NetworkTraining:
         return best
 
     def gradient(self, numbers: Array, z: Array, k: int) -> tuple[float, Array]:
-        """Mean over states (M, n_z) of step k of the cost of the next steps, and its derivative.
-
-        Rows that are not finite do not count.
-        """
+        """Mean over states (M, n_z) of step k of the cost of the next steps, and its derivative."""
         planner, network, H = self._planner, self._network, self._part
         parts, tape = network.parts(numbers), list[tuple[Array, Array, Array]]()
 

@@ -40,34 +40,14 @@ _NUMBERS = {
 class Progress:
     """State of an optimisation that changes over time, apart from its rollouts.
 
-    Attributes
-    ----------
-    policy : array
-        The present law, and at the end the chosen one.
-    stage : str
-        One of `renewing`, `judging`, `ended`.
-    tells : int
-        Number of calls of `tell`.
-    belief : Belief or None
-        The model that the law was improved on last.
-    improved : array or None
-        The law after the last descent, with which the next one begins.
-    parts : list of arrays
-        The same for each part of the fields, from the other parts.
-    change : Estimate
-        What it then cost more than the first one on fields that did not make it.
-    replayed : bool
-        True if the law was last improved along measured rollouts, as no model predicts them.
-    trust : float
-        Weight of the distance from a law in such a step; 0: the law was last improved on a model.
-    none_is_close : bool
-        True if no control is judged as well.
-    safe : bool
-        True if the first law is better than no control on the model.
-    noise : float
-        Measurement noise that was found in place of the declared one; 0: none was.
-    rested : int
-        Rollouts after which laws about the target took the place of improved ones; 0: they did not.
+    policy: the present law, and at the end the chosen one; belief: the model that it was improved on
+    last; improved, parts: the law after the last descent, and that of each part of the fields from the
+    other parts, with which the next descents begin; change: what it cost more than the first one on
+    fields that did not make it; replayed: whether it was last improved along measured rollouts, and
+    trust: the weight of the distance from a law in such a step; none_is_close: whether no control is
+    judged as well; safe: whether the first law is better than no control on the model; noise: what was
+    found in place of the declared one, or 0; rested: rollouts after which laws about the target began,
+    or 0.
     """
 
     policy: Array
@@ -124,10 +104,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Schedule:
-    """When a law is renewed, in rollouts of the optimiser itself.
-
-    known: rollouts that were measured before; budget: rollouts in all, without those.
-    """
+    """When a law is renewed, in own rollouts; known: those before; budget: all without those."""
 
     known: int
     budget: int

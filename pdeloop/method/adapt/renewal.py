@@ -51,7 +51,7 @@ from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change
 from pdeloop.method.adapt.improve import Improvement, cheapest, curvature_of, improve
-from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ImprovementSettings
+from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ModelBasedSettings
 
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
@@ -77,9 +77,8 @@ _MOVED, _CHANGED = 1e-2, 4.5e-2
 class Renewal:
     """A law made on a model: the fraction of the way from the first one to the improved one.
 
-    improved: the law after the descent, with which the next one begins; parts: the laws that each part
-    of the fields did not make; change: the mean change of the cost against the first law on fields that
-    were left out, 0 where the law is that; steps: of L-BFGS, all together.
+    parts: the laws that each part of the fields did not make; change: of the cost against the first law
+    on fields that were left out; steps: of L-BFGS.
     """
 
     theta: Array
@@ -97,21 +96,17 @@ def renew(
     parts: Sequence[Array],
     fields: Array,
     rng: np.random.Generator,
-    settings: ImprovementSettings,
+    settings: ModelBasedSettings,
     *,
     components: int = 1,
     periodic: bool = True,
     final: bool = True,
 ) -> Renewal | None:
-    """The law of least cost on the model, moved only as far as held-out fields confirm.
+    """The law of least cost on the model, moved as far as held-out fields confirm; None: not finite.
 
-    None where no law is finite on the model.
-
-    first, improved: the law that the optimisation began with, and the one after the last descent;
-    parts: the latter for each part of the fields, none: the first law; fields (n, n_z): measured
-    initial ones, field i of part i modulo the number of parts, whatever comes later, so that no law of
-    a part ever sees its fields; rng, components, periodic: as for `mixtures`; final: whether it is the
-    last one: others end sooner, on fewer fields that are drawn.
+    improved, parts: the laws after the last descents; fields (n, n_z): measured initial ones, field i
+    of part i modulo the number of parts, whatever comes later, so that no law of a part ever sees its
+    fields; final: others end sooner, on fewer fields that are drawn.
     """
     least_gain = settings.least_gain if final else FIRST_GAIN
     curvature, designed = curvature_of(loop), loop.designed()
@@ -173,7 +168,7 @@ def renew(
 
 
 def is_overfitted(
-    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ImprovementSettings
+    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ModelBasedSettings
 ) -> bool:
     """True if fields that were left out confirm too little of what a law gains on its own."""
     gain = _own_gain(loop, first, found, fields, settings)
@@ -181,7 +176,7 @@ def is_overfitted(
 
 
 def _own_gain(
-    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ImprovementSettings
+    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ModelBasedSettings
 ) -> float:
     """By how much the law after the descent is better than the first; 0 where it is hardly better."""
     before, after = loop.costs(first, fields), loop.costs(found.improved, fields)
@@ -198,17 +193,11 @@ def renew_from_states(
     improved: Array,
     records: Sequence[Record],
     rng: np.random.Generator,
-    settings: ImprovementSettings,
+    settings: ModelBasedSettings,
     *,
     final: bool = True,
 ) -> Renewal | None:
-    """As `renew`, of a chaotic plant, from measured states: more where few leave the gain in doubt.
-
-    Costs differ so much from state to state that a law made from a few is hardly better from others.
-    Where it is, the plant is only unstable, and more states would make the same law.
-
-    records: all rollouts, denoised.
-    """
+    """As `renew`, of a chaotic plant, from measured states: more where few leave a doubt."""
     settings, found = replace(settings, mixtures=0, most_mixtures=0), None
     for count in (CHAOTIC_FIELDS, _CHAOTIC_MOST):
         fields = measured_states(records, count)
@@ -227,18 +216,15 @@ def held_out_fraction(
     first: Array,
     parts: Sequence[Array],
     fields: Array,
-    settings: ImprovementSettings,
+    settings: ModelBasedSettings,
 ) -> tuple[float, Estimate]:
-    """The fraction of the way from the first law, and `change` of a `Renewal`; parts: as below."""
+    """The fraction of the way from the first law, and `change` of a `Renewal`."""
     i, change = choose_fraction(left_out_costs(loop, first, parts, fields), settings.confidence)
     return i / FRACTIONS, change
 
 
 def left_out_costs(loop: ClosedLoop, first: Array, parts: Sequence[Array], fields: Array) -> Array:
-    """What each fraction of the way costs from each field that was left out, (`FRACTIONS` + 1, n).
-
-    parts: for each part of the fields the law that the others made.
-    """
+    """What each fraction of the way costs from each field that was left out, (`FRACTIONS` + 1, n)."""
     shares = np.linspace(0.0, 1.0, FRACTIONS + 1)
     costs = np.full((len(shares), len(fields)), np.inf)
     for part, law in enumerate(parts):
@@ -270,10 +256,7 @@ def initial_fields(records: Sequence[Record]) -> Array:
 
 
 def begin_alike(records: Sequence[Record]) -> bool:
-    """True if initial fields differ by little of how far states move from them.
-
-    In the coordinates of a basis that grows (`in_coordinates`) one field is nearly the same each time.
-    """
+    """True if initial fields differ by little of how far states move from them."""
     fields = np.stack([record.states[0] for record in records])
     moved = max(float(np.abs(record.states - record.states[0]).max()) for record in records)
     return bool(np.abs(fields - fields[0]).max() <= ALIKE * moved)
@@ -302,11 +285,8 @@ def is_chaotic(loop: ClosedLoop, fields: Array) -> bool:
 def any_state_serves(loop: ClosedLoop, law: Array, fields: Array, states: Array) -> bool:
     """True if measured states may take the place of initial fields: the plant is chaotic.
 
-    One that runs away is as sensitive to where it begins, but then states that were measured late are
-    not where episodes lead that a law controls: on the model it diverges under the law from more of
-    them than of the fields. A chaotic one stays where it is.
-
-    law: that episodes are to stay near to.
+    One that runs away is as sensitive to where it begins, but diverges under the law from more of the
+    late states than of the fields.
     """
     if not is_chaotic(loop, fields):
         return False
@@ -324,10 +304,7 @@ def mixtures(
 ) -> Array:
     """Draws (at most `most`, n_z) of the distribution above; none from fewer than two fields.
 
-    Two more than twice as many as there are directions are enough.
-
-    components: number of fields in a state, stored one after the other; periodic: whether they are on a
-    ring; else rho is 0.
+    components: fields in a state, one after the other; periodic: on a ring, else rho is 0.
     """
     n, n_z = fields.shape
     mean = fields.mean(axis=0)

@@ -36,7 +36,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.settings import FIRST_GAIN, ImprovementSettings
+from pdeloop.method.adapt.settings import FIRST_GAIN, ModelBasedSettings
 from pdeloop.method.design.lqt import Gains, track
 from pdeloop.method.models.base import Measured, Samples
 from pdeloop.method.models.selection import limited
@@ -62,8 +62,7 @@ def best_measured(records: Sequence[Record], first: Array) -> Array:
 def best_on_same_fields(records: Sequence[Record], first: Array) -> Array:
     """The law that costs least relative to the first one on the fields of both.
 
-    A law that diverged where the first one did not is no candidate; where the first one diverged and
-    others did not, the cheapest of these is better.
+    Not one that diverged where the first one did not; where only that diverged, the cheapest.
     """
     base = costs_by_field(records, first)
     best, least, cheapest = first, 0.0, np.inf
@@ -95,15 +94,10 @@ def step(
     loop: ClosedLoop,
     fields: Array,
     law: Array,
-    settings: ImprovementSettings,
+    settings: ModelBasedSettings,
     trust: float,
 ) -> tuple[Array, int] | None:
-    """The law after a step on replayed rollouts, and how many of L-BFGS that took.
-
-    None where it is not finite on the model.
-
-    fields: of `ClosedLoop.replays_of`; trust: weight of the distance from the law to begin with.
-    """
+    """The law after a step on replayed rollouts, and its steps of L-BFGS; None if it is not finite."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
         loop,
@@ -123,10 +117,9 @@ _LINEAR_RIDGE, _PRODUCT_RIDGE = 1e-7, 1e-4
 
 
 def law_about_target(context: Context, records: Sequence[Record]) -> Array | None:
-    """[K, -K] of the law above, (n_a, 2 n_s), from measured rollouts and explorations.
+    """[K, -K] of the law above, (n_a, 2 n_s), from all that was measured.
 
-    None where the target moves, needs an action or is not of the whole state, the samples are fewer
-    than the unknowns, or no law stabilises A.
+    None where the target moves, needs an action or is not of the whole state, or no law is found.
     """
     cost, W = context.cost, context.weights
     if cost is not None and (cost.target.ndim > 1 or cost.action_target.any()):
@@ -138,11 +131,7 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
 
 
 def designed_again(context: Context, records: Sequence[Record]) -> Array | None:
-    """[K_a K_b] of LQ tracking on x' = A x + B a + d, by regression of all that was measured.
-
-    After explorations that hardly move a plant, as with a dead zone, a first law diverges;
-    what that does tells more. None where no law stabilises A.
-    """
+    """[K_a K_b] of LQ tracking on x' = A x + B a + d, by regression of all that was measured."""
     gains = _tracking(context, records, products=False)
     if gains is None:
         return None

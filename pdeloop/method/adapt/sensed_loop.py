@@ -164,10 +164,7 @@ class SensedLoop(LinearLoop):
 
 
 def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:
-    """Mean of (z - z_r)^2 from the cost of a rollout; NaN where it has none, as after an exploration.
-
-    state_weight: what a sensor counts.
-    """
+    """Mean of (z - z_r)^2 from the cost of a rollout; NaN: unknown; state_weight: of a sensor."""
     if not record.usable or len(record.actions) != horizon:
         return np.nan
     acting = action_weight * float(np.sum(record.actions**2)) / horizon
@@ -176,19 +173,13 @@ def distance(record: Record, state_weight: float, action_weight: float, horizon:
 
 
 def can_be_sensed(context: Context) -> bool:
-    """True if the states are one reading of each of a few sensors of one component on a ring.
-
-    And if the cost is that of q and r.
-    """
+    """True if states are one reading of each of a few sensors on a ring, and the cost of q and r."""
     alone = 0 < context.sensors == len(context.target) <= SENSED_MOST
     return alone and context.periodic and context.cost is None
 
 
 def to_be_fitted(context: Context, records: Sequence[Record]) -> list[Record]:
-    """The newest whole rollouts, each once, and none whose readings went far away.
-
-    The first of the records is an exploration.
-    """
+    """The newest whole rollouts, each once, and none whose readings went far away."""
     largest_cost = _LARGEST_COST * context.cost_of(records[0])
     whole = {
         record.states.tobytes(): record
@@ -203,7 +194,7 @@ def sensed_from(
 ) -> tuple[SensedModel, float] | None:
     """The model that reproduces the newest rollouts, and its error; None if it does not.
 
-    before: the model of earlier rollouts, whose equation and spread the fit starts from.
+    before: that of earlier rollouts, from which the fit starts.
     """
     chosen = to_be_fitted(context, records)
     if not chosen:
@@ -275,10 +266,9 @@ def from_estimates(of_fields: Act, known: SensedFilter, sigma: float) -> Act:
 
 @dataclass(frozen=True, eq=False)
 class WholeFieldLaw:
-    """The best law found of the whole field on a model, theta = [K b].
+    """The best law of the whole field on a model, theta = [K b]; the modes V are U of the loop.
 
-    The U of the loop are the modes V; simulation: of this law, from the fields that have a finite cost,
-    and their weights; steps: of L-BFGS.
+    simulation, weights: from fields of finite cost; steps: of L-BFGS.
     """
 
     loop: ClosedLoop
@@ -326,8 +316,8 @@ def estimated_laws(
 ) -> tuple[list[Array], int]:
     """Theta of laws on the estimate, and the steps of L-BFGS; none if none is finite.
 
-    That of the whole field, and one that is optimised with noise on what it sees, so that it depends
-    less on what an estimate has wrong; each with filters that know the initial fields well, and less.
+    That of the whole field, and one that is optimised with noise on what it sees; each with filters
+    that know the initial fields well, and less.
     """
     model = loop.model
     whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
@@ -353,10 +343,7 @@ def estimated_laws(
 
 
 def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
-    """Standard deviation of a reading for a filter: noise, and what the model does not predict of it.
-
-    times: multiple of the latter.
-    """
+    """Standard deviation of a reading for a filter: noise, and so many times what is not predicted."""
     unpredicted = settings.filter_unpredicted * root_mean_square(model.spread)
     return float(np.hypot(model.noise, times * unpredicted))
 
@@ -366,9 +353,7 @@ def least_trusting(
 ) -> Array:
     """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
-    Plants in simulations follow the filter's equation, or ones like it: what trusts it looks too good.
-
-    best: the law on an estimate that is cheapest from these fields.
+    Simulated plants follow the filter's equation: what trusts it looks too good.
     """
     model = loop.model
     parts, costs = dict(law.parts(best)), loop.costs(best, fields)
@@ -387,8 +372,7 @@ def least_trusting(
 def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:
     """Mean and factor (`SensedFilter`) of the Fourier coefficients of these weighted fields.
 
-    independent: share of the standard deviation of each wave that its cosine and sine have in addition,
-    independently, as a few fields do not have all that others may.
+    independent: share of the standard deviation of each wave that its parts have besides.
     """
     x = coefficients_of(fields)
     mean = weights @ x

@@ -23,8 +23,8 @@ is 1/(1 + weight) of the full one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImprovementSettings(Settings):
-    """The constants of improving a law on a model, and of the verdict on it.
+class ModelBasedSettings(Settings):
+    """The constants of `model_based`.
 
     All are dimensionless: costs and gains are scaled by those of the initial law.
     """
@@ -77,12 +77,6 @@ class ImprovementSettings(Settings):
         0.0,
         10.0,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelBasedSettings(ImprovementSettings):
-    """The constants of `model_based`."""
-
     enough_fields: int = setting(
         48, "number of measured fields at which improvements stop", 2, 1_000_000
     )

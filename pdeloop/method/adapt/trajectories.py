@@ -93,13 +93,7 @@ def taken_record(
 
 
 class Records:
-    """The rollouts of an optimiser.
-
-    Parameters
-    ----------
-    limit : float
-        A diverged rollout counts until a state exceeds this magnitude.
-    """
+    """The rollouts of an optimiser; a diverged one counts until a state exceeds the limit."""
 
     def __init__(self, limit: float) -> None:
         self._limit = limit

@@ -60,16 +60,9 @@ ALL_AGREE = "which may be chance, but every estimate agrees"
 class Evidence:
     """Evidence for a law.
 
-    Attributes
-    ----------
-    change : Estimate
-        Its model cost against that of the law to stay with, in the mean over measured fields that did
-        not make it.
-    excess : (k,) array
-        Measured less model cost of its own rollouts; infinite where one diverged.
-    also : sequence of Estimate
-        What else is known of the same change, too uncertain or too much in favour of the law to decide
-        by itself.
+    change: its model cost against that of the law to stay with, over fields that did not make it;
+    excess: measured less model cost of its own rollouts, infinite where one diverged; also: what else
+    is known of the change, too uncertain or too much in favour of the law to decide by itself.
     """
 
     change: Estimate
@@ -100,9 +93,7 @@ class Verdict:
 def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
     """The law with the least cost, and `base` where the difference may be chance.
 
-    Where `base` is no control, another law is taken in spite of that if every estimate favours it.
-
-    confidence: standard errors by which another law has to be better, were they known exactly.
+    If that is no control, another law is taken in spite of that where every estimate favours it.
     """
     stays = Verdict(base, 0.0, 0.0, NO_OTHER)
     missed: list[str] = []
@@ -151,10 +142,7 @@ def size_of(law: str, change: Estimate, other: str) -> str:
 
 
 def beats_no_control(loop: ClosedLoop, first: Array, fields: Array) -> bool:
-    """True if a law is cheaper than no control on the model; where that says nothing, if it is another.
-
-    A first law that is not is nothing to stay near to.
-    """
+    """True if a law is cheaper than no control on the model; without finite costs, if it is another."""
     none = loop.no_control
     costs = np.array([loop.costs(theta, fields) for theta in (none, first)])
     if not np.isfinite(costs).any():
@@ -172,11 +160,8 @@ def evidence_of(
 ) -> dict[str, Evidence] | None:
     """The evidence of model and rollouts for the laws, except for `base` only if they were measured.
 
-    None where rollouts alone count: the model replays them, or knows nothing of one of the laws; or
-    where all rollouts of the law to stay with diverged, so that its model costs mean nothing.
-
-    base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
-    held_out: change of the adapted law on fields that did not make it.
+    None where rollouts alone count: the model replays them, or knows nothing of one of the laws, or all
+    rollouts of `base` diverged. held_out: change of the adapted law on fields that did not make it.
     """
     if loop.replays:
         return None
@@ -203,17 +188,7 @@ def evidence_of(
 
 @dataclass(frozen=True, eq=False)
 class Replays:
-    """Rollouts as a model replays them, under any law.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-        That of the model.
-    beginnings : array
-        Those of all rollouts.
-    error : float
-        E of the model, whose root is taken for the relative error of a cost.
-    """
+    """Rollouts as a model replays them, under any law; the root of its E is the error of a cost."""
 
     loop: ClosedLoop
     beginnings: Array
@@ -236,9 +211,9 @@ def evidence_of_rollouts(
 ) -> dict[str, Evidence]:
     """The evidence of rollouts alone, except for `base` only for laws that were measured.
 
-    It is the mean difference on the initial fields that a law and the base share if there are two or
-    more, else the difference of their means. Where the base has no finite cost, no control takes its
-    place, and without that 0. With replays, the difference in these counts if its error is smaller.
+    It is the mean difference on two or more shared initial fields, else that of the means, or with
+    replays that in these if its error is smaller. Where the base has no finite cost, no control takes
+    its place, and without that 0.
     """
     costs: dict[str, dict[int, float]] = {}
     for name, law in laws.items():
@@ -288,17 +263,9 @@ def cheaper_law(
     confidence: float,
     replays: Replays | None = None,
 ) -> tuple[Array, Estimate] | None:
-    """The measured law that beats the chosen one beyond chance.
+    """The measured law that beats the chosen one beyond chance, and its change against that.
 
-    The difference is that of rollouts, and on a model that of its costs corrected by rollouts, as in
-    `evidence_of`; the estimate with the smaller error counts. A law that was measured is so never lost
-    to one that a model promised more of.
-
-    loop: of the model, or none; fields: as for `evidence_of`; replays: as for `evidence_of_rollouts`.
-
-    Returns
-    -------
-    law, its change against the chosen one, or None
+    By rollouts, or on a model by its costs corrected by rollouts, whichever has the smaller error.
     """
     found: tuple[Array, Estimate] | None = None
     for law in (own[0].policy for own in by_law(records) if len(own) > 1):

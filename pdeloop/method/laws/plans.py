@@ -72,32 +72,13 @@ Act: TypeAlias = Callable[[Array, Array, int], Array]
 
 @dataclass(frozen=True, eq=False)
 class Planner:
-    """Receding-horizon control on a model.
+    """Receding-horizon control on a model f, in an episode with this cost.
 
-    Attributes
-    ----------
-    model : FieldModel
-        f.
-    cost : Cost
-        Of an episode of T steps.
-    action_set : ActionSet
-        What actuators can take.
-    K : (n_a, n_z) array
-    b : (n_a,) or (T, n_a) array
-        The affine law a_k = K z_k + b_k.
-    around : bool
-        Whether a plan is a deviation from a law; else it is the actions themselves.
-    steps : int
-        H.
-    terminal : bool
-        Whether V is the cost to go at the target, where that exists.
-    iterations, first : int
-        Of the search at each step, and at the first.
-    starts : int
-        Plans that the first search begins from: no action, the affine law, and drawn ones.
-    regulated : bool
-        Whether that law is the linear-quadratic one of the whole state at the target, which V belongs
-        to; else, or without V, it is the affine law.
+    K (n_a, n_z), b (n_a,) or (T, n_a): the affine law; around: whether a plan is a deviation from a
+    law, else it is the actions; regulated: whether that is the linear-quadratic law at the target,
+    which V belongs to, else, or without V, the affine one; steps: H; terminal: whether V is the cost to
+    go at the target, where that exists; iterations, first: of the search at each step, and at the
+    first; starts: plans that begin the first search: no action, the affine law, and drawn ones.
     """
 
     model: FieldModel
@@ -148,9 +129,8 @@ class Planner:
     def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array]:
         """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan (M, H, n_a).
 
-        plan (M, H, n_a): that of the step before without its first action; at k = 0 it does not count.
-        Where the affine law's own plan is cheaper on the model, the search begins from that; where no
-        plan is finite, this law acts.
+        The search begins from the rest of the plan of the step before, or the affine law's own where
+        that is cheaper; where no plan is finite, this law acts.
         """
         H = self.length(k)
         if k == 0:
@@ -196,8 +176,8 @@ class Planner:
     def gradient(self, v: Array, z: Array, k: int) -> tuple[Array, Array, Array]:
         """J (M,), its gradient (M, H, n_a), and the plans such that no action has to be projected.
 
-        Infinite, with a gradient of zero, where J or the gradient is not finite. Zero, too, for an
-        action at a bound that it could only leave outwards.
+        J is infinite where either is not finite; the gradient is 0 there, and of actions at a bound
+        that they could only leave outwards.
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
         given, K, b = self._given(v, k, *self._feedback)
@@ -250,10 +230,7 @@ class Planner:
         iterations: int,
         known: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:
-        """Plans after so many steps of L-BFGS from v (M, H, n_a), and J.
-
-        known: J and gradient of v, which no action of has to be projected.
-        """
+        """Plans after so many steps of L-BFGS from v (M, H, n_a), and J; known: J and gradient of v."""
         if known is None:
             J, g, v = self.gradient(v, z, k)
         else:
@@ -433,8 +410,8 @@ def simulated(
 ) -> tuple[Array, Array, Array]:
     """Mean stage costs (M,), states (M, H + 1, n_z) and actions (M, H, n_a) on the model of plans.
 
-    From states z (M, n_z) at step k on, H = steps, or to the end of the episode. Where a simulation is
-    not finite, its cost is infinite, and it goes on from the target.
+    From states z at step k on, H = steps, or to the end; where a simulation is not finite, its cost is
+    infinite, and it goes on from the target.
     """
     cost, model, totals = planner.cost, planner.model, np.zeros(len(z))
     end = k + steps if steps else cost.horizon

@@ -54,11 +54,8 @@ class Predictive(Extended):
 
         a_k = P(K z_k + b_k + v_0),      v_0 .. v_{H-1} = argmin of the cost of the next H steps
 
-    (`pdeloop.method.laws.plans`). It begins without a model. An optimiser that identifies one writes it
-    into theta, with the cost, the admissible actions, H and the constants of the search: `model_based`
-    does.
-
-    Its memory is the plan for the next steps and the action applied last.
+    (`pdeloop.method.laws.plans`). An optimiser that identifies a model writes it into theta with all
+    that plans need. Its memory is the plan for the next steps and the action applied last.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd ed., 2017, chapter 2.
     """
@@ -209,10 +206,7 @@ class Predictive(Extended):
         return after
 
     def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array]:
-        """The action (n_a,) and its plan (H, n_a).
-
-        The same for the same arguments: it is kept for `memory_update` because it takes long.
-        """
+        """The action (n_a,) and its plan (H, n_a), kept for `memory_update` because it takes long."""
         seen = hashlib.blake2b(digest_size=16)
         for part in (*theta.values(), z, memory, np.array(k)):
             seen.update(np.ascontiguousarray(part).data)
@@ -241,9 +235,8 @@ class Auto(Predictive):
 class PredictiveKalman(Predictive):
     """`Predictive` from the field that an extended Kalman filter estimates between few sensors.
 
-    It begins as the law `extended_kalman`, and what that law knows is a part of its own theta and
-    memory: a plan starts from its estimate x_k, on the equation that its filter integrates, and is
-    compared with a_k = K_e x_k + b.
+    It begins as the law `extended_kalman`, whose estimate x_k a plan starts from, on the equation that
+    its filter integrates, and is compared with a_k = K_e x_k + b.
     """
 
     name = "predictive_kalman"
