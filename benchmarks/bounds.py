@@ -147,9 +147,7 @@ def best_law(
     return descended(loop, start, fields, fine)
 
 
-def descended(
-    loop: ClosedLoop, theta: Array, fields: Array, settings: ModelBasedSettings
-) -> Array:
+def descended(loop: ClosedLoop, theta: Array, fields: Array, settings: ModelBasedSettings) -> Array:
     """The law after repeated descents, each in the coordinates of where the last one ended."""
     even, curvature = np.full(len(fields), 1.0 / len(fields)), curvature_of(loop)
     for _ in range(ROUNDS):

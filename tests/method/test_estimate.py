@@ -3,32 +3,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr, stdtr
 
-from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change, mean_difference, mean_of
+from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt import Record
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change, mean_of
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     ALL_AGREE,
     FIRST,
     NONE,
     Evidence,
-    Verdict,
     choose,
-    evidence_against_none,
-    evidence_of_pairs,
+    evidence_of_rollouts,
 )
 
 DRAWS = 4000
 
 
-FEWER = 1000
-
-
 def upper(rate: float, draws: int = DRAWS) -> float:
     """What a share of as many draws of this rate exceeds in one case of 30,000."""
     return rate + 4.0 * float(np.sqrt(rate * (1.0 - rate) / draws))
+
+
+def of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
+    """The evidence of costs of laws, field by field."""
+    laws = {name: np.full((1, 1), float(i)) for i, name in enumerate(costs)}
+    none = np.empty((0, 0))
+    seen = [
+        Record(laws[name], cost, none, none, field_seed=i)
+        for name, own in costs.items()
+        for i, cost in enumerate(own.tolist())
+    ]
+    return evidence_of_rollouts(laws, base, seen)
 
 
 @pytest.mark.parametrize("pairs", [2, 3, 5, 8])
@@ -41,73 +53,9 @@ def test_pairs_without_a_difference_are_taken_for_one_at_the_level_however_few(
     level = 1.0 - float(ndtr(confidence))
     for difference in rng.standard_normal((DRAWS, pairs)):
         costs = {FIRST: np.full(pairs, 9.0), ADAPTED: 9.0 + difference}
-        verdict = choose(evidence_of_pairs(costs, FIRST), FIRST, confidence)
+        verdict = choose(of_pairs(costs, FIRST), FIRST, confidence)
         wrong += verdict.chosen == ADAPTED
     assert 2.0 * level - upper(level) < wrong / DRAWS < upper(level)
-
-
-def against_none(
-    rng: np.random.Generator, together: float, spread: float, fields: int, others: int, more: float
-) -> Verdict:
-    """A law on some fields, where no control's costs have a correlation with its own and a spread.
-
-    others: fields of no control alone; more: what the law costs more in the mean.
-    """
-    own, apart = rng.standard_normal((2, fields))
-    none = spread * (together * own + np.sqrt(1.0 - together**2) * apart)
-    costs = {ADAPTED: 100.0 + more + own, NONE: 100.0 + none}
-    before = 100.0 + spread * rng.standard_normal(others)
-    said = {ADAPTED: [Estimate(-1.0, np.inf)]}
-    return choose(evidence_against_none(costs, before, said), NONE, 1.0)
-
-
-@pytest.mark.parametrize("together", [-0.9, 0.0, 0.9])
-@pytest.mark.parametrize("spread", [1.0, 5.0])
-@pytest.mark.parametrize(("fields", "others"), [(2, 3), (3, 3)])
-def test_a_law_as_good_as_no_control_is_better_beyond_chance_no_more_often_than_the_level(
-    together: float, spread: float, fields: int, others: int
-) -> None:
-    """Whatever one law's costs say of the other's: not more than 2 % above the level."""
-    rng, wrong = np.random.default_rng([fields, others]), 0
-    for _ in range(FEWER):
-        found = against_none(rng, together, spread, fields, others, 0.0)
-        wrong += found.chosen == ADAPTED and ALL_AGREE not in found.reason
-    assert wrong / FEWER < upper(1.0 - float(ndtr(1.0)), FEWER) + 0.02
-
-
-@pytest.mark.parametrize("together", [0.0, 0.9])
-@pytest.mark.parametrize("sizes", [0.0, 1.0, 2.0])
-def test_a_law_that_costs_more_than_no_control_is_seldom_taken(
-    together: float, sizes: float
-) -> None:
-    """Less often than all pairs together favour it, by however many standard errors it is worse."""
-    rng = np.random.default_rng(7)
-    pairs = float(np.sqrt((1.0 + 25.0 - 10.0 * together) / 3.0))
-    taken = sum(
-        against_none(rng, together, 5.0, 3, 3, sizes * pairs).chosen == ADAPTED
-        for _ in range(FEWER)
-    )
-    assert taken / FEWER < upper(float(ndtr(-sizes)), FEWER)
-
-
-def test_fields_that_cost_one_law_more_and_the_other_less_add_to_the_error() -> None:
-    """By as much as in pairs, where there are no others."""
-    own, before, none = np.array([3.0, 1.0, 2.0]), np.array([5.0, 9.0, 7.0]), np.zeros(0)
-    assert mean_difference(own, before, none).error == pytest.approx(mean_of(own - before).error)
-    alike = mean_difference(own, 14.0 - before, none)
-    assert alike.error == pytest.approx((mean_of(own) - mean_of(before)).error)
-
-
-def test_rollouts_without_control_count_from_whatever_field() -> None:
-    """Three pairs leave doubt where no control's costs vary; its other rollouts settle it."""
-    costs = {ADAPTED: np.array([55.0, 52.0, 48.0]), NONE: np.array([34.0, 47.0, 103.0])}
-    pairs = choose(evidence_of_pairs(costs, NONE), NONE, 1.0)
-    assert pairs.chosen == NONE
-    before = np.array([47.0, 93.0, 113.0])
-    found = choose(evidence_against_none(costs, before, {}), NONE, 1.0)
-    assert found.chosen == ADAPTED and ALL_AGREE not in found.reason
-    every = np.concatenate([costs[NONE], before])
-    assert found.change == pytest.approx(costs[ADAPTED].mean() - every.mean())
 
 
 @pytest.mark.parametrize("said", [-3.0, 3.0])
@@ -118,23 +66,13 @@ def test_where_chance_explains_everything_no_control_is_kept_only_if_an_estimate
     """The first law, which was designed for the plant, is kept in any case."""
     costs = np.array([30.0, 60.0, 90.0])
     own = costs + measured + np.array([40.0, 0.0, -40.0])
-    known = {ADAPTED: [Estimate(said, 9.0)]}
-    evidence = evidence_against_none({ADAPTED: own, NONE: costs}, costs, known)
-    found = choose(evidence, NONE, 1.0)
-    better = said < 0.0 and measured < 0.0
-    assert found.chosen == (ADAPTED if better else NONE)
-    assert (ALL_AGREE in found.reason) == better
-    first = {FIRST: evidence[NONE], ADAPTED: evidence[ADAPTED]}
-    assert choose(first, FIRST, 1.0).chosen == FIRST
-
-
-def test_no_control_that_diverged_loses_and_so_does_a_law() -> None:
-    own, none = np.array([3.0, 4.0]), np.array([5.0, 6.0])
-    lost = evidence_against_none({ADAPTED: own, NONE: none}, np.array([7.0, np.inf]), {})
-    assert choose(lost, NONE, 1.0).reason == "a rollout of no control diverged"
-    bad = np.array([3.0, np.inf])
-    kept = choose(evidence_against_none({ADAPTED: bad, NONE: none}, none, {}), NONE, 1.0)
-    assert kept.chosen == NONE and kept.reason == "a rollout of the last law diverged"
+    for base in (NONE, FIRST):
+        known = of_pairs({base: costs, ADAPTED: own}, base)
+        known[ADAPTED] = replace(known[ADAPTED], also=[Estimate(said, 9.0)])
+        found = choose(known, base, 1.0)
+        better = said < 0.0 and measured < 0.0 and base == NONE
+        assert found.chosen == (ADAPTED if better else base)
+        assert (ALL_AGREE in found.reason) == better
 
 
 @pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 12), (2, 40), (8, 8)])

@@ -12,7 +12,7 @@ import pytest
 from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
-from pdeloop.method.adapt.renewal import choose_fraction, held_out_fraction
+from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
@@ -21,7 +21,6 @@ from pdeloop.method.adapt.verdict import (
     Evidence,
     choose,
     evidence_of,
-    evidence_of_pairs,
     evidence_of_rollouts,
 )
 
@@ -60,10 +59,9 @@ def test_the_way_from_the_first_law_is_what_fields_that_were_left_out_agree_on(
 ) -> None:
     fields = np.arange(8.0)[:, None]
     loop: Any = Costs(cost)
-    found, change = held_out_fraction(
-        loop, np.zeros((1, 1)), [np.ones((1, 1))] * 2, fields, ModelBasedSettings()
-    )
-    assert found == fraction
+    costs = left_out_costs(loop, np.zeros((1, 1)), [np.ones((1, 1))] * 2, fields)
+    found, change = choose_fraction(costs, ModelBasedSettings().confidence)
+    assert found == fraction * FRACTIONS
     differences = np.array([cost(fraction, i) - cost(0.0, i) for i in range(8)])
     assert change.value == pytest.approx(differences.mean()) and change.error >= 0.0
 
@@ -170,8 +168,13 @@ def test_where_the_first_law_diverges_others_are_compared_on_the_same_fields() -
 
 
 def test_fields_from_which_both_laws_diverge_are_left_out_of_their_difference() -> None:
-    costs = {FIRST: np.array([np.inf, 3.0, 4.0]), ADAPTED: np.array([np.inf, 2.0, 2.0])}
-    found = evidence_of_pairs(costs, FIRST)[ADAPTED]
+    laws = {FIRST: np.zeros((1, 1)), ADAPTED: np.ones((1, 1))}
+    seen = [
+        Record(laws[name], cost, np.ones((1, 1)), np.ones((0, 1)), field_seed=i)
+        for name, own in ((FIRST, (np.inf, 3.0, 4.0)), (ADAPTED, (np.inf, 2.0, 2.0)))
+        for i, cost in enumerate(own)
+    ]
+    found = evidence_of_rollouts(laws, FIRST, seen)[ADAPTED]
     assert found.change.value == -1.5 and np.array_equal(found.excess, [np.inf])
 
 

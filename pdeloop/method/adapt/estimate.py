@@ -87,26 +87,6 @@ def mean_of(values: Array) -> Estimate:
     return Estimate(mean, error, len(values) - 1.0)
 
 
-def mean_difference(own: Array, before: Array, others: Array) -> Estimate:
-    """The mean of some costs less that of another law, known on further fields as well.
-
-    It is not that of the pairs: where the costs of the other law vary more, all of them count. Fields
-    that cost one law more and the other less add to the error.
-
-    own, before: of the same fields; others: of the other law.
-
-    >>> mean_difference(np.array([1.0, 1.0]), np.array([2.0, 4.0]), np.array([3.0, 3.0])).value
-    -2.0
-    """
-    every = np.concatenate([before, others])
-    found = mean_of(own) - mean_of(every)
-    if len(own) < 2:
-        return found
-    opposed = -2.0 * float(np.cov(own, before)[0, 1]) / len(every)
-    error = float(np.hypot(found.error, np.sqrt(max(opposed, 0.0))))
-    return Estimate(found.value, error, found.degrees)
-
-
 def mean_change(costs: Array, before: Array) -> Estimate:
     """The mean change of the costs; the error is that of the ratio of means, times the mean before.
 

@@ -52,6 +52,7 @@ from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.estimate import ZERO, mean_change
 from pdeloop.method.adapt.improve import cheapest
 from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
     SensedLoop,
     estimated_laws,
@@ -67,7 +68,7 @@ from pdeloop.method.adapt.verdict import (
     PREDICTIVE,
     Evidence,
     choose,
-    evidence_of_pairs,
+    evidence_of_rollouts,
     excess_of,
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
@@ -474,12 +475,8 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
 
     def _seeds(self) -> list[int]:
         """Those of fields of the trained law, and further ones where it has fewer."""
-        known = list(dict.fromkeys(own.field_seed for own in self._of_base()))
+        known = list(costs_by_field(self._affine.records, self._affine.policy))
         return [*known, *super()._seeds()][: self._left]
-
-    def _of_base(self) -> list[Record]:
-        """The rollouts of the law to stay with."""
-        return of_law(self._affine.records, self._affine.policy)
 
     def _evidence(
         self,
@@ -491,11 +488,9 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
     ) -> Mapping[str, Evidence]:
         """Means over pairs from the same initial fields."""
         row["predicted"] = float(np.mean(candidate.costs))
-        known = {own.field_seed: own.cost for own in self._of_base()}
-        pairs = [
-            (result.cost if result.usable else np.inf, known[own.field_seed])
-            for own, result in zip(asked, results, strict=True)
-            if own.field_seed in known
-        ]
-        own, others = np.array(pairs).reshape(-1, 2).T
-        return evidence_of_pairs({base: others, PREDICTIVE: own}, base)
+        known, none = self._affine.records, np.empty((0, 0))
+        for own, result in zip(asked, results, strict=True):
+            cost = result.cost if result.usable else np.inf
+            known.append(Record(own.policy, cost, none, none, field_seed=own.field_seed))
+        laws = {base: self._affine.policy, PREDICTIVE: candidate.theta}
+        return evidence_of_rollouts(laws, base, known)

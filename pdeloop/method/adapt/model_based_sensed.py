@@ -32,7 +32,7 @@ from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.progress import JUDGING, RENEWING
 from pdeloop.method.adapt.renewal import mixtures, weighted
-from pdeloop.method.adapt.replay import FEWEST, best_measured, step
+from pdeloop.method.adapt.replay import FEWEST, best_measured, costs_by_field, step
 from pdeloop.method.adapt.sensed_loop import (
     SensedLoop,
     compensators,
@@ -50,8 +50,7 @@ from pdeloop.method.adapt.verdict import (
     NONE,
     Replays,
     choose,
-    evidence_against_none,
-    evidence_of_pairs,
+    evidence_of_rollouts,
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
@@ -299,19 +298,12 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
         """Decide between the final law and the one to stay with on the same fields."""
-        judged = self._records.all()[-self._schedule.judging :]
-        own = np.array([record.cost for record in judged if np.array_equal(record.policy, final)])
-        known = np.array([record.cost for record in self._of(stays)])
-        count = min(len(own), len(known))
-        if count < FEWEST:
+        known, laws = self._records.all(), {base: stays, ADAPTED: final}
+        own, others = (costs_by_field(known, law).keys() for law in (final, stays))
+        if len(own & others) < FEWEST:
             return
-        costs, others = {ADAPTED: own[:count], base: known[:count]}, known[count:]
-        if base == NONE:
-            before = [r for r in self._context.measured if r.usable and not r.policy.any()]
-            others = np.concatenate([others, [record.cost for record in before]])
-            evidence = evidence_against_none(costs, others, {ADAPTED: [self._progress.change]})
-        else:
-            evidence = evidence_of_pairs(costs, base)
+        evidence = evidence_of_rollouts(laws, base, known)
+        evidence[ADAPTED] = replace(evidence[ADAPTED], also=[self._progress.change])
         measured = choose(evidence, base, self._settings.confidence)
         self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
         row |= measured.row

@@ -149,7 +149,8 @@ def renew(
             return None
         made = [law.theta if law else own for law, own in zip(found, starts, strict=True)]
         steps = best.steps + sum(law.steps for law in found if law)
-        fraction, change = held_out_fraction(loop, first, made, fields, settings)
+        i, change = choose_fraction(left_out_costs(loop, first, made, fields), settings.confidence)
+        fraction = i / FRACTIONS
         theta = first + fraction * (best.theta - first)
         return Renewal(theta, best.theta, made, fraction, change, steps)
 
@@ -209,18 +210,6 @@ def renew_from_states(
         if gain > 0.0 and -found.change.value >= _CHAOTIC_CONFIRMED * gain:
             break
     return found
-
-
-def held_out_fraction(
-    loop: ClosedLoop,
-    first: Array,
-    parts: Sequence[Array],
-    fields: Array,
-    settings: ModelBasedSettings,
-) -> tuple[float, Estimate]:
-    """The fraction of the way from the first law, and `change` of a `Renewal`."""
-    i, change = choose_fraction(left_out_costs(loop, first, parts, fields), settings.confidence)
-    return i / FRACTIONS, change
 
 
 def left_out_costs(loop: ClosedLoop, first: Array, parts: Sequence[Array], fields: Array) -> Array:

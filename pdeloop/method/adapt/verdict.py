@@ -13,13 +13,8 @@ the mean is over held-out fields.
 
 Of an accepted model that replays rollouts, the costs of two laws in the same rollouts count where their
 difference has a smaller error than that of measured costs (`Replays`). Where no model predicts
-rollouts, they alone count, by one of two rules:
-
-- the mean over pairs from the same fields (`evidence_of_pairs`), in which cancels what a field costs
-  with either law,
-- against no control of which further rollouts are known, the difference of two means
-  (`evidence_against_none`): its costs vary from field to field, where those of a law hardly do, so that
-  the error of a pair is that of a single rollout of no control, however many others there are.
+rollouts, they alone count (`evidence_of_rollouts`): as a mean over pairs from the same fields, in which
+cancels what a field costs with either law.
 
 The rule of choice accounts for how well the error of few rollouts is known (`estimate`).
 
@@ -38,7 +33,7 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Row, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_difference, mean_of
+from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
 from pdeloop.method.adapt.improve import index_of_cheapest
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
@@ -300,43 +295,6 @@ def _change(evidence: Mapping[str, Evidence], name: str, base: str) -> Estimate 
     if np.isinf(own.excess).any():
         return None
     return own.change + _correction(own) - _correction(other)
-
-
-def evidence_of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
-    """The evidence of rollouts alone: means over pairs from the same initial fields.
-
-    costs: those of each law, field by field, infinite where it diverged; base: the law to stay with.
-    """
-    evidence = {}
-    for name, own in costs.items():
-        known = np.isfinite(own) & np.isfinite(costs[base])
-        difference = mean_of(own[known] - costs[base][known]) if known.any() else ZERO
-        evidence[name] = Evidence(difference, own[np.isinf(own)])
-    return evidence
-
-
-def evidence_against_none(
-    costs: Mapping[str, Array], others: Array, known: Mapping[str, Sequence[Estimate]]
-) -> dict[str, Evidence]:
-    """The evidence of rollouts alone against no control: differences of means, of all its rollouts.
-
-    costs: as for `evidence_of_pairs`, and after those of the other laws' fields further ones of no
-    control; others: its costs from before; known: what else is known of the change by a law.
-    """
-    none = np.concatenate([costs[NONE], others])
-    evidence = {NONE: Evidence(ZERO, none[np.isinf(none)])}
-    for name, own in costs.items():
-        if name == NONE:
-            continue
-        came = np.isfinite(own) & np.isfinite(none[: len(own)])
-        before, further = none[: len(own)][came], none[len(own) :]
-        change, pairs = ZERO, ZERO
-        if came.any():
-            change = mean_difference(own[came], before, further[np.isfinite(further)])
-            pairs = mean_of(own[came] - before)
-        also = known.get(name, ())
-        evidence[name] = Evidence(change, own[np.isinf(own)], (pairs, *also) if also else ())
-    return evidence
 
 
 def excess_of(loop: ClosedLoop, own: Sequence[Record]) -> Array:
