@@ -35,7 +35,7 @@ from pdeloop.messages.files import make_folder, write_atomically
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.estimate import mean_of
 from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.settings import CLOSE, ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
 from pdeloop.method.models import affine_law
 from pdeloop.method.models.base import saturated
@@ -254,7 +254,7 @@ def drawn_choice(
     fraction, held_out = choose_fraction(table.left_out[part, :, known].T, settings.confidence)
     adapted, stays = OF_FRACTIONS + fraction, table.stays
     means = table.model[:, known].mean(axis=1)
-    close = len(judging) > 1 and means[0] <= (1.0 + settings.close) * means[adapted]
+    close = len(judging) > 1 and means[0] <= (1.0 + CLOSE) * means[adapted]
     own, on_none = (judging[:-1], judging[-1:]) if close else (judging, judging[:0])
 
     def evidence(row: int, rollouts: NDArray[np.int64]) -> Evidence:

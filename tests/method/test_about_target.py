@@ -14,7 +14,7 @@ from pde_sim_node.plants import DynamicsPlant
 from pdeloop import rollout
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
-from pdeloop.method.adapt import model_based
+from pdeloop.method.adapt import ModelBased, verdict
 from pdeloop.method.adapt.base import Context, Record, Rollout, RolloutResult, Trajectory
 from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.replay import best_on_same_fields, designed_again, law_about_target
@@ -110,7 +110,7 @@ def test_where_the_first_law_diverges_the_cheapest_of_the_others_is_the_best() -
 def test_the_final_law_is_compared_with_one_that_comes_to_an_end(diverged: bool) -> None:
     first, last = np.ones((1, 4)), np.full((1, 4), 2.0)
     record = _record(0)
-    optimizer = model_based.ModelBased(first, seed=0, rollouts=20, context=_context(record))
+    optimizer = ModelBased(first, seed=0, rollouts=20, context=_context(record))
     seen = RolloutResult(1.0, diverged, Trajectory(record.states, record.actions))
     for seed, law in ((1, first), (2, first), (1, last), (2, last)):
         told = seen if law is first else replace(seen, diverged=False)
@@ -132,7 +132,7 @@ def test_a_training_brings_convection_to_rest_from_rollouts_that_begin_with_it(
 ) -> None:
     """Also where the model has it that no control costs less than the first law."""
     if not safe:
-        monkeypatch.setattr(model_based, "beats_no_control", lambda *given: False)
+        monkeypatch.setattr(verdict, "beats_no_control", lambda *given: False)
     how = {"reduced_order": 20, "exploration_variance": 0.3, "law": "affine", **FEW_FITS}
     how["optimizer_settings"] = {"mixtures": 4}
     plant = Admissible(10, steps=60)

@@ -154,10 +154,10 @@ def test_an_equation_that_cannot_be_integrated_is_a_law_that_diverges() -> None:
 
 
 def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> None:
-    loop, law = loop_of(CUBIC)
+    loop, _ = loop_of(CUBIC)
     every, weights = fields(24), np.full(24, 1.0 / 24.0)
     settings = ModelBasedSettings(iterations=30, filter_unpredicted=0.0)
-    laws, steps = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    laws, steps = estimated_laws(loop, every, weights, settings)
     assert len(laws) == 4 and steps > 0
     others, equal = fields(20, seed=1), np.full(20, 1.0 / 20.0)
     none = loop.costs(loop.no_control, others) @ equal
@@ -173,7 +173,7 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
     loop, law = loop_of(CUBIC)
     every, weights, trusted = fields(8), np.full(8, 1.0 / 8.0), 0.3
     settings = ModelBasedSettings(iterations=10, filter_unpredicted=trusted)
-    designed, _ = estimated_laws(loop, law, every, weights, settings, DEFAULTS)
+    designed, _ = estimated_laws(loop, every, weights, settings)
     best = min(designed, key=lambda theta: float(loop.costs(theta, every).mean()))
     parts = dict(law.parts(best))
 
@@ -192,9 +192,9 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
         (0.99 * shares[1], best),
     ):
         settings = replace(settings, filter_margin=allowed)
-        assert same_bits(least_trusting(loop, law, best, every, settings), expected)
+        assert same_bits(least_trusting(loop, best, every, settings), expected)
     lost = law.vector(parts | {"K_e": np.full((N_A, 64), np.inf)})
-    assert least_trusting(loop, law, lost, every, settings) is lost
+    assert least_trusting(loop, lost, every, settings) is lost
 
 
 def test_the_prior_has_the_moments_of_the_fields() -> None:

@@ -20,7 +20,8 @@ from pdeloop.method.adapt import (
     Rollout,
     RolloutResult,
     Trajectory,
-    model_based,
+    renewal,
+    replay,
 )
 from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ClosedLoop
@@ -212,7 +213,7 @@ def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without noise that would be the same rollout; fresh fields tell more of the plant."""
-    monkeypatch.setattr(model_based, "step", lambda *_: None)
+    monkeypatch.setattr(replay, "step", lambda *_: None)
     plant = Plant(chaotic)
     optimizer = make(plant, rollouts=12)
     known: list[tuple[bytes, int]] = []
@@ -225,7 +226,7 @@ def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
 def test_where_no_law_stays_finite_on_the_model_steps_follow_measured_rollouts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
+    monkeypatch.setattr(renewal, "renew", lambda *_, **__: None)
     plant = Plant()
     optimizer = make(plant)
     rows = finished(plant, optimizer)
@@ -340,8 +341,8 @@ def test_a_first_law_is_left_only_where_no_control_diverges_from_fewer_fields_or
     monkeypatch.setattr(
         ClosedLoop, "costs", lambda _, theta, fields: np.array(first if theta.any() else none)
     )
-    monkeypatch.setattr(model_based, "renew", lambda *_, **__: None)
-    monkeypatch.setattr(model_based, "any_state_serves", lambda *_: False)
+    monkeypatch.setattr(renewal, "renew", lambda *_, **__: None)
+    monkeypatch.setattr(renewal, "any_state_serves", lambda *_: False)
     belief = believe(optimizer._context, optimizer._before, 0.05)
     assert belief is not None
     optimizer._improve(belief, {}, True)

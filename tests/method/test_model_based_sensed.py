@@ -152,7 +152,7 @@ def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_bett
             result = replace(measured(Rollout(law, seed)), cost=cost * level)
             own._records.add([Rollout(law, -1)], [result])
     first = [record.cost / level for record in own._of(own._first)]
-    own._look_back(row, {"none": own._none, "adapted": final}, "none")
+    own._look_back(row, own._none)
     assert same_bits(own.policy, own._first) and row["chosen"] == "first"
     assert row["predicted_change"] == pytest.approx(level * (np.mean(first) - 9.1))
 

@@ -67,7 +67,7 @@ CONTEXT = Context(
 
 
 def made(context: Context) -> ModelBased:
-    settings, start = ModelBasedSettings(mixtures=0, folds=2), np.zeros((N_A, 2 * N_S))
+    settings, start = ModelBasedSettings(mixtures=0), np.zeros((N_A, 2 * N_S))
     return ModelBased(start, seed=0, rollouts=7, settings=settings, context=context)
 
 

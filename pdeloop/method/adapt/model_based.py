@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt import renewal, replay, verdict
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
@@ -41,45 +42,10 @@ from pdeloop.method.adapt.base import (
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate
 from pdeloop.method.adapt.progress import ENDED, JUDGING, RENEWING, Progress, Schedule
-from pdeloop.method.adapt.renewal import (
-    any_state_serves,
-    begin_alike,
-    initial_fields,
-    measured_states,
-    renew,
-    renew_from_states,
-)
-from pdeloop.method.adapt.replay import (
-    FIRST_TRUST,
-    GROWS,
-    LARGEST_TRUST,
-    SHRINKS,
-    best_on_same_fields,
-    costs_by_field,
-    designed_again,
-    law_about_target,
-    step,
-)
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
-from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, ModelBasedSettings
+from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CLOSE, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records
-from pdeloop.method.adapt.verdict import (
-    ADAPTED,
-    FIRST,
-    LAST,
-    NAMES,
-    NO_OTHER,
-    NONE,
-    Replays,
-    Verdict,
-    beats_no_control,
-    cheaper_law,
-    choose,
-    evidence_of,
-    evidence_of_rollouts,
-    measured_change,
-    size_of,
-)
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.noise import cleaned_states
@@ -200,11 +166,6 @@ class ModelBased(Optimizer):
         return self._records.all()
 
     @property
-    def fields(self) -> Array:
-        """The initial fields of all rollouts, (n, n_z)."""
-        return self._fields()
-
-    @property
     def tells(self) -> int:
         """Number of calls of `tell`."""
         return self._progress.tells
@@ -255,14 +216,14 @@ class ModelBased(Optimizer):
         lost.
         """
         progress, judging = self._progress, self._schedule.judging
-        known = list(costs_by_field(self._records.all(), self._first))
+        known = list(replay.costs_by_field(self._records.all(), self._first))
         if progress.stage == RENEWING:
             left = self._schedule.last - self._records.count
             count = min(judging, left, len(known))
             asked = self._on_new(known, progress.policy)[:count]
             numbers = range(self._records.count, self._records.count + count - len(asked))
             asked += [self._rollout(progress.policy, number) for number in numbers]
-            if not costs_by_field(self._records.all(), self._none):
+            if not replay.costs_by_field(self._records.all(), self._none):
                 free = max(min(_NONE_ROLLOUTS, left - count), 0)
                 asked += [Rollout(self._none.copy(), seed) for seed in known[:free]]
             return asked
@@ -278,7 +239,7 @@ class ModelBased(Optimizer):
 
     def _on_new(self, known: Sequence[int], policy: Array) -> list[Rollout]:
         """Rollouts of a law on those of these fields that it was not measured on."""
-        own = costs_by_field(self._records.all(), policy)
+        own = replay.costs_by_field(self._records.all(), policy)
         return [Rollout(policy.copy(), seed) for seed in known if seed not in own]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
@@ -312,7 +273,7 @@ class ModelBased(Optimizer):
         own, known = self._records.count, self._measurements()
         if self._repeats:
             return min(own + 1, self._schedule.last)
-        if own == 0 and len(known) > 1 and not self._context.noise and begin_alike(known):
+        if own == 0 and len(known) > 1 and not self._context.noise and renewal.begin_alike(known):
             return min(2, self._schedule.last)  # whether they are the same
         return self._scheduled(own)
 
@@ -325,7 +286,7 @@ class ModelBased(Optimizer):
         """True if a law's rollouts are all the same one: every episode begins alike, without noise."""
         laws = [[record.cost for record in own] for own in by_law(self._records.all())]
         pairs = [own for own in laws if len(own) > 1 and np.isfinite(own).all()]
-        if self._context.noise or not pairs or not begin_alike(self._measurements()):
+        if self._context.noise or not pairs or not renewal.begin_alike(self._measurements()):
             return False
         return all(np.ptp(own) <= _REPEATS * abs(own[0]) for own in pairs)
 
@@ -342,7 +303,7 @@ class ModelBased(Optimizer):
         left = self._records.count < self._schedule.last
         if not (affine and left and self._repeats) or self._progress.replayed:
             return None
-        return law_about_target(self._context, self._measurements())
+        return replay.law_about_target(self._context, self._measurements())
 
     def _turns_to_target(self, row: Row) -> bool:
         """Take the next law about the target, or the cheapest of all laws where none is left to try."""
@@ -376,8 +337,8 @@ class ModelBased(Optimizer):
         return row
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
-        """The costs of rollouts on the last model; none without one."""
-        if self._progress.belief is None:
+        """The costs of rollouts on the last model; none without one, or where it replays them."""
+        if self._progress.belief is None or not self._model_compares:
             return []
         loop = self._progress.belief.loop(self._context)
         return [loop.predicted(record) for record in added]
@@ -399,13 +360,14 @@ class ModelBased(Optimizer):
         self._progress.stage = JUDGING
         belief, policy = self._progress.belief, self._progress.policy
         if belief is not None and self._schedule.judging > 1 and policy.any():
-            loop, fields = belief.loop(self._context), self._fields()
+            loop, fields = belief.loop(self._context), self.fields
             none, own = (loop.costs(loop.theta(law), fields).mean() for law in (self._none, policy))
-            self._progress.none_is_close = bool(none <= (1.0 + self._settings.close) * own)
+            self._progress.none_is_close = bool(none <= (1.0 + CLOSE) * own)
 
-    def _fields(self) -> Array:
-        """Initial fields of all rollouts."""
-        fields = initial_fields(self._data())
+    @property
+    def fields(self) -> Array:
+        """The initial fields of all rollouts, (n, n_z)."""
+        fields = renewal.initial_fields(self._data())
         return fields[:1] if self._repeats else fields
 
     def _renew(self, row: Row) -> None:
@@ -451,13 +413,15 @@ class ModelBased(Optimizer):
         """A step along measured rollouts from the law that is best on fields of the first one."""
         why = why or self._unpredicted
         progress, records = self._progress, self._records.all()
-        best = best_on_same_fields(records, self._first)
+        best = replay.best_on_same_fields(records, self._first)
         progress.replayed = True
         if progress.trust:
             good = np.array_equal(best, progress.policy)
-            progress.trust = min(progress.trust * (GROWS if good else SHRINKS), LARGEST_TRUST)
+            progress.trust = min(
+                progress.trust * (replay.GROWS if good else replay.SHRINKS), replay.LARGEST_TRUST
+            )
         else:
-            progress.trust = FIRST_TRUST
+            progress.trust = replay.FIRST_TRUST
         progress.policy = best.copy()
         row["reason"] = f"{why}: steps along measured ones"
         if final:
@@ -474,7 +438,9 @@ class ModelBased(Optimizer):
             loop = model.loop(self._context)
             usable = [record for record in records if record.usable]
             if usable:
-                found = step(loop, loop.replays_of(usable), best, self._settings, progress.trust)
+                found = replay.step(
+                    loop, loop.replays_of(usable), best, self._settings, progress.trust
+                )
         if found is None:
             row["reason"] = f"{why}, and no step along them stays finite"
         else:
@@ -491,24 +457,26 @@ class ModelBased(Optimizer):
             return None
         if len(costs) > _AGAIN and not costs[-1] < costs[-2]:
             return None
-        return designed_again(self._context, self._measurements())
+        return replay.designed_again(self._context, self._measurements())
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """Take the law of least cost on a model; final: by the last update."""
-        loop, fields = belief.loop(self._context), self._fields()
+        loop, fields = belief.loop(self._context), self.fields
         first, none = loop.theta(self._first), loop.theta(self._none)
-        safe = beats_no_control(loop, first, fields)
+        safe = verdict.beats_no_control(loop, first, fields)
         base, near = (first, self._first) if safe else (none, self._none)
         self._progress.safe = safe
         improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
         data = self._data()
-        states = measured_states(data, CHAOTIC_FIELDS)
-        if not belief.whole or any_state_serves(loop, base, fields, states):
+        states = renewal.measured_states(data, CHAOTIC_FIELDS)
+        if not belief.whole or renewal.any_state_serves(loop, base, fields, states):
             row["chaotic"] = True
-            found = renew_from_states(loop, base, improved, data, rng, self._settings, final=final)
+            found = renewal.renew_from_states(
+                loop, base, improved, data, rng, self._settings, final=final
+            )
         else:
-            found = renew(
+            found = renewal.renew(
                 loop,
                 base,
                 improved,
@@ -535,15 +503,11 @@ class ModelBased(Optimizer):
         """Choose between the first law, the final one, no control and all others that were measured."""
         laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._progress.policy}
         base = self._decide(row, laws)
-        self._look_back(row, self._compared(laws, base), base)
-        early = "" if self._progress.replayed else WELL_KNOWN.format(len(self._fields()))
+        self._look_back(row, laws[base])
+        early = "" if self._progress.replayed else WELL_KNOWN.format(len(self.fields))
         if self._repeats:
             early = "every episode begins alike, and the last two laws gained nothing"
         self._end(row, str(row["reason"]), early)
-
-    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
-        """Which of the laws were compared with the one to stay with."""
-        return laws
 
     def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
         """Choose between the first law, the final one and no control; the name of that to stay with."""
@@ -551,46 +515,46 @@ class ModelBased(Optimizer):
         base = FIRST if progress.safe or progress.replayed else NONE
         evidence = None
         if progress.belief is not None and not progress.replayed:
-            loop, fields = progress.belief.loop(self._context), self._fields()
-            evidence = evidence_of(loop, laws, base, known, fields, progress.change)
+            loop, fields = progress.belief.loop(self._context), self.fields
+            evidence = verdict.evidence_of(loop, laws, base, known, fields, progress.change)
         if evidence is None:
             base = base if of_law(known, laws[base]) else FIRST  # there is nothing to compare
-            evidence = evidence_of_rollouts(laws, base, known, self._replays())
-        verdict = choose(evidence, base, self._settings.confidence)
-        progress.policy = laws[verdict.chosen].copy()
-        row |= verdict.row
+            evidence = verdict.evidence_of_rollouts(laws, base, known, self._replays())
+        found = verdict.choose(evidence, base, self._settings.confidence)
+        progress.policy = laws[found.chosen].copy()
+        row |= found.row
         return base
 
     _model_compares = True
     """Whether laws of earlier rollouts are compared on the model as well."""
 
-    def _look_back(self, row: Row, laws: Mapping[str, Array], base: str) -> None:
+    def _look_back(self, row: Row, base: Array) -> None:
         """Return another measured law in place of the chosen one where it is better beyond chance."""
         progress, loop, known = self._progress, None, self._rollouts()
         if progress.belief is not None and self._model_compares and not progress.replayed:
             loop = progress.belief.loop(self._context)
-        confidence, fields = self._settings.confidence, self._fields()
+        confidence, fields = self._settings.confidence, self.fields
         replays = self._replays()
-        found = cheaper_law(loop, progress.policy, known, fields, confidence, replays)
+        found = verdict.cheaper_law(loop, progress.policy, known, fields, confidence, replays)
         if found is None:
             return
         law, saved = found
         name = FIRST if np.array_equal(law, self._first) else ADAPTED
         chosen = str(row["chosen"])
-        other = NAMES[FIRST] if name == FIRST else "an earlier adapted law"
-        than = LAST if chosen == ADAPTED else NAMES[chosen]
-        reason = f"{size_of(other, saved, than)} and is returned"
+        other = verdict.NAMES[FIRST] if name == FIRST else "an earlier adapted law"
+        than = verdict.LAST if chosen == ADAPTED else verdict.NAMES[chosen]
+        reason = f"{verdict.size_of(other, saved, than)} and is returned"
         if chosen != ADAPTED:
-            missed = str(row["reason"]).removeprefix(f"{NO_OTHER}: ")
+            missed = str(row["reason"]).removeprefix(f"{verdict.NO_OTHER}: ")
             within = " (within chance)" if missed != row["reason"] else ""
             reason = f"{missed}{within}; {reason}"
-        change = measured_change(known, law, laws[base], replays)
+        change = verdict.measured_change(known, law, base, replays)
         if change is None:
             change = saved + Estimate(float(row["predicted_change"]), float(row["deviation"]))
-        row |= Verdict(name, change.value, change.error, reason).row
+        row |= verdict.Verdict(name, change.value, change.error, reason).row
         progress.policy = law.copy()
 
-    def _replays(self) -> Replays | None:
+    def _replays(self) -> verdict.Replays | None:
         """Rollouts as a model replays them; None where it cannot."""
         return None
 

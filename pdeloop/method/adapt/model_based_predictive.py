@@ -2,25 +2,17 @@
 """`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
 
 The law that it begins as is trained as ever; here it is called the affine one, also where it has an
-offset for each step. On the last model that predicts the rollouts, plans of 20, 40 and 80 steps are
-simulated in closed loop from a few measured initial fields, as actions, as deviations from that law, or
-from the linear-quadratic one of the whole state at the target, whichever is cheaper there; the shortest
-within 2 % of the cheapest is taken. They are closed by the cost to go at the target unless plans
-without it are 2 % cheaper: it is that of the linear problem, and far too high where bounded actuators
-can do little near the target. The last rollouts are of the law with that plan, from fresh fields. It
-replaces the affine law only if it is better by more than chance (`verdict`).
+offset for each step. On the last model, plans are simulated in closed loop from a few measured initial
+fields. The cost to go that closes them is that of the linear problem, and far too high where bounded
+actuators can do little near the target. The last rollouts are of the law with the plan, from fresh
+fields, and the verdict is on these (`verdict`).
 
-The law `auto` keeps no rollouts for plans before a model says what is to be had: after each renewal of
-the affine law but the last, the best inputs for an episode are searched on the model from several
-starts, around both laws. If they save more than 3 % of the cost of the affine law, also once that is
-improved as far as at the last update, the last rollouts are kept; else they are the affine law's, which
-is then that of that law to the bit.
+The law `auto` keeps rollouts for plans only where the model says, after a renewal of the affine law,
+that the best inputs for an episode save enough of its cost; else it is the affine law to the bit.
 
 With few sensors the law `extended_kalman` is trained in place of the affine one. Plans start from the
-estimate of its filter, on the equation of that, and are simulated with it and with noise on the
-readings. Where the trained law has no filter, one is designed as for it. An equation that reproduces
-the readings may be wrong where no sensor is: the last rollouts are on fields of the trained law, and
-these pairs decide.
+estimate of its filter, on the equation of that. This may be wrong where no sensor is: the last rollouts
+are on fields of the trained law, and these pairs decide.
 """
 
 from __future__ import annotations
@@ -35,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
+from pdeloop.method.adapt import verdict
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
@@ -61,16 +54,7 @@ from pdeloop.method.adapt.sensed_loop import (
     sensed_loop,
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.verdict import (
-    ADAPTED,
-    FIRST,
-    NONE,
-    PREDICTIVE,
-    Evidence,
-    choose,
-    evidence_of_rollouts,
-    excess_of,
-)
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, PREDICTIVE, Evidence
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Affine
 from pdeloop.method.laws.plans import Planner, planned, seen_with_noise, simulated
@@ -338,10 +322,10 @@ class ModelBasedPredictive(Optimizer):
         if not np.array_equal(policy, self._first):
             base = ADAPTED if policy.any() else NONE
         evidence = self._evidence(self._candidate, base, asked, results, row)
-        verdict = choose(evidence, base, self._settings.confidence)
-        if verdict.chosen == self.candidate:
+        found = verdict.choose(evidence, base, self._settings.confidence)
+        if found.chosen == self.candidate:
             self._chosen = self._candidate.theta
-        row |= verdict.row
+        row |= found.row
 
     def _evidence(
         self,
@@ -366,7 +350,7 @@ class ModelBasedPredictive(Optimizer):
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
         excess += [np.inf] * (len(results) - len(usable))
-        of_base = excess_of(loop, of_law(self._affine.records, policy))
+        of_base = verdict.excess_of(loop, of_law(self._affine.records, policy))
         change = mean_change(np.concatenate(costs), np.concatenate(before))
         return {
             base: Evidence(ZERO, of_base),
@@ -454,12 +438,11 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
             return policy
         loop, fields = self._loop(belief), self._affine.fields
         weights = np.full(len(fields), 1.0 / len(fields))
-        models = self._context.field_models
-        laws, _ = estimated_laws(loop, self._kalman, fields, weights, self._settings, models)
+        laws, _ = estimated_laws(loop, fields, weights, self._settings)
         if not laws:
             return None
         best = cheapest(loop, laws, fields, weights)
-        return least_trusting(loop, self._kalman, best, fields, self._settings)
+        return least_trusting(loop, best, fields, self._settings)
 
     def _loop(self, belief: Belief) -> SensedLoop:
         assert isinstance(belief.model, SensedModel)
@@ -493,4 +476,4 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
             cost = result.cost if result.usable else np.inf
             known.append(Record(own.policy, cost, none, none, field_seed=own.field_seed))
         laws = {base: self._affine.policy, PREDICTIVE: candidate.theta}
-        return evidence_of_rollouts(laws, base, known)
+        return verdict.evidence_of_rollouts(laws, base, known)

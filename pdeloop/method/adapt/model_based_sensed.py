@@ -19,12 +19,13 @@ exactly. Measured costs decide, or of an accepted model those of both laws in th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.adapt import verdict
 from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate, mean_of
@@ -44,14 +45,7 @@ from pdeloop.method.adapt.sensed_loop import (
     whole_field_law,
 )
 from pdeloop.method.adapt.settings import FIRST_GAIN, READINGS_TRUST, ModelBasedSettings
-from pdeloop.method.adapt.verdict import (
-    ADAPTED,
-    FIRST,
-    NONE,
-    Replays,
-    choose,
-    evidence_of_rollouts,
-)
+from pdeloop.method.adapt.verdict import ADAPTED
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import SENSED_REPRODUCED
@@ -63,6 +57,13 @@ class ModelBasedReadings(ModelBased):
     _unpredicted = "no model of the readings predicts the rollouts"
     _model_compares = False
 
+    @property
+    def _sensed(self) -> SensedModel | None:
+        """The model of the field that is believed."""
+        belief = self._progress.belief
+        model = None if belief is None else belief.model
+        return model if isinstance(model, SensedModel) else None
+
     def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
         return self._schedule.often(own)
@@ -71,14 +72,11 @@ class ModelBasedReadings(ModelBased):
         """All rollouts as they were measured: the model's filter knows their noise."""
         return self._measurements()
 
-    def _predicted(self, added: Sequence[Record]) -> list[float]:
-        """None: the model gives each rollout its own cost."""
-        return []
-
-    def _fields(self) -> Array:
+    @property
+    def fields(self) -> Array:
         """Initial states of rollouts, with their innovations."""
         if self._progress.belief is None:
-            return super()._fields()
+            return super().fields
         return self._progress.belief.loop(self._context).beginnings(self._data())
 
     def _renew(self, row: Row) -> None:
@@ -120,22 +118,23 @@ class ModelBasedReadings(ModelBased):
             self._progress.policy, row["steps"] = found
 
     def _judge(self, row: Row) -> None:
-        """Judge the law that measured best in place of the last one."""
-        others = [
-            record
-            for record in self._records.all()
-            if self._is_linear(record.policy) and not np.array_equal(record.policy, self._first)
-        ]
-        self._progress.policy = best_measured(others, self._progress.policy).copy()
+        """Judge the law that measured best in place of the last one, if that is on these models."""
+        if self._sensed is None:
+            others = [
+                record
+                for record in self._records.all()
+                if self._is_linear(record.policy) and not np.array_equal(record.policy, self._first)
+            ]
+            self._progress.policy = best_measured(others, self._progress.policy).copy()
         super()._judge(row)
 
-    def _replays(self) -> Replays | None:
+    def _replays(self) -> verdict.Replays | None:
         """Of few sensors there are none: the plant's cost is not that of the readings alone."""
         belief = self._progress.belief
         if self._context.sensors or belief is None or belief.error > self._settings.believed:
             return None
         loop = belief.loop(self._context)
-        return Replays(loop, loop.beginnings(self._rollouts()), belief.error)
+        return verdict.Replays(loop, loop.beginnings(self._rollouts()), belief.error)
 
     def _is_linear(self, policy: Array) -> bool:
         """False of a law on an estimate of the field, which a model of the readings does not have."""
@@ -157,13 +156,6 @@ OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
 
 class ModelBasedSensed(ModelBasedReadings):
     """`ModelBasedReadings`, on a model of the field as long as one reproduces the readings."""
-
-    @property
-    def _sensed(self) -> SensedModel | None:
-        """The model of the field that is believed."""
-        belief = self._progress.belief
-        model = None if belief is None else belief.model
-        return model if isinstance(model, SensedModel) else None
 
     def _scheduled(self, own: int) -> int:
         """After as many rollouts as judge a law; on a model of the field later after twice as many."""
@@ -191,10 +183,11 @@ class ModelBasedSensed(ModelBasedReadings):
                 return Belief(*found)
         return believe(self._context, measured, self._settings.believed)
 
-    def _fields(self) -> Array:
+    @property
+    def fields(self) -> Array:
         """Initial fields of the rollouts whose readings the equation reproduces; of all if of none."""
         if self._sensed is None:
-            return super()._fields()
+            return super().fields
         loop = sensed_loop(self._context, self._sensed)
         found = [loop.smoothed(record) for record in self._data()]
         good = [field for field, error in found if error <= SENSED_REPRODUCED]
@@ -205,7 +198,7 @@ class ModelBasedSensed(ModelBasedReadings):
         if not isinstance(belief.model, SensedModel):
             super()._improve(belief, row, final)
             return
-        loop, fields = sensed_loop(self._context, belief.model), self._fields()
+        loop, fields = sensed_loop(self._context, belief.model), self.fields
         progress, settings, law = self._progress, self._settings, self._context.law
         # A law with memory has many parameters, and simulations cost no rollout.
         sets = _OBSERVER_DRAWS if final else 1
@@ -215,9 +208,7 @@ class ModelBasedSensed(ModelBasedReadings):
         linear = now if now.ndim > 1 else loop.theta(self._first)
         laws, steps = _observers(loop, linear, every, weights, settings, final)
         if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
-            further, more = estimated_laws(
-                loop, law, every, weights, settings, self._context.field_models
-            )
+            further, more = estimated_laws(loop, every, weights, settings)
             laws, steps = [*laws, *further], steps + more
         if not laws:
             row["reason"] = "no improved law stays finite on the model; the law is kept"
@@ -227,7 +218,7 @@ class ModelBasedSensed(ModelBasedReadings):
         theta = cheapest(loop, [now, *laws], held_out, equal)
         if theta is not now:
             if isinstance(law, ExtendedKalman) and theta.ndim == 1:
-                theta = least_trusting(loop, law, theta, held_out, settings)
+                theta = least_trusting(loop, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)
@@ -252,7 +243,7 @@ class ModelBasedSensed(ModelBasedReadings):
             return asked
         first = self._of(self._first)
         if self._progress.stage == JUDGING:
-            known = self._of(self._base[1]) or first
+            known = self._of(self._first if self._progress.safe else self._none) or first
             numbers = [record.stamp for record in known]
             return [
                 self._rollout(own.policy, numbers[i % len(numbers)]) for i, own in enumerate(asked)
@@ -263,50 +254,24 @@ class ModelBasedSensed(ModelBasedReadings):
             len(first) :
         ]
 
-    @property
-    def _base(self) -> tuple[str, Array]:
-        """The law to stay with on the model."""
-        return (FIRST, self._first) if self._progress.safe else (NONE, self._none)
-
     def _begin_judging(self) -> None:
         super()._begin_judging()
         self._progress.none_is_close &= self._sensed is None or not self._of(self._none)
 
-    def _judge(self, row: Row) -> None:
-        """The law that measured best in place of the last one, if that is on a model of readings."""
-        if self._sensed is None:
-            super()._judge(row)
-        else:
-            ModelBased._judge(self, row)
-
-    def _compared(self, laws: Mapping[str, Array], base: str) -> Mapping[str, Array]:
-        if self._sensed is None:
-            return laws
-        return {base: laws[base], ADAPTED: laws[ADAPTED]}
-
     def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
-        """As on a model of the whole field, where there is one, if measured costs agree."""
+        """As on a model of the whole field, where there is one, if pairs of rollouts agree."""
         base = super()._decide(row, laws)
-        stays, final = laws[base], laws[ADAPTED]
-        if (
-            self._sensed is not None
-            and row["chosen"] in (base, ADAPTED)
-            and not np.array_equal(final, stays)
-        ):
-            self._compare_pairs(row, base, stays, final)
-        return base
-
-    def _compare_pairs(self, row: Row, base: str, stays: Array, final: Array) -> None:
-        """Decide between the final law and the one to stay with on the same fields."""
-        known, laws = self._records.all(), {base: stays, ADAPTED: final}
-        own, others = (costs_by_field(known, law).keys() for law in (final, stays))
-        if len(own & others) < FEWEST:
-            return
-        evidence = evidence_of_rollouts(laws, base, known)
+        pair, known = {base: laws[base], ADAPTED: laws[ADAPTED]}, self._records.all()
+        common = set[int].intersection(*(set(costs_by_field(known, law)) for law in pair.values()))
+        same = np.array_equal(*pair.values()) or row["chosen"] not in pair
+        if self._sensed is None or same or len(common) < FEWEST:
+            return base
+        evidence = verdict.evidence_of_rollouts(pair, base, known)
         evidence[ADAPTED] = replace(evidence[ADAPTED], also=[self._progress.change])
-        measured = choose(evidence, base, self._settings.confidence)
-        self._progress.policy = (final if measured.chosen == ADAPTED else stays).copy()
-        row |= measured.row
+        found = verdict.choose(evidence, base, self._settings.confidence)
+        self._progress.policy = pair[found.chosen].copy()
+        row |= found.row
+        return base
 
 
 def _observers(

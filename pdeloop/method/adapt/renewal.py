@@ -1,23 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A new law from measurements: initial fields, and a descent from them on a model of the whole field.
 
-The distance that the law moves from the first one is chosen by cross-validation on measured fields.
-The fields are split into a few parts. For each part a law is computed from the other parts, and the
-fractions of the way from the first law to it are compared by their costs on the model from the held-out
-fields, which needs no rollouts. Among the fractions that are better than the first law by more than
-chance, the cheapest is used; without evidence the first law is kept.
+The distance that the law moves from the first one is chosen by cross-validation: for each part of the
+measured fields a law is made from the others, and fractions of the way to it are compared by their
+costs on the model from the fields left out. Costs differ far more between fields than between laws, and
+the saving of a law is proportional to the cost. So the cost of the first law is the control variate:
+chance is that of the ratio of mean costs.
 
-Costs differ far more between fields than between laws, and the saving of a law is proportional to the
-cost. So the cost of the first law is the control variate: chance is that of the ratio of mean costs.
-
-The measured fields are those in which episodes began. The state of a chaotic plant soon becomes
-independent of them, and the cost of a law depends on the initial field as if by chance: a law that is
-better on a few fields need not be better on others. There any measured state serves, and one rollout
-has many.
-
-On other plants a law that is best on a few fields need not be best near them. On a model further fields
-cost no rollout, so the law is also improved on draws of a normal distribution, with the mean m of the n
-measured fields and the covariance
+The measured fields are those in which episodes began, of which the state of a chaotic plant soon
+becomes independent: there any measured state serves, and one rollout has many. On other plants the law
+is also improved on draws of a normal distribution, with the mean m of the n measured fields and the
+covariance
 
     C = (1 + 1/n) ((1 - rho) S + rho P),        S = 1/(n - 1) sum (z_i - m)(z_i - m)^T,
 
@@ -27,9 +20,8 @@ is nearest to the true covariance in the mean: with Q the part of a matrix that 
 
     rho = E|Q S - E Q S|^2 / E|Q S|^2.
 
-It is 1 where fields look alike everywhere and falls as 1/n where they do not. The factor 1 + 1/n is the
-uncertainty of m. Draws have exactly this mean and, in as many directions as they can, this covariance:
-what is quadratic in the field is then averaged without an error of sampling.
+It is 1 where fields look alike everywhere and falls as 1/n where they do not; 1 + 1/n is for the
+uncertainty of m. Draws have this mean and, in as many directions as they can, this covariance exactly.
 
 References
 ----------
@@ -53,6 +45,8 @@ from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change
 from pdeloop.method.adapt.improve import Improvement, cheapest, curvature_of, improve
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ModelBasedSettings
 
+PARTS = 2
+"""Parts of the fields, each held out once to choose how far the law moves."""
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
 _CHAOTIC_MOST = 96
@@ -154,7 +148,7 @@ def renew(
         theta = first + fraction * (best.theta - first)
         return Renewal(theta, best.theta, made, fraction, change, steps)
 
-    starts, few = [first] * settings.folds, settings.mixtures // 2
+    starts, few = [first] * PARTS, settings.mixtures // 2
     drawn, most = settings.mixtures if final else few, settings.most_mixtures
     found = from_fields(improved, parts or starts, drawn, few)
     if found is None or not final or most <= drawn:

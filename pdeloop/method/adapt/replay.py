@@ -5,10 +5,9 @@ With the innovations e_k = z_{k+1} - f(z_k, a_k) of a measured rollout a model f
 
     z_{k+1} = f(z_k, a_k) + e_k        (`ClosedLoop.replays_of`),
 
-so that the cost of the law that it was measured under is the measured one, and the model says only how
-it changes with the law. That holds near this law: a step is held to it by a trust region, and rollouts
-on the same initial fields, of which the differences vary far less than the costs themselves, decide
-whether it is taken. The trust region grows where a step was good and shrinks where it was not.
+so that the model says only how the measured cost of its law changes with the law. That holds near it: a
+step is held to it by a trust region, which grows where rollouts on the same initial fields show that it
+was good and shrinks where it was not.
 
 A linear model of rollouts that stay far from the target describes the plant where they are, and laws
 that it improves stay there, too. In x = U^T (z - z_r), the samples of all rollouts are fitted by

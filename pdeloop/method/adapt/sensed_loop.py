@@ -6,9 +6,7 @@ designs begin with the best law of the whole field on the model, a = K x + b wit
 POD modes of simulated fields (`whole_field_law`).
 
 The law `extended_kalman` acts on the filter's estimate of the field as if that were the field:
-certainty equivalence, which is optimal where model and law are linear and the cost is quadratic. What
-is not known of the field in a closed loop is seen in simulations under the filter, of its own model or
-of others.
+certainty equivalence.
 
 The law `observer` combines it with a Kalman filter for the linear model that fits these simulations on
 average, by statistical linearisation,
@@ -111,6 +109,12 @@ class SensedLoop(LinearLoop):
     model: SensedModel = field(kw_only=True)
     settings: FieldModelSettings = DEFAULTS
 
+    @property
+    def kalman(self) -> ExtendedKalman:
+        """The law, where there are filters."""
+        assert isinstance(self.law, ExtendedKalman)
+        return self.law
+
     def theta(self, policy: Array) -> Array:
         """Theta, or the whole vector of a law whose actions depend on an estimate of the field."""
         if isinstance(self.law, ExtendedKalman) and self.law.estimates(policy):
@@ -123,9 +127,8 @@ class SensedLoop(LinearLoop):
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         if theta.ndim > 1:
             return super().simulate(theta, fields)
-        assert isinstance(self.law, ExtendedKalman)
-        parts, count = self.law.parts(theta), len(fields)
-        allowed, known, n_a = self.action_set, self.law.filter(parts), self.model.n_a
+        parts, count = self.kalman.parts(theta), len(fields)
+        allowed, known, n_a = self.action_set, self.kalman.filter(parts), self.model.n_a
         K, b, features = parts["K_e"], parts["b"], np.empty((self.horizon, count, 0))
         if known is None:
             states, actions = (np.zeros((self.horizon, count, n)) for n in (self.model.n_z, n_a))
@@ -307,12 +310,7 @@ def whole_field_law(
 
 
 def estimated_laws(
-    loop: SensedLoop,
-    law: ExtendedKalman,
-    fields: Array,
-    weights: Array,
-    settings: ModelBasedSettings,
-    models: FieldModelSettings,
+    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings
 ) -> tuple[list[Array], int]:
     """Theta of laws on the estimate, and the steps of L-BFGS; none if none is finite.
 
@@ -338,7 +336,7 @@ def estimated_laws(
                 continue
             theta, steps = better.theta, steps + better.steps
         K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
-        found += [law.theta_of(K, b, known, models) for known in filters]
+        found += [loop.kalman.theta_of(K, b, known, loop.settings) for known in filters]
     return found, steps
 
 
@@ -349,21 +347,20 @@ def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: flo
 
 
 def least_trusting(
-    loop: SensedLoop, law: ExtendedKalman, best: Array, fields: Array, settings: ModelBasedSettings
+    loop: SensedLoop, best: Array, fields: Array, settings: ModelBasedSettings
 ) -> Array:
     """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
     Simulated plants follow the filter's equation: what trusts it looks too good.
     """
-    model = loop.model
-    parts, costs = dict(law.parts(best)), loop.costs(best, fields)
+    law, costs = loop.kalman, loop.costs(best, fields)
     known = np.isfinite(costs)
     if not known.any():
         return best
     most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
-        noise = noise_of_filter(model, settings, times)
-        other = law.vector(parts | {"noise": np.array([noise, FILTER_INFLATION])})
+        noise = np.array([noise_of_filter(loop.model, settings, times), FILTER_INFLATION])
+        other = law.vector({**law.parts(best), "noise": noise})
         if loop.costs(other, fields)[known].mean() <= most:
             return other
     return best

@@ -12,6 +12,8 @@ CONFIRMED = 0.5
 again on more drawn fields."""
 CHAOTIC_FIELDS = 32
 """Measured states used as initial fields of a chaotic plant, for which no fields are drawn."""
+CLOSE = 0.2
+"""Share by which no control may cost more than a law on the model, to be rolled out as well."""
 FIRST_GAIN = 2e-2
 """`least_gain` before the last renewal."""
 FIRST_RENEWAL = 6
@@ -56,19 +58,6 @@ class ModelBasedSettings(Settings):
         "relative reduction of the cost that a window must reach for the descent to continue",
         0.0,
         1.0,
-    )
-    folds: int = setting(
-        2,
-        "parts of the fields, each held out once to choose how far the law moves",
-        2,
-        100,
-    )
-    close: float = setting(
-        0.2,
-        "no control is also rolled out if its cost on the model exceeds the law's by at most "
-        "this share",
-        0.0,
-        10.0,
     )
     confidence: float = setting(
         1.0,

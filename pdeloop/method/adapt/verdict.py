@@ -6,21 +6,16 @@ distribution is
 
     m + mean over its own rollouts of (measured - model),
 
-with m the mean of its model costs over all measured fields: the model is a control variate, so that one
-rollout is as informative as many without it. The fields of that mean are the same for all laws, so the
-difference of two laws has little variance; for the final law, which was computed from these fields,
-the mean is over held-out fields.
+with m the mean of its model costs over the same measured fields for all laws, or held-out ones for the
+final law, which was made from these: the model is a control variate.
 
 Of an accepted model that replays rollouts, the costs of two laws in the same rollouts count where their
 difference has a smaller error than that of measured costs (`Replays`). Where no model predicts
 rollouts, they alone count (`evidence_of_rollouts`): as a mean over pairs from the same fields, in which
 cancels what a field costs with either law.
 
-The rule of choice accounts for how well the error of few rollouts is known (`estimate`).
-
-A first law was designed for the plant, and is given up only for one that is better by more than chance.
-No control was not: what chance may explain is settled there by the expected cost, if all that is known
-of it says the same.
+A first law was designed for the plant, and is given up only for one that is better by more than chance
+(`estimate`). No control was not: there it is enough that all that is known says the same.
 """
 
 from __future__ import annotations

@@ -18,11 +18,8 @@ The search is L-BFGS in the metric of R + B^T P B, with a projected backtracking
 number of iterations. A spectral model carries out both ways over all steps in one compiled call
 (`pdeloop.solver.polynomial_sweep`).
 
-With rate limits P also depends on a_{i-1}, and states z_k are given with a_{k-1} (`Planner.after`). An
-action that its rate limit holds back is requested a step's change further, so that it follows when
-a_{i-1} changes.
-
-All functions take M plans side by side, each with the same result as alone.
+With rate limits P also depends on a_{i-1}, and states z_k are given with a_{k-1} (`Planner.after`). All
+functions take M plans side by side, each with the same result as alone.
 
 References
 ----------
