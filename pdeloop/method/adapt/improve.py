@@ -126,12 +126,7 @@ def improve(
         jac=True,
         method="L-BFGS-B",
         callback=stop_when_flat,
-        options={
-            "maxiter": settings.iterations,
-            "maxcor": _MEMORY,
-            "ftol": 0.0,
-            "gtol": 0.0,
-        },
+        options={"maxiter": settings.iterations, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
     )
     return Improvement(best.theta, before, best.after, len(values) - 1)
 

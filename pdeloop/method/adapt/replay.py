@@ -90,23 +90,12 @@ def costs_by_field(records: Sequence[Record], law: Array) -> dict[int, float]:
 
 
 def step(
-    loop: ClosedLoop,
-    fields: Array,
-    law: Array,
-    settings: ModelBasedSettings,
-    trust: float,
+    loop: ClosedLoop, fields: Array, law: Array, settings: ModelBasedSettings, trust: float
 ) -> tuple[Array, int] | None:
     """The law after a step on replayed rollouts, and its steps of L-BFGS; None if it is not finite."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
-        loop,
-        loop.theta(law),
-        fields,
-        weights,
-        curvature_of(loop),
-        settings,
-        FIRST_GAIN,
-        trust,
+        loop, loop.theta(law), fields, weights, curvature_of(loop), settings, FIRST_GAIN, trust
     )
     return None if found is None else (loop.policy(found.theta, law), found.steps)
 

@@ -194,10 +194,7 @@ class Replays:
 
 
 def evidence_of_rollouts(
-    laws: Mapping[str, Array],
-    base: str,
-    records: Sequence[Record],
-    replays: Replays | None = None,
+    laws: Mapping[str, Array], base: str, records: Sequence[Record], replays: Replays | None = None
 ) -> dict[str, Evidence]:
     """The evidence of rollouts alone, except for `base` only for laws that were measured.
 

@@ -220,12 +220,7 @@ class Planner:
         return found
 
     def improved(
-        self,
-        v: Array,
-        z: Array,
-        k: int,
-        iterations: int,
-        known: tuple[Array, Array] | None = None,
+        self, v: Array, z: Array, k: int, iterations: int, known: tuple[Array, Array] | None = None
     ) -> tuple[Array, Array]:
         """Plans after so many steps of L-BFGS from v (M, H, n_a), and J; known: J and gradient of v."""
         if known is None:

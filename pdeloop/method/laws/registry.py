@@ -30,25 +30,12 @@ from pdeloop.method.laws.predictive import Auto, AutoKalman, Predictive, Predict
 from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
 
+_OURS = Affine, FeedForward, Observer, ExtendedKalman, Predictive, Auto, Neural
+_OURS_OF_SENSORS = PredictiveKalman, AutoKalman
 OWN_LAWS = OwnCode(
     "law",
     "PDELOOP_LAWS",
-    MappingProxyType(
-        {
-            kind.name: kind
-            for kind in (
-                Affine,
-                FeedForward,
-                Observer,
-                ExtendedKalman,
-                Predictive,
-                Auto,
-                Neural,
-                PredictiveKalman,
-                AutoKalman,
-            )
-        }
-    ),
+    MappingProxyType({kind.name: kind for kind in (*_OURS, *_OURS_OF_SENSORS)}),
 )
 
 
