@@ -28,7 +28,7 @@ from pdeloop.method.adapt.verdict import (
 class Costs:
     """A loop whose costs from field i under the law theta are given by a function."""
 
-    replays = False
+    readings = None
     predicted: Any = ClosedLoop.predicted
 
     def __init__(self, cost: Callable[[float, int], float]) -> None:

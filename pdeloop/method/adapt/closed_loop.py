@@ -99,11 +99,6 @@ class ClosedLoop:
         """Columns of theta that are constant parts: 1, or one for each step."""
         return 1
 
-    @property
-    def replays(self) -> bool:
-        """True if initial fields are measured rollouts, with what in them was not foreseen."""
-        return self.readings is not None
-
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, (n, n_z)."""
         return np.stack([record.states[0] for record in records])

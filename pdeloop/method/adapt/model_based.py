@@ -201,9 +201,10 @@ class ModelBased(Optimizer):
             return self._on_known_fields()
         if progress.stage == RENEWING:
             count = self._next_renewal() - own
-            laws = [progress.policy] * (
-                min(count, self._schedule.judging) if self._is_new else count
-            )
+            made = progress.belief is not None and self._model_compares
+            if made and not of_law(self._records.all(), progress.policy):
+                count = min(count, self._schedule.judging)  # does it cost what the model says?
+            laws = [progress.policy] * count
         else:
             laws = [progress.policy] * (self._schedule.judging - progress.none_is_close)
             laws += [self._none] * progress.none_is_close
@@ -261,12 +262,6 @@ class ModelBased(Optimizer):
                 self._renew(row)
         diverged = sum(not result.usable for result in results)
         return row | {"rollouts": self._records.count, "diverged": diverged}
-
-    @property
-    def _is_new(self) -> bool:
-        """True if a model made the law, and no rollout has shown yet whether it costs as much."""
-        made = self._progress.belief is not None and self._model_compares
-        return made and not of_law(self._records.all(), self._progress.policy)
 
     def _next_renewal(self) -> int:
         """Own rollouts after which the law is renewed next, unless it costs more than predicted."""
@@ -507,7 +502,9 @@ class ModelBased(Optimizer):
         early = "" if self._progress.replayed else WELL_KNOWN.format(len(self.fields))
         if self._repeats:
             early = "every episode begins alike, and the last two laws gained nothing"
-        self._end(row, str(row["reason"]), early)
+        self._progress.stage = ENDED
+        if self._records.count < self._budget:
+            row["early"] = early or row["reason"]
 
     def _decide(self, row: Row, laws: Mapping[str, Array]) -> str:
         """Choose between the first law, the final one and no control; the name of that to stay with."""
@@ -561,11 +558,6 @@ class ModelBased(Optimizer):
     def _rollouts(self) -> list[Record]:
         """The rollouts of laws, denoised."""
         return self._data()[len(self._context.every_exploration) :]
-
-    def _end(self, row: Row, reason: str, early: str = "") -> None:
-        row["reason"], self._progress.stage = reason, ENDED
-        if self._records.count < self._budget:
-            row["early"] = early or reason
 
     def state(self) -> State:
         """The progress and all rollouts."""

@@ -153,7 +153,8 @@ def renew(
     found = from_fields(improved, parts or starts, drawn, few)
     if found is None or not final or most <= drawn:
         return found
-    if not is_overfitted(loop, first, found, fields, settings):
+    gain = own_gain(loop, first, found, fields)
+    if not (gain > 0.0 and -found.change.value < CONFIRMED * gain):
         return found
     # A law that is best on too few fields is no start: the descent would stay near it.
     again = from_fields(first, starts, most, most)
@@ -162,17 +163,7 @@ def renew(
     return replace(again, steps=found.steps + again.steps)
 
 
-def is_overfitted(
-    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ModelBasedSettings
-) -> bool:
-    """True if fields that were left out confirm too little of what a law gains on its own."""
-    gain = _own_gain(loop, first, found, fields, settings)
-    return gain > 0.0 and -found.change.value < CONFIRMED * gain
-
-
-def _own_gain(
-    loop: ClosedLoop, first: Array, found: Renewal, fields: Array, settings: ModelBasedSettings
-) -> float:
+def own_gain(loop: ClosedLoop, first: Array, found: Renewal, fields: Array) -> float:
     """By how much the law after the descent is better than the first; 0 where it is hardly better."""
     before, after = loop.costs(first, fields), loop.costs(found.improved, fields)
     known = np.isfinite(before) & np.isfinite(after)
@@ -200,7 +191,7 @@ def renew_from_states(
         found = renew(loop, first, improved, [], fields, rng, settings, final=final)
         if found is None or found.change.is_negative(settings.confidence, _CHAOTIC_CLEAR):
             break
-        gain = _own_gain(loop, first, found, fields, settings)
+        gain = own_gain(loop, first, found, fields)
         if gain > 0.0 and -found.change.value >= _CHAOTIC_CONFIRMED * gain:
             break
     return found

@@ -152,18 +152,16 @@ class SensedLoop(LinearLoop):
 
     def smoothed(self, record: Record) -> tuple[Array, float]:
         """The initial field of a rollout, and its error."""
-        known = _SMOOTHED.setdefault(self.model, WeakKeyDictionary())
-        if record not in known:  # each renewal and the verdict ask for all rollouts
-            known[record] = self._smooth(record)
-        return known[record]
-
-    def _smooth(self, record: Record) -> tuple[Array, float]:
-        model, steps = self.model, len(record.actions)
-        if not steps or not np.isfinite(record.states).all():
+        known, model = _SMOOTHED.setdefault(self.model, WeakKeyDictionary()), self.model
+        if record in known:  # each renewal and the verdict ask for all rollouts
+            return known[record]
+        if not len(record.actions) or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
         target, weight = self.target[model.seen], self.state_weight * (model.n_z // model.sensors)
-        known = distance(record, weight, self.action_weight, self.horizon)
-        return initial_field(model, record.acted_from, record.actions, target, known, self.settings)
+        of_cost = distance(record, weight, self.action_weight, self.horizon)
+        given = record.acted_from, record.actions, target, of_cost, self.settings
+        known[record] = initial_field(model, *given)
+        return known[record]
 
 
 def distance(record: Record, state_weight: float, action_weight: float, horizon: int) -> float:

@@ -153,7 +153,7 @@ def evidence_of(
     None where rollouts alone count: the model replays them, or knows nothing of one of the laws, or all
     rollouts of `base` diverged. held_out: change of the adapted law on fields that did not make it.
     """
-    if loop.replays:
+    if loop.readings is not None:
         return None
     stay = loop.costs(loop.theta(laws[base]), fields)
     evidence = {}

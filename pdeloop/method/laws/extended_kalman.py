@@ -149,20 +149,10 @@ class ExtendedKalman(Observer):
 
 # Every step of an episode asks for it. One thread at a time may use a model.
 @lru_cache(maxsize=64)
-def _filter(
-    thread: int,
-    sensors: int,
-    equation: bytes,
-    centres: bytes,
-    widths: bytes,
-    integration: bytes,
-    mean: bytes,
-    factor: bytes,
-    noise: bytes,
-) -> SensedFilter | None:
-    shared, first = np.frombuffer(equation), np.frombuffer(factor).reshape(FIELD_COEFFICIENTS, -1)
-    largest, substeps, reach, growth = np.frombuffer(integration).tolist()
-    actuators = Actuators(np.frombuffer(centres), np.abs(np.frombuffer(widths)))
+def _filter(thread: int, sensors: int, *parts: bytes) -> SensedFilter | None:
+    shared, centres, widths, integration, mean, factor, noise = map(np.frombuffer, parts)
+    largest, substeps, reach, growth = integration.tolist()
+    actuators, first = Actuators(centres, np.abs(widths)), factor.reshape(FIELD_COEFFICIENTS, -1)
     try:
         settings = replace(
             DEFAULTS,
@@ -175,4 +165,4 @@ def _filter(
             model.step(np.zeros((1, model.n_z)), np.zeros((1, model.n_a)))
     except (ValueError, ZeroDivisionError, OverflowError):
         return None
-    return SensedFilter(model, np.frombuffer(mean), first, *np.abs(np.frombuffer(noise)).tolist())
+    return SensedFilter(model, mean, first, *np.abs(noise).tolist())
