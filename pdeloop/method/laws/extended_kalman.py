@@ -32,11 +32,9 @@ class ExtendedKalman(Observer):
         a_k = K_e x_k + K p_k + D s_k + b
 
     with x_k the estimate of the field given all readings so far (`SensedFilter`), on a grid of n
-    points. It begins as the law `observer`, with K_e = 0, where no filter is computed. An optimiser
-    that identifies an equation of the field between sensors writes it into theta, with the distribution
-    of initial fields and the constants of the filter, and designs K_e and b: `model_based` does.
-
-    Its memory is p_k, the prediction of x_k and the columns S_k of the square root of its covariance.
+    points. It begins as the law `observer`, with K_e = 0, where no filter is computed; `model_based`
+    writes the equation, the distribution of initial fields and the filter's constants into theta. Its
+    memory is p_k, the prediction of x_k and the columns S_k of the square root of its covariance.
 
     Source: Anderson, Moore, *Optimal Filtering*, 1979, section 8.2.
     """

@@ -128,10 +128,9 @@ class Affine(Linear):
 class FeedForward(Linear):
     """a_k = K s_k + b_k, s = U^T z, for k = 0 .. T - 1; at T and beyond b_{T-1} again.
 
-    It starts with the LQ-tracking gains: K = K_a, and b_k = K_b s_r at all steps. A constant b cannot
-    foresee the transient from one initial field to the target, of which the b_k may hold what is
-    common to all fields. Where the cost is more than numbers and a constant target, the b_k are
-    those of `tracking_offsets`.
+    It starts with the LQ-tracking gains: K = K_a, and b_k = K_b s_r at all steps, or where the cost is
+    more than numbers and a constant target those of `tracking_offsets`. The b_k may hold what is common
+    to the transients from all fields.
     """
 
     name = "feedforward"
@@ -155,12 +154,9 @@ class Observer(Linear):
 
     with K_b s_r and what the rows of the model have besides it (`ModelRows.constant`).
 
-    Where the target moves, b and c have a row for each step, b_k and c_k, and the b_k are those of
-    `feedforward`: an estimate takes the place of the state (separation), and the target is known ahead.
-
-    Its memory is p_k. B is the model's, and a_k is what the plant gets, so that a saturated action
-    misleads no prediction. A model without a filter gain has L = I, the filter for exact measurements:
-    this is then the affine law.
+    Where the target moves, b and c have a row for each step, and the b_k are those of `feedforward`.
+    a_k in p_{k+1} is what the plant gets, so that a saturated action misleads no prediction. A model
+    without a filter gain has L = I, the filter for exact measurements: this is then the affine law.
 
     Source: Anderson, Moore, *Optimal Control: Linear Quadratic Methods*, 1990, chapter 8.
     """

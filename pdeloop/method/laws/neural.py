@@ -41,10 +41,9 @@ class Neural(Extended):
 
         a_k = K s_k + b_k + D tanh(W x_k + w) + d,        s = U^T z,    x_k = s_k or [s_k; b_k],
 
-    the latter where b_k is one of each step, as of a target that moves: it tells what this target and
-    those to come ask for. It begins without a network. An optimiser that has a model of the plant
-    trains one and writes it into theta: `model_based` does. theta is then longer by h, the number of
-    neurons, and W, w, D and d, row after row.
+    the latter where b_k is one of each step, which tells what targets to come ask for. It begins
+    without a network; one that `model_based` trains makes theta longer by h, the number of neurons, and
+    W, w, D and d, row after row.
 
     Source: Goodfellow, Bengio, Courville, *Deep Learning*, 2016, chapter 6.
     """
