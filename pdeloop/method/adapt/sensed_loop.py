@@ -80,9 +80,9 @@ FILTER_INFLATION = 1.0
 """Factor by which the standard deviations of its estimate grow in every step."""
 _FILTER_SEEN = 0.2
 """Noise, as a share of the size of a field, for which one of its laws is optimised."""
-INDEPENDENT = (0.3, 1.0)
-"""Shares of the standard deviation of each wave that initial fields are assumed to have besides the
-covariance of those that were estimated; each makes a filter."""
+_INDEPENDENT = 0.3
+"""Share of the standard deviation of each wave that initial fields are assumed to have besides the
+covariance of those that were estimated."""
 UNPREDICTED = (6.0, 3.0)
 """Multiples of `filter_unpredicted` with which the cheapest law is tried again, one after the other."""
 SHARES = (0.01, 0.1, 1.0)
@@ -312,30 +312,24 @@ def estimated_laws(
 ) -> tuple[list[Array], int]:
     """Theta of laws on the estimate, and the steps of L-BFGS; none if none is finite.
 
-    That of the whole field, and one that is optimised with noise on what it sees; each with filters
-    that know the initial fields well, and less.
+    That of the whole field, and one that is optimised with noise on what it sees.
     """
     model = loop.model
     whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
     if whole is None:
         return [], 0
-    size = root_mean_square(model.spread)
-    noise = noise_of_filter(model, settings)
-    filters = [
-        SensedFilter(model, *prior(fields, weights, share), noise, FILTER_INFLATION)
-        for share in INDEPENDENT
+    of_fields, noise = prior(fields, weights, _INDEPENDENT), noise_of_filter(model, settings)
+    known = SensedFilter(model, *of_fields, noise, FILTER_INFLATION)
+    seen = replace(whole.loop, noise=_FILTER_SEEN * root_mean_square(model.spread))
+    found = improve(seen, whole.theta, fields, weights, curvature_of(seen), settings)
+    every = [(whole.theta, whole.steps), *([(found.theta, found.steps)] if found else [])]
+    laws = [
+        loop.kalman.theta_of(
+            theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1], known, loop.settings
+        )
+        for theta, _ in every
     ]
-    found, theta, steps = [], whole.theta, whole.steps
-    for share in (0.0, _FILTER_SEEN):
-        seen = replace(whole.loop, noise=share * size)
-        if share:
-            better = improve(seen, theta, fields, weights, curvature_of(seen), settings)
-            if better is None:
-                continue
-            theta, steps = better.theta, steps + better.steps
-        K, b = theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1]
-        found += [loop.kalman.theta_of(K, b, known, loop.settings) for known in filters]
-    return found, steps
+    return laws, sum(steps for _, steps in every)
 
 
 def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
