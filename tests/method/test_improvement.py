@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -297,7 +298,8 @@ def renewed(measured: np.ndarray, **constants: int) -> tuple[Renewal, float]:
     """The law made from a few fields, and its cost on many others."""
     closed = loop()
     none, settings = closed.no_control, ModelBasedSettings(mixtures=2, **constants)
-    found = renew(closed, none, none, [], measured, np.random.default_rng(6), settings)
+    draw = partial(mixtures, rng=np.random.default_rng(6))
+    found = renew(closed, none, none, [], measured, draw, settings)
     assert found is not None
     return found, float(closed.costs(found.theta, fields(100)).mean())
 
@@ -312,8 +314,9 @@ def test_a_law_that_asks_for_more_than_there_is_everywhere_is_improved() -> None
     measured = np.random.default_rng(4).normal(size=(6, 3))
     assert (closed.simulate(first, measured).actions == 3.0).all()
     assert not closed.gradient(first, measured, np.full(6, 1 / 6))[1].any()
-    rng, settings = np.random.default_rng(6), ModelBasedSettings(mixtures=2, most_mixtures=2)
-    found = renew(closed, first, first, [], measured, rng, settings)
+    draw = partial(mixtures, rng=np.random.default_rng(6))
+    settings = ModelBasedSettings(mixtures=2, most_mixtures=2)
+    found = renew(closed, first, first, [], measured, draw, settings)
     assert found is not None and found.fraction == 1.0 and found.change.is_negative(1.0)
     # The law that is best from every field: 3 until the target is there, and then 1.
     best = np.column_stack([-0.8 * np.eye(2, 3), np.full(2, 5.0)])

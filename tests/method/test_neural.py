@@ -19,6 +19,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import RolloutResult, Trajectory
 from pdeloop.method.adapt.network import ModelBasedNeural, Network, NetworkTraining
+from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner, simulated
@@ -143,7 +144,7 @@ def training(
     states = simulated(planner, fields, plans.planned(planner))[1].reshape(-1, N_Z)
     curvature = np.array([[2.0, 0.3], [0.3, 1.0]])
     network = Network.of(U, K, b, states, curvature, 3.0, H)
-    made = NetworkTraining(network, planner, fields, [1, 2], 1, periodic=True, noise=noise)
+    made = NetworkTraining(network, planner, fields, [1, 2], mixtures, noise)
     return made, network, fields
 
 

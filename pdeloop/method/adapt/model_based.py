@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -463,26 +464,17 @@ class ModelBased(Optimizer):
         self._progress.safe = safe
         improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
-        data = self._data()
+        draw: renewal.Draw = partial(
+            renewal.mixtures, rng=rng, components=belief.components, periodic=self._context.periodic
+        )
+        data, settings, known = self._data(), self._settings, (loop, base, improved)
         states = renewal.measured_states(data, CHAOTIC_FIELDS)
         if not belief.whole or renewal.any_state_serves(loop, base, fields, states):
             row["chaotic"] = True
-            found = renewal.renew_from_states(
-                loop, base, improved, data, rng, self._settings, final=final
-            )
+            found = renewal.renew_from_states(*known, data, draw, settings, final=final)
         else:
-            found = renewal.renew(
-                loop,
-                base,
-                improved,
-                self._progress.parts,
-                fields,
-                rng,
-                self._settings,
-                components=belief.components,
-                periodic=self._context.periodic,
-                final=final,
-            )
+            parts = self._progress.parts
+            found = renewal.renew(*known, parts, fields, draw, settings, final=final)
         if found is None:
             self._replay(belief, row, final, "no improved law stays finite on the model")
             return

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,6 +77,9 @@ _TRAINING, _JUDGING, _ENDED = "training", "judging", "ended"
 _OWN = "own."
 _NUMBERS = {"stage": "U", "tells": "i", "count": "i", "kept": "i", "share": "f"}
 """What is one number or text of a checkpoint, and its NumPy kind."""
+
+
+Told: TypeAlias = Sequence[tuple[Rollout, RolloutResult]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,27 +324,20 @@ class ModelBasedPredictive(Optimizer):
         policy, base = self._affine.policy, FIRST
         if not np.array_equal(policy, self._first):
             base = ADAPTED if policy.any() else NONE
-        evidence = self._evidence(self._candidate, base, asked, results, row)
+        evidence = self._evidence(base, list(zip(asked, results, strict=True)), row)
         found = verdict.choose(evidence, base, self._settings.confidence)
         if found.chosen == self.candidate:
             self._chosen = self._candidate.theta
         row |= found.row
 
-    def _evidence(
-        self,
-        candidate: Candidate,
-        base: str,
-        asked: Sequence[Rollout],
-        results: Sequence[RolloutResult],
-        row: Row,
-    ) -> Mapping[str, Evidence]:
+    def _evidence(self, base: str, told: Told, row: Row) -> Mapping[str, Evidence]:
         """Of the law that plans and the one to stay with, from their rollouts."""
-        belief, policy = self._affine.belief, self._affine.policy
-        assert belief is not None
+        belief, policy, candidate = self._affine.belief, self._affine.policy, self._candidate
+        assert belief is not None and candidate is not None
         loop = belief.loop(self._context)
         theta = loop.theta(policy)
         excess, costs, before = list[float](), [candidate.costs], [candidate.before]
-        usable = [r for r in results if r.usable and r.trajectory is not None]
+        usable = [r for _, r in told if r.usable and r.trajectory is not None]
         if usable:
             fields = np.stack([r.trajectory.states[0] for r in usable if r.trajectory is not None])
             own = self._costs_of(candidate.theta, belief, fields)
@@ -349,7 +345,7 @@ class ModelBasedPredictive(Optimizer):
             before.append(loop.costs(theta, fields))
             row["predicted"] = float(np.mean(own))
             excess = [r.cost - float(c) for r, c in zip(usable, own, strict=True)]
-        excess += [np.inf] * (len(results) - len(usable))
+        excess += [np.inf] * (len(told) - len(usable))
         of_base = verdict.excess_of(loop, of_law(self._affine.records, policy))
         change = mean_change(np.concatenate(costs), np.concatenate(before))
         return {
@@ -461,18 +457,13 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         known = list(costs_by_field(self._affine.records, self._affine.policy))
         return [*known, *super()._seeds()][: self._left]
 
-    def _evidence(
-        self,
-        candidate: Candidate,
-        base: str,
-        asked: Sequence[Rollout],
-        results: Sequence[RolloutResult],
-        row: Row,
-    ) -> Mapping[str, Evidence]:
+    def _evidence(self, base: str, told: Told, row: Row) -> Mapping[str, Evidence]:
         """Means over pairs from the same initial fields."""
+        candidate = self._candidate
+        assert candidate is not None
         row["predicted"] = float(np.mean(candidate.costs))
         known, none = self._affine.records, np.empty((0, 0))
-        for own, result in zip(asked, results, strict=True):
+        for own, result in told:
             cost = result.cost if result.usable else np.inf
             known.append(Record(own.policy, cost, none, none, field_seed=own.field_seed))
         laws = {base: self._affine.policy, PREDICTIVE: candidate.theta}

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -98,24 +99,11 @@ class ModelBasedNeural(ModelBasedPredictive):
         known = np.isfinite(costs)
         if not (known.any() and costs[known].any()):
             return f"the law {own.without.name} does not stay finite on the model, or costs nothing"
-        network = Network.of(
-            context.U,
-            K,
-            b,
-            states[known].reshape(-1, states.shape[2]),
-            curvature_of(loop),
-            float(costs[known].mean()),
-            own.settings.neurons,
-        )
-        training = NetworkTraining(
-            network,
-            planner,
-            every,
-            [self._seed, _STREAM, self._count],
-            belief.components,
-            periodic=context.periodic,
-            noise=loop.noise,
-        )
+        rows, cost = states[known].reshape(-1, states.shape[2]), float(costs[known].mean())
+        network = Network.of(context.U, K, b, rows, curvature_of(loop), cost, own.settings.neurons)
+        seed = [self._seed, _STREAM, self._count]
+        draw = partial(mixtures, components=belief.components, periodic=context.periodic)
+        training = NetworkTraining(network, planner, every, seed, draw, loop.noise)
         numbers = training.trained(own.settings.iterations)
         every = np.concatenate([every, training.drawn(HELD_OUT)])
         before = simulated(planner, every, self._acts(planner, policy, loop.noise))[0]
@@ -249,13 +237,11 @@ class NetworkTraining:
         planner: Planner,
         fields: Array,
         seed: list[int],
-        components: int,
-        *,
-        periodic: bool,
+        draw: Callable[[Array, int, np.random.Generator], Array],
         noise: float,
     ) -> None:
         self._network, self._planner, self._fields, self._noise = network, planner, fields, noise
-        self._rng, self._of_fields = np.random.default_rng(seed), (components, periodic)
+        self._rng, self._draw = np.random.default_rng(seed), draw
         self._part = min(PART, planner.cost.horizon)
 
     def trained(self, iterations: int) -> Array:
@@ -269,8 +255,7 @@ class NetworkTraining:
         """Initial fields (count, n_z)."""
         found = list[Array]()
         while sum(map(len, found)) < count:
-            components, periodic = self._of_fields
-            own = mixtures(self._fields, _DRAWN, self._rng, components, periodic=periodic)
+            own = self._draw(self._fields, _DRAWN, self._rng)
             found.append(own if len(own) else self._fields)
         every = np.concatenate(found)
         return every[self._rng.permutation(len(every))[:count]]

@@ -32,8 +32,9 @@ Cochran, "Sampling Techniques", 3rd ed., Wiley 1977, chapter 6 (ratio estimators
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy import linalg
@@ -47,6 +48,8 @@ from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN,
 
 PARTS = 2
 """Parts of the fields, each held out once to choose how far the law moves."""
+Draw: TypeAlias = Callable[[Array, int], Array]
+"""From measured initial fields, at most so many further ones: `mixtures` with a generator."""
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
 _CHAOTIC_MOST = 96
@@ -89,11 +92,9 @@ def renew(
     improved: Array,
     parts: Sequence[Array],
     fields: Array,
-    rng: np.random.Generator,
+    draw: Draw,
     settings: ModelBasedSettings,
     *,
-    components: int = 1,
-    periodic: bool = True,
     final: bool = True,
 ) -> Renewal | None:
     """The law of least cost on the model, moved as far as held-out fields confirm; None: not finite.
@@ -108,8 +109,7 @@ def renew(
 
     def descend(starts: Sequence[Array], fields: Array, most: int) -> Improvement | None:
         """The law after a descent from the cheapest of some laws; most: fields to draw."""
-        drawn = mixtures(fields, most, rng, components, periodic=periodic)
-        every, weights = weighted(fields, drawn)
+        every, weights = weighted(fields, draw(fields, most))
         starts = [*starts, *others]
         if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
             starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
@@ -178,7 +178,7 @@ def renew_from_states(
     first: Array,
     improved: Array,
     records: Sequence[Record],
-    rng: np.random.Generator,
+    draw: Draw,
     settings: ModelBasedSettings,
     *,
     final: bool = True,
@@ -188,7 +188,7 @@ def renew_from_states(
     for count in (CHAOTIC_FIELDS, _CHAOTIC_MOST):
         fields = measured_states(records, count)
         # Others than last time, so that the laws of the parts may know those of their own part.
-        found = renew(loop, first, improved, [], fields, rng, settings, final=final)
+        found = renew(loop, first, improved, [], fields, draw, settings, final=final)
         if found is None or found.change.is_negative(settings.confidence, _CHAOTIC_CLEAR):
             break
         gain = own_gain(loop, first, found, fields)
