@@ -263,7 +263,7 @@ class ModelBasedSensed(ModelBasedReadings):
         base = super()._decide(row, laws)
         pair, known = {base: laws[base], ADAPTED: laws[ADAPTED]}, self._records.all()
         common = set[int].intersection(*(set(costs_by_field(known, law)) for law in pair.values()))
-        same = np.array_equal(*pair.values()) or row["chosen"] not in pair
+        same = np.array_equal(pair[base], pair[ADAPTED]) or row["chosen"] not in pair
         if self._sensed is None or same or len(common) < FEWEST:
             return base
         evidence = verdict.evidence_of_rollouts(pair, base, known)

@@ -19,7 +19,7 @@ begins; v is the noise plus the part of a reading that the modes do not represen
 the target would have unstable modes in directions that no field takes.
 
 Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So the
-law is also mixed with the best law of the newest readings, a = D y + b, found by a descent on the model
+law is compared with the best law of the newest readings, a = D y + b, found by a descent on the model
 from the regression of the actions on the readings.
 
 The law starts with p_0 = U^T y_0. The compensator's coordinates are those in which this is the best
@@ -85,10 +85,8 @@ _INDEPENDENT = 0.3
 covariance of those that were estimated."""
 UNPREDICTED = (6.0, 3.0)
 """Multiples of `filter_unpredicted` with which the cheapest law is tried again, one after the other."""
-SHARES = (0.01, 0.1, 1.0)
-"""Shares of the initial second moment that count as process noise over an episode; each makes laws."""
-ESTIMATED = (1.0, 0.5, 0.0)
-"""Shares of the action that follow the filter's estimate; the rest follows the newest readings."""
+SHARE = 0.1
+"""Share of the initial second moment that counts as process noise over an episode."""
 RIDGE = 1e-6
 """Of the regressions, relative to the mean square of a mode."""
 TOLD = 1e-2
@@ -384,8 +382,7 @@ def compensators(
 ) -> Iterator[Array]:
     """Theta (`LinearLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
 
-    One for each of `SHARES` and `ESTIMATED`. settings: of the descent to the law of newest readings,
-    which without them is the regression's.
+    settings: of the descent to the latter, which without them is the regression's.
     """
     model = loop.model
     z, a = law.simulation.states, law.simulation.actions
@@ -409,18 +406,14 @@ def compensators(
     if settings is not None:
         D, own = _of_readings(loop, D, own, z[0], law.weights, settings)
     K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
-    for share in SHARES:
-        try:
-            M = kalman_filter(A, C, W + share / steps * first, V).M
-        except DesignError:
-            continue
-        I_MC = np.eye(n_s) - M @ C
-        after = A @ I_MC, A @ M, c - A @ M @ d
-        for part in ESTIMATED:
-            rows = part * K @ I_MC, part * K @ M, part * (b - K @ M @ d)
-            rest = (1.0 - part) * D, (1.0 - part) * own
-            mixed = rows[0], rows[1] + rest[0], rows[2] + rest[1]
-            yield law_theta(loop, B, guess, mixed, after)
+    try:
+        M = kalman_filter(A, C, W + SHARE / steps * first, V).M
+    except DesignError:
+        return
+    I_MC = np.eye(n_s) - M @ C
+    after = A @ I_MC, A @ M, c - A @ M @ d
+    for rows in ((K @ I_MC, K @ M, b - K @ M @ d), (np.zeros_like(K), D, own)):
+        yield law_theta(loop, B, guess, rows, after)
 
 
 class _WithOffset(ClosedLoop):
