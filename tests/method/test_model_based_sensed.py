@@ -12,7 +12,6 @@ import pytest
 
 from pdeloop.method.adapt import (
     ModelBased,
-    Record,
     Rollout,
     Trajectory,
     model_based_sensed,
@@ -23,8 +22,7 @@ from pdeloop.method.adapt.sensed_loop import UNPREDICTED, noise_of_filter, sense
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.models.sensed import SensedModel
-from tests.support.sensed import SENSORS
-from tests.support.sensed_optimiser import N_A, measured, optimiser, small, told
+from tests.support.sensed_optimiser import measured, optimiser, small, told
 from tests.support.small import same_bits
 
 
@@ -75,24 +73,6 @@ def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields
     assert {each.field_seed for each in judged} == {each.field_seed for each in asked}
 
 
-def test_all_rollouts_of_no_control_are_evidence_against_it() -> None:
-    """Of three pairs chance explains the difference, of all of its rollouts it does not."""
-    own, (result, *_), row = told(rollouts=7, judging=3)
-    assert not own._progress.safe
-    final, checked = own._progress.policy, [70.0, np.inf]  # before, and in an exploration
-    few = np.zeros((1, SENSORS)), np.zeros((0, N_A))
-    own._context = replace(
-        own._context, measured=[Record(own._none, cost, *few) for cost in checked]
-    )
-    known, costs = [34.0, 47.0, 103.0, 47.0, 93.0, 113.0], [55.0, 52.0, 48.0]
-    for law, every in ((own._none, known), (final, costs)):
-        for cost in every:
-            own._records.add([Rollout(law, -1)], [replace(result, cost=cost)])
-    own._judge(row)
-    assert row["chosen"] == "adapted"
-    assert row["predicted_change"] == pytest.approx(np.mean(costs) - np.mean([*known, 70.0]))
-
-
 def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
     own, *_ = told(better=True, rollouts=7, judging=3)
     before, final = own._first + 1e-6, own._first + 2e-6
@@ -118,14 +98,15 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
     own, *_ = told(better=True, rollouts=7, judging=3)
     before, final, row = own._first + 1e-6, own._first + 2e-6, dict[str, Any]()
     own._progress.policy = final
+    seeds = [record.field_seed for record in own._of(own._first)]
     first = [record.cost for record in own._of(own._first)]
     assert len(first) == 3
-    for law, share in ((before, 0.4), (final, 0.4 * more)):
-        for seed, cost in enumerate(first, start=1):
+    for law, share, fields in ((before, 0.4, [-1] * 3), (final, 0.4 * more, seeds)):
+        for seed, (cost, of_field) in enumerate(zip(first, fields, strict=True), start=1):
             result = measured(Rollout(law, seed))
             # Alike from field to field, so that three rollouts decide.
             level = share * (np.mean(first) + 0.01 * (cost - np.mean(first)))
-            own._records.add([Rollout(law, -1)], [replace(result, cost=float(level))])
+            own._records.add([Rollout(law, of_field)], [replace(result, cost=float(level))])
     own._judge(row)
     assert row["chosen"] == "adapted"
     assert same_bits(own.policy, before if more > 1.0 else final)

@@ -7,7 +7,7 @@ And the numbers of rollouts after which it renews its law and judges the final o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +23,6 @@ RENEWING, JUDGING, ENDED = "renewing", "judging", "ended"
 LARGEST = 1e150
 """Largest change on fields that were left out."""
 _STAGES = (RENEWING, JUDGING, ENDED)
-_NUMBERS = {
-    "stage": "U",
-    "tells": "i",
-    "replayed": "b",
-    "trust": "f",
-    "none_is_close": "b",
-    "safe": "b",
-    "noise": "f",
-    "rested": "i",
-}
-"""What is one number or text of a checkpoint, and its NumPy kind."""
 
 
 @dataclass(eq=False)
@@ -100,6 +89,11 @@ class Progress:
             change=Estimate(*known.tolist()),
             **numbers,
         )
+
+
+_KINDS = {"str": "U", "int": "i", "bool": "b", "float": "f"}
+_NUMBERS = {own.name: _KINDS[str(own.type)] for own in fields(Progress) if own.type in _KINDS}
+"""What is one number or text of a checkpoint, and its NumPy kind."""
 
 
 @dataclass(frozen=True)
