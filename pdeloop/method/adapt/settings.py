@@ -34,46 +34,28 @@ class ModelBasedSettings(Settings):
     judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
     believed: float = setting(
         0.05,
-        "largest error E at which a model is used; above it, laws are steps along measured rollouts",
+        "largest E at which a model is used; above it, laws are steps along rollouts",
         0.0,
         1.0,
     )
     mixtures: int = setting(
-        24,
-        "maximum number of initial fields drawn around the measured ones; half as many before "
-        "the final law",
-        0,
-        1000,
+        24, "most initial fields that are drawn; half as many before the final law", 0, 1000
     )
     most_mixtures: int = setting(
-        96,
-        "the same for the final law if the one from fewer fields is not confirmed by the fields "
-        "left out",
-        0,
-        1000,
+        96, "the same for a final law that fields left out do not confirm", 0, 1000
     )
     iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
     least_gain: float = setting(
-        1e-3,
-        "relative reduction of the cost that a window must reach for the descent to continue",
-        0.0,
-        1.0,
+        1e-3, "relative gain in a window of steps with which a descent continues", 0.0, 1.0
     )
     confidence: float = setting(
-        1.0,
-        "standard errors by which a law must beat the first one if they are known exactly; more "
-        "if they are estimated from few rollouts",
-        0.0,
-        10.0,
+        1.0, "standard errors, if exact, by which a law must beat the first one", 0.0, 10.0
     )
     enough_fields: int = setting(
         48, "number of measured fields at which improvements stop", 2, 1_000_000
     )
     observer_iterations: int = setting(
-        400,
-        "as iterations, for the last improvement of the law observer on a model of the field",
-        1,
-        10_000,
+        400, "as iterations, for the last one of an observer of few sensors", 1, 10_000
     )
     filter_unpredicted: float = setting(
         0.04,
@@ -83,9 +65,5 @@ class ModelBasedSettings(Settings):
         1.0,
     )
     filter_margin: float = setting(
-        0.03,
-        "largest relative increase in the cost on the model at which a filter that trusts the "
-        "equation less is still used",
-        0.0,
-        1.0,
+        0.03, "share of the cost that a filter may add by trusting the equation less", 0.0, 1.0
     )
