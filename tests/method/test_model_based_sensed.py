@@ -16,7 +16,7 @@ from pdeloop.method.adapt import (
     Trajectory,
     model_based_sensed,
 )
-from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed, gained
+from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
 from pdeloop.method.adapt.progress import JUDGING
 from pdeloop.method.adapt.sensed_loop import UNPREDICTED, noise_of_filter, sensed_from
 from pdeloop.method.adapt.settings import ModelBasedSettings
@@ -203,9 +203,3 @@ def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
     _, context = small()
     other = replace(context, periodic=False)
     assert ModelBased.for_context(other) is ModelBasedReadings
-
-
-def test_a_change_is_that_of_the_fields_from_which_both_laws_are_finite() -> None:
-    change = gained(np.array([1.0, np.inf, 3.0]), np.array([2.0, np.inf, 5.0]))
-    assert change.value == -1.5 and change.error == pytest.approx(0.5)
-    assert np.isnan(gained(np.array([np.inf]), np.array([1.0])).value)

@@ -223,10 +223,11 @@ class ModelBasedSensed(ModelBasedReadings):
         first = loop.costs(loop.theta(self._first), held_out)
         none = loop.costs(loop.no_control, held_out)
         progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
-        base = first if progress.safe else none
-        progress.change = change = gained(loop.costs(theta, held_out), base)
-        row["steps"] = steps
-        if np.isfinite(change.value):
+        with np.errstate(invalid="ignore"):
+            changes = loop.costs(theta, held_out) - (first if progress.safe else none)
+        known, row["steps"] = changes[np.isfinite(changes)], steps
+        progress.change = change = mean_of(known) if len(known) else Estimate(np.nan, np.nan)
+        if len(known):
             row["predicted_change"], row["deviation"] = change.value, change.error
 
     def _drawn(self, fields: Array, sets: int, which: int) -> Array:
@@ -294,9 +295,3 @@ def _observers(
     gain = longer.least_gain if final else FIRST_GAIN
     found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
     return ([], 0) if found is None else ([start, found.theta], found.steps)
-
-
-def gained(costs: Array, base: Array) -> Estimate:
-    """The mean change against the costs of another law, where both are finite; NaN where none is."""
-    known = np.isfinite(costs) & np.isfinite(base)
-    return mean_of(costs[known] - base[known]) if known.any() else Estimate(np.nan, np.nan)
