@@ -191,8 +191,6 @@ class Planner:
                 seen = np.where(close, actions, requested)
                 own = sweep.roll_back(seen, on_states, on_actions, K, eta)
                 g[rows] = np.where(self._leaves(actions, own), 0.0, own)
-                if self.action_set.rated:
-                    kept[rows] += self._further(z[rows], actions, own)
 
         self._sweep.each(len(z), work)
         lost = ~(
@@ -208,16 +206,6 @@ class Planner:
         up = actions >= high - _CLOSE * (1.0 + np.abs(high))
         held: Flags = (down & (g > 0.0)) | (up & (g < 0.0))
         return held
-
-    def _further(self, z: Array, actions: Array, g: Array) -> Array:
-        """What the requests of actions that a rate limit holds back are beyond them."""
-        allowed, before = self.action_set, z[:, None, self.model.n_z :]
-        low, high = allowed.within(np.concatenate([before, actions[:, :-1]], axis=1))
-        held, close = (g == 0.0) & np.isfinite(allowed.rate), _CLOSE * (1.0 + np.abs(actions))
-        down = held & (actions <= low + close) & (low > allowed.low)
-        up = held & (actions >= high - close) & (high < allowed.high)
-        found: Array = np.where(held, allowed.rate, 0.0) * (up.astype(float) - down)
-        return found
 
     def improved(
         self, v: Array, z: Array, k: int, iterations: int, known: tuple[Array, Array] | None = None
@@ -247,9 +235,6 @@ class Planner:
                 todo = todo[~good]
                 t[todo] *= SHORTER
             s, y = new_v - v, new_g - g
-            if self.action_set.rated:  # requests beyond a limit say nothing about curvature
-                free = (g != 0.0) & (new_g != 0.0)
-                s, y = s * free, y * free
             product = (s * y).sum(axis=(1, 2))
             curved = product > 1e-14 * np.maximum((g * g).sum(axis=(1, 2)), 1e-300)
             pairs = [*pairs[1 - MEMORY :], (s, y, np.where(curved, product, np.inf))]
