@@ -135,7 +135,7 @@ class Planner:
         else:
             affine = self._affine_plan(z, k, H)
             of_affine = self.costs(affine, z, k)
-            J, g, kept = self.gradient(self._extended(plan[:, :H], z, k), z, k)
+            J, g, kept = self.gradient(plan[:, :H], z, k)
             fell = ~(of_affine >= J)
             plan = np.where(fell[:, None, None], affine, kept)
             if fell.any():
@@ -152,15 +152,6 @@ class Planner:
     def shifted(self, plan: Array) -> Array:
         """A plan (M, H, n_a) without its first action, and with a zero at the end."""
         return np.concatenate([plan[:, 1:], np.zeros_like(plan[:, :1])], axis=1)
-
-    def _extended(self, plan: Array, z: Array, k: int) -> Array:
-        """The plan (M, H, n_a) that ends as the affine law acts."""
-        if self.around:
-            return plan
-        found, (states, _), last = plan.copy(), self._rolled(z, plan, k), k + plan.shape[1] - 1
-        with np.errstate(all="ignore"):
-            found[:, -1] = self.action_set.project(self._law(states[:, -2], last, self.K, self.b))
-        return found
 
     def costs(self, v: Array, z: Array, k: int) -> Array:
         """J (M,) of plans v (M, H, n_a) from states z (M, n_z) at step k; infinite if not finite."""
