@@ -67,26 +67,19 @@ class Belief:
 
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""
-        problem = (
-            context.U,
-            context.target,
-            context.state_weight,
-            context.action_weight,
-            context.horizon,
-            context.action_set,
-        )
+        U, target, q, r = context.U, context.target, context.state_weight, context.action_weight
+        given = q, r, context.horizon, context.action_set
         on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
         on["reach"] = FAR * context.largest
         if isinstance(self.model, ReadingsModel):
             assert isinstance(context.law, Observer)
             seen = self.model.U.T
-            of_readings = (seen @ context.U, seen @ context.target, *problem[2:])
-            known = self.model.U @ self.model.C
-            cost = None if context.cost is None else context.cost.through(known)
-            return ReplayedLoop(*of_readings, model=self.model, law=context.law, cost=cost)
+            cost = context.cost and context.cost.through(self.model.U @ self.model.C)
+            own: dict[str, Any] = {"model": self.model, "law": context.law, "cost": cost}
+            return ReplayedLoop(seen @ U, seen @ target, *given, **own)
         if isinstance(self.model, SensedModel):
             return sensed_loop(context, self.model)
-        law = context.with_constants
+        law, problem = context.with_constants, (U, target, *given)
         return LinearLoop(*problem, **on, law=law) if law else ClosedLoop(*problem, **on)
 
 

@@ -130,21 +130,18 @@ class ModelBased(Optimizer):
     def for_context(cls, context: Context) -> type[Optimizer]:
         """Another one for a law that plans, has a network, or estimates the state from few readings."""
         # Not at the top: they know this class.
-        from pdeloop.method.adapt.model_based_predictive import (
-            ModelBasedPredictive,
-            ModelBasedPredictiveSensed,
-        )
-        from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
-        from pdeloop.method.adapt.network import ModelBasedNeural
+        from pdeloop.method.adapt import model_based_predictive as plans
+        from pdeloop.method.adapt import model_based_sensed as sensed
+        from pdeloop.method.adapt import network
 
         if isinstance(context.law, Neural):
-            return ModelBasedNeural
+            return network.ModelBasedNeural
         if isinstance(context.law, Predictive):
             few = isinstance(context.law, PredictiveKalman)
-            return ModelBasedPredictiveSensed if few else ModelBasedPredictive
+            return plans.ModelBasedPredictiveSensed if few else plans.ModelBasedPredictive
         if not context.of_readings:
             return cls
-        return ModelBasedSensed if can_be_sensed(context) else ModelBasedReadings
+        return sensed.ModelBasedSensed if can_be_sensed(context) else sensed.ModelBasedReadings
 
     @classmethod
     def first_step(cls, settings: ModelBasedSettings) -> int:

@@ -59,8 +59,7 @@ class ModelBasedSettings(Settings):
     )
     filter_unpredicted: float = setting(
         0.04,
-        "share of the size of a field that its filter adds to the noise of a reading for what no "
-        "model predicts; 6 times as much, or else 3 times, where filter_margin allows it",
+        "share of a field's size that a filter adds to a reading's noise, 1 to 6 times",
         0.0,
         1.0,
     )

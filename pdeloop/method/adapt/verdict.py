@@ -262,7 +262,7 @@ def cheaper_law(
         if loop is not None:
             pair = {"law": law, FIRST: chosen}
             evidence = evidence_of(loop, pair, FIRST, records, fields, ZERO)
-            estimates.append(_change(evidence or {}, "law", FIRST))
+            estimates.append(_change(evidence or {}))
         usable = [own for own in estimates if own is not None and np.isfinite(own.value)]
         if usable:
             change = min(usable, key=lambda own: own.error)
@@ -276,15 +276,13 @@ def measured_change(
 ) -> Estimate | None:
     """The change of a law against another by their rollouts; None where either lacks finite ones."""
     evidence = evidence_of_rollouts({"law": law, FIRST: base}, FIRST, records, replays)
-    return _change(evidence, "law", FIRST) if of_law(records, base) else None
+    return _change(evidence) if of_law(records, base) else None
 
 
-def _change(evidence: Mapping[str, Evidence], name: str, base: str) -> Estimate | None:
-    """The change of a law against another, corrected by rollouts; None where either lacks one."""
-    if name not in evidence or base not in evidence:
-        return None
-    own, other = evidence[name], evidence[base]
-    if np.isinf(own.excess).any():
+def _change(evidence: Mapping[str, Evidence]) -> Estimate | None:
+    """The change of "law" against the first one, corrected by rollouts; None where either lacks one."""
+    own, other = evidence.get("law"), evidence.get(FIRST)
+    if own is None or other is None or np.isinf(own.excess).any():
         return None
     return own.change + _correction(own) - _correction(other)
 

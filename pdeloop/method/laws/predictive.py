@@ -39,10 +39,7 @@ class PredictiveSettings(Settings):
     """Constants of the law `predictive`."""
 
     steps: int = setting(
-        0,
-        "steps H of a plan; 0: the shortest of 20, 40 and 80 that suffices on the model",
-        0,
-        LONGEST,
+        0, "steps H of a plan; 0: the shortest of 20, 40 and 80 that suffices", 0, LONGEST
     )
     iterations: int = setting(2, "iterations of the search at a step", 0, 100)
     first_iterations: int = setting(60, "iterations of the first search from each start", 0, 1000)
