@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
+from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import improve
+from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.renewal import (
     Renewal,
     averaged_over_shifts,
@@ -226,6 +227,24 @@ def test_units_of_actions_and_states_do_not_change_an_improvement() -> None:
     two = improve(scaled, theta * units, scale * start, weights, G / size**2, settings)
     assert one is not None and two is not None
     np.testing.assert_allclose(two.theta / units, one.theta, rtol=1e-5, atol=1e-7)
+
+
+def test_the_unit_of_one_action_does_not_change_an_improvement() -> None:
+    """kW beside kg/s: the curvature is that of the whole cost, whatever its weights."""
+    A, B, units = 0.9 * np.eye(4) + 0.1 * np.eye(4, k=1), np.eye(4, 2), np.array([1.0, 1e3])
+    settings = ModelBasedSettings(iterations=4, least_gain=0.0)
+    found = []
+    for own in (np.ones(2), units):
+        Q, R = np.array([2.0, 1.0, 0.0, 0.5]), np.diag([0.4, 0.1]) * own**2
+        cost = Cost(4, 2, T, state_weight=Q, action_weight=R)
+        model = LinearModel("linear", A, B * own, np.zeros(4))
+        closed = ClosedLoop(np.eye(4), np.zeros(4), *cost.size, T, model=model, cost=cost)
+        curvature = curvature_of(closed)
+        start = np.random.default_rng(4).normal(size=(6, 4))
+        law = improve(closed, np.zeros((2, 5)), start, np.full(6, 1 / 6), curvature, settings)
+        assert law is not None
+        found.append(law.theta * own[:, None])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-7)
 
 
 def test_mixtures_have_the_mean_and_covariance_they_claim() -> None:

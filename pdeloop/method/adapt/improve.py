@@ -23,6 +23,7 @@ import numpy as np
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import LARGEST, ClosedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqt import action_curvature
@@ -161,15 +162,16 @@ def index_of_cheapest(costs: Array, weights: Array) -> int:
 
 def curvature_of(loop: ClosedLoop) -> Array:
     """R + B^T P B of the model linearised at the target; R where there is none."""
-    n_a, r = loop.model.n_a, loop.action_weight
-    if loop.model.n_z <= LARGEST:
-        A, B = loop.model.linearise(loop.target, np.zeros(n_a))
+    n_z, n_a, q, r = loop.model.n_z, loop.model.n_a, loop.state_weight, loop.action_weight
+    cost = loop.cost or Cost(n_z, n_a, loop.horizon, state_weight=q, action_weight=r)
+    if n_z <= LARGEST:
+        A, B = loop.model.linearise(loop.target, cost.action_target)
         if np.isfinite(A).all() and np.isfinite(B).all():
             try:
-                found = action_curvature(A, B, loop.state_weight, r, loop.horizon)
+                found = action_curvature(A, B, cost)
             except np.linalg.LinAlgError:
                 found = np.full((n_a, n_a), np.nan)
             found = 0.5 * (found + found.T)
             if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
                 return loop.curvature(found)
-    return loop.curvature(r * np.eye(n_a))
+    return loop.curvature(cost.action_matrix)

@@ -314,7 +314,9 @@ def finite_horizon(
     >>> K.round(6), b
     (array([[-0.618034]]), array([-0.]))
     """
-    whole, inputs, P = _regulated(A, B, drift, state_weight, action_weight, horizon)
+    whole, inputs = _extended(A, B, drift)
+    Q = np.diag(np.append(np.full(len(A), state_weight), 0.0))
+    P = _doubled(whole, inputs @ inputs.T / action_weight, Q, horizon)
     return _first_step(whole, inputs, P, action_weight * np.eye(B.shape[1]))
 
 
@@ -341,16 +343,15 @@ def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Ar
     return _doubled(whole, G, rows.T @ rows, cost.horizon)
 
 
-def action_curvature(
-    A: Array, B: Array, state_weight: float, action_weight: float, horizon: int
-) -> Array:
+def action_curvature(A: Array, B: Array, cost: Cost) -> Array:
     """R + B^T P B (n_a, n_a): the cost of a deviation from the optimal action, to second order.
 
-    >>> action_curvature(np.eye(1), np.eye(1), 1.0, 1.0, 64).round(6)
+    >>> action_curvature(np.eye(1), np.eye(1), Cost(1, 1, 64)).round(6)
     array([[2.618034]])
     """
-    _, inputs, P = _regulated(A, B, np.zeros(len(A)), state_weight, action_weight, horizon)
-    curvature: Array = action_weight * np.eye(B.shape[1]) + inputs.T @ P @ inputs
+    n = len(A)
+    P = cost_to_go(A, B, np.zeros(n), cost, np.zeros(n))[:n, :n]
+    curvature: Array = cost.action_matrix + B.T @ P @ B
     return curvature
 
 
@@ -359,15 +360,6 @@ def _extended(A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
     n, n_a = B.shape
     whole = np.block([[A, drift[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
     return whole, np.vstack([B, np.zeros((1, n_a))])
-
-
-def _regulated(
-    A: Array, B: Array, drift: Array, state_weight: float, action_weight: float, horizon: int
-) -> tuple[Array, Array, Array]:
-    """The system of [e; 1], and P of the least cost sum_k q |e_k|^2 + r |a_k|^2."""
-    whole, inputs = _extended(A, B, drift)
-    P = np.diag(np.append(np.full(len(A), state_weight), 0.0))
-    return whole, inputs, _doubled(whole, inputs @ inputs.T / action_weight, P, horizon)
 
 
 def _first_step(whole: Array, inputs: Array, P: Array, R: Array) -> tuple[Array, Array]:
