@@ -40,8 +40,8 @@ from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
 from pdeloop.method.models import affine_law
 from pdeloop.method.models.base import saturated
 from pdeloop.study.executors import processes
+from tuner_node.batch import context_of
 from tuner_node.build import build_training
-from tuner_node.optimizer_context import context_of
 
 __all__ = ["run", "text"]
 

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from controller_node.answered_steps import AnsweredSteps
 from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
 from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.run_state import (
     MAX_RUNS,
+    AnsweredSteps,
     Answering,
     EpisodeInputs,
     Models,

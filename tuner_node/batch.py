@@ -11,8 +11,9 @@ import numpy as np
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
-from pdeloop.method.adapt import Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt import Context, Record, Rollout, RolloutResult, Trajectory
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 
@@ -181,3 +182,41 @@ def batch_of(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) 
         row[:] = (rollout.field_seed, -1, 0.0, model)
     policies = stacked([rollout.policy for _, rollout in wanted])
     return Batch(rows, np.clip(policies, -MAX_GAIN, MAX_GAIN), trajectories)
+
+
+def context_of(
+    settings: TrainingSettings,
+    law: Law,
+    target: Array,
+    exploration: Trajectory,
+    further: Sequence[Trajectory],
+    measured: Sequence[Record],
+) -> Context:
+    """The context of one seed.
+
+    exploration: the one that its model was identified from; further: others; measured: the rollouts
+    that checked its first law.
+    """
+    cost = Cost.parse(settings.cost)
+    return Context(
+        U=law.model.U,
+        target=target,
+        state_weight=settings.state_weight,
+        action_weight=settings.action_weight,
+        horizon=len(exploration.actions),
+        exploration=exploration,
+        measured=measured,
+        action_set=settings.action_set,
+        noise=settings.measurement_noise,
+        sensors=settings.sensors,
+        actuator_positions=settings.actuator_positions,
+        actuator_widths=settings.actuator_widths,
+        periodic=settings.periodic,
+        line=settings.line,
+        shape=settings.shape,
+        further=further,
+        # Where numbers and the target do not say it.
+        cost=None if cost is None or cost.plain else cost,
+        law=law,
+        field_models=settings.field_models,
+    )

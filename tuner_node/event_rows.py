@@ -10,8 +10,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.topics import COMPLETED, CostColumn
 from pdeloop.method.adapt import RolloutResult
 from tuner_node.batch import TrainingSettings
-from tuner_node.rollouts import EVALUATED
-from tuner_node.void_exploration import variance
+from tuner_node.rollouts import EVALUATED, variance
 
 Row = dict[str, Any]
 

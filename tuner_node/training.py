@@ -33,20 +33,19 @@ from pdeloop.messages.topics import CostColumn, StartColumn
 from pdeloop.method.adapt import Context, Optimizer, Record, Rollout, Trajectory, registry
 from pdeloop.method.laws import Law
 from pdeloop.method.laws.registry import laws_of
-from tuner_node import event_rows, rollouts, void_exploration
+from tuner_node import event_rows, rollouts
 from tuner_node.batch import (
     UNKNOWN_PLANT,
     Batch,
     BatchResult,
     TrainingSettings,
     batch_of,
+    context_of,
     stacked,
 )
 from tuner_node.budget import Budget
 from tuner_node.errors import NoModelError
-from tuner_node.law_check import check_law
-from tuner_node.optimizer_context import context_of
-from tuner_node.result_checks import check_excitation, same_steps
+from tuner_node.result_checks import check_excitation, check_law, same_steps
 from tuner_node.rollouts import CHECK, EVALUATED
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
@@ -167,7 +166,7 @@ class Training:
         self.plant, self.steps = result.plant, same_steps(result, self.steps)
         if self.phase == "identify":
             together = self.settings.explorations
-            if lost := void_exploration.diverged_steps(result, self.pending, together):
+            if lost := rollouts.diverged_steps(result, self.pending, together):
                 return self._explored_in_vain(lost)
             if result.models is None:
                 raise ValueError(
@@ -304,12 +303,10 @@ class Training:
             self.void[m] += 1
             self.budget.count("identify", [m] * settings.explorations)
             affordable = self._can_pay_for_exploration(m)
-            again = self.void[m] <= void_exploration.MOST and affordable
+            again = self.void[m] <= rollouts.MOST_VOID and affordable
             if not again and not self.attempts[m]:
-                steps = [*void_exploration.steps_before(self.history, settings.all_seeds[m]), step]
-                raise NoModelError(
-                    void_exploration.no_model(settings, steps, paid_up=not affordable)
-                )
+                steps = [*rollouts.steps_before(self.history, settings.all_seeds[m]), step]
+                raise NoModelError(rollouts.no_model(settings, steps, paid_up=not affordable))
             if not again:
                 self.pending.remove(m)
             paid = int(self.budget.paid[m])

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,12 @@ import numpy as np
 from controller_node.identification import DesignSettings, design_each
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.headers import Headers
-from pdeloop.bags.numbering import gaps, gaps_text
 from pdeloop.bags.report import Report
 from pdeloop.bags.run_claims import RunClaims, compare_parameters, compare_results
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import EPISODES_PER_START
+from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.parameters import PLANT, recorded_values, with_budget
 from pdeloop.messages.spec import ParameterError
@@ -27,6 +27,51 @@ from tuner_node.batch import Batch
 from tuner_node.budget import PURPOSES
 from tuner_node.build import build_training
 from tuner_node.training import Training
+
+NAMED = 5
+"""Gaps that are named; the others are only counted."""
+
+Gap = tuple[int, int]
+"""The first and the last of consecutive numbers that are missing."""
+
+
+def gaps(numbers: Iterable[int]) -> list[Gap]:
+    """The numbers missing before and between these, of each start of the tuner that is among them.
+
+    Numbers that are not our tuner's have none.
+
+    >>> gaps([EPISODES_PER_START + 2, EPISODES_PER_START + 5]) == [
+    ...     (EPISODES_PER_START + 1, EPISODES_PER_START + 1),
+    ...     (EPISODES_PER_START + 3, EPISODES_PER_START + 4),
+    ... ]
+    True
+    >>> gaps([3, 9])
+    []
+    """
+    found = []
+    for start, own in groupby(
+        sorted(set(numbers)), key=lambda number: number // EPISODES_PER_START
+    ):
+        if start:
+            for a, b in pairwise([start * EPISODES_PER_START, *own]):
+                found += [(a + 1, b - 1)] if b - a > 1 else []
+    return found
+
+
+def gaps_text(found: Sequence[Gap]) -> str:
+    """The gaps in words.
+
+    >>> gaps_text([(EPISODES_PER_START + 3, EPISODES_PER_START + 4)])
+    'episodes 1.3 to 1.4'
+    """
+    parts = [
+        episode_name(a) if a == b else f"{episode_name(a)} to {episode_name(b)}"
+        for a, b in found[:NAMED]
+    ]
+    more = f" and {len(found) - NAMED} more gaps" if len(found) > NAMED else ""
+    several = len(found) > 1 or any(a != b for a, b in found)
+    return f"episode{'s' if several else ''} {', '.join(parts)}{more}"
+
 
 _TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
 

@@ -25,9 +25,8 @@ from pdeloop.animation import pictures, write
 from pdeloop.finished_run import field_means
 from pdeloop.messages.files import make_own_folder, write_atomically
 from pdeloop.report import figures, learning
-from pdeloop.report.dark import darken
 from pdeloop.report.data import ProblemData, ReportData
-from pdeloop.report.style import NAMES, STYLE
+from pdeloop.report.style import NAMES, STYLE, darken
 from pdeloop.reproduction import PAPER, beside_the_paper
 from pdeloop.study.results import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts

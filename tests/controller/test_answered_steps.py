@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.answered_steps import AnsweredSteps
+from controller_node.run_state import AnsweredSteps
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import COMPLETED, VOID
 

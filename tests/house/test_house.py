@@ -33,7 +33,6 @@ WITH_ROS = {
     "sample_subscription.py",
     "observer.py",
     "loop_reader.py",
-    "service_call.py",
     "peers.py",
     "node_main.py",
     "endpoints.py",

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.regression import exact_regression
 from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
-from tuner_node.exploration import least_variance
+from tuner_node.build import least_variance
 
 N_S, N_A, STEPS = 4, 2, 60
 

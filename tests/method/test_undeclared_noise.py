@@ -21,8 +21,7 @@ from pdeloop.method.models.selection import Selection
 from tests.support.small import same_bits
 from tuner_node.build import build_training
 from tuner_node.narration import misjudged_noise, warnings
-from tuner_node.readings import seeming_noise
-from tuner_node.results import check_result, summarise
+from tuner_node.results import check_result, seeming_noise, summarise
 from tuner_node.training_state import arrays_of, restore
 
 N, L = 64, 120

@@ -13,12 +13,12 @@ ARGUED: dict[tuple[str, str, str], str] = {
         "1 -> 2",
     ): "the column before it counts steps, which are not negative",
     (
-        "controller_node.answered_steps",
+        "controller_node.run_state",
         "self._furthest = -1",
         "1 -> 2",
     ): "it is compared once an episode was answered, whose first step is 0",
     (
-        "controller_node.answered_steps",
+        "controller_node.run_state",
         "self._claimed = NONE, -1",
         "1 -> 2",
     ): "the step is not looked at where the episode is none",

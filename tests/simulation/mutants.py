@@ -68,12 +68,10 @@ _CONTROLLER = (
 _MEMORY = ("controller/test_law_batch.py", "controller/test_law_memory.py")
 TESTS: dict[str, tuple[str, ...]] = {
     "tuner_node.dispatch": _TUNER,
-    "tuner_node.chunk_queue": _TUNER,
+    "tuner_node.chunk": _TUNER,
     "tuner_node.pair": ("tuner/test_trajectory_collector.py", *_TUNER),
     "tuner_node.session": _TUNER,
     "tuner_node.batch": ("tuner/test_batch.py", *_TUNER),
-    "tuner_node.chunk": _TUNER,
-    "tuner_node.targets": _TUNER,
     "tuner_node.participants": ("tuner/test_participants.py", *_TUNER),
     "tuner_node.trajectory_collector": ("tuner/test_trajectory_collector.py", *_TUNER),
     "tuner_node.training_state": ("tuner/test_training_state.py", "tuner/test_session.py"),
@@ -81,7 +79,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "pde_sim_node.taken_actions": _PLANT,
     "controller_node.responder": (*_CONTROLLER, *_MEMORY),
     "controller_node.run_state": (*_CONTROLLER, *_MEMORY),
-    "controller_node.answered_steps": _CONTROLLER,
     "controller_node.law_batch": (*_MEMORY, *_CONTROLLER),
     "controller_node.exploration": _CONTROLLER,
     "pdeloop.messages.signature": _SIGNATURE,

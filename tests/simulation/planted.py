@@ -128,7 +128,7 @@ BUGS = {
         _RESPONDER, "if known is None or known[0] != made_from:", "if known is None:"
     ),
     "controller: costs beyond what it answered": Bug(
-        "controller_node.answered_steps", "if episode != known or cost.step >= step:", "if True:"
+        "controller_node.run_state", "if episode != known or cost.step >= step:", "if True:"
     ),
 }
 """By what is not checked any more, or goes wrong."""

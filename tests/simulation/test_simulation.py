@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.answered_steps import AnsweredSteps
+from controller_node.run_state import AnsweredSteps
 from pde_sim_node.taken_actions import Episode, TakenActions
 from tests.simulation.audit import audit, shrunk, verdict
 from tests.simulation.disk import Disk

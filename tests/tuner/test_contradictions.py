@@ -24,10 +24,10 @@ from tests.support.dispatching import (
     void_of,
 )
 from tests.support.small import same_bits
-from tuner_node import targets
+from tuner_node import dispatch as dispatching
+from tuner_node.dispatch import MAX_TARGET_BYTES, MAX_TARGETS
 from tuner_node.errors import DispatchError
 from tuner_node.pair import FOREIGN_PLANT_GRACE, REMEMBERED
-from tuner_node.targets import MAX_TARGET_BYTES, MAX_TARGETS
 
 
 def test_two_different_costs_of_one_episode_end_the_run():
@@ -89,7 +89,7 @@ def test_targets_of_ever_new_plants_fill_no_memory():
 
 
 def test_targets_of_just_the_bytes_that_are_allowed_are_remembered(monkeypatch):
-    monkeypatch.setattr(targets, "MAX_TARGET_BYTES", 32)
+    monkeypatch.setattr(dispatching, "MAX_TARGET_BYTES", 32)
     served = dispatcher()
     for plant in (1, 2):
         served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), plant), 0.0)

@@ -10,7 +10,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Rollout, Trajectory
 from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.registry import along
-from tuner_node.law_check import check_law
+from tuner_node.result_checks import check_law
 
 STEPS, N_S = 60, 3
 

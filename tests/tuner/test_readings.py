@@ -11,7 +11,7 @@ import pytest
 from pdeloop.method.adapt import Trajectory
 from tests.support.small import parameters
 from tuner_node.build import build_training
-from tuner_node.readings import seeming_noise
+from tuner_node.results import seeming_noise
 from tuner_node.training import Training
 
 L, N = 120, 64

@@ -18,8 +18,8 @@ from tests.support.small import SMALL, parameters, same_bits, train_here
 from tuner_node import training_state
 from tuner_node.build import build_training
 from tuner_node.narration import Narration
+from tuner_node.rollouts import MOST_VOID, no_model
 from tuner_node.training import Training
-from tuner_node.void_exploration import MOST, no_model
 
 STRONG = {"exploration_variance": 100.0, "divergence_bound": 3.2}
 """Of the seeds 0, 1 and 2 the first and the last diverge; a quarter is not too strong for any."""
@@ -100,13 +100,13 @@ def test_a_plant_that_always_diverges_ends_the_training_with_the_reason(noise):
     with pytest.raises(ValueError, match="no reduced model: the plant diverged under") as ended:
         explore_until_the_end(training, LocalPair(values))
     told = str(ended.value)
-    assert f"{MOST + 1} times, last at step 0" in told
-    weakest = training.settings.exploration_variance / 4**MOST
+    assert f"{MOST_VOID + 1} times, last at step 0" in told
+    weakest = training.settings.exploration_variance / 4**MOST_VOID
     assert f"inputs of variance {weakest:.3g}; weaker inputs did not delay it" in told
     assert (
         told.endswith("otherwise lower exploration_variance further") and "a horizon of" not in told
     )
-    assert [row["step"] for row in training.history] == [0] * MOST
+    assert [row["step"] for row in training.history] == [0] * MOST_VOID
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
