@@ -39,10 +39,7 @@ class ProjectedLaw:
     """
 
     def __init__(
-        self,
-        models: Sequence[ArrayLike],
-        target: ArrayLike,
-        action_set: ActionSet = ANY_ACTION,
+        self, models: Sequence[ArrayLike], target: ArrayLike, action_set: ActionSet = ANY_ACTION
     ) -> None:
         bases = [np.asarray(basis, dtype=np.float64) for basis in models]
         shapes = {basis.shape for basis in bases}

@@ -35,10 +35,7 @@ ARGUMENTS = {
     "problem": ("burgers", f"one of {', '.join(shipped_problems())}, or the path of a YAML file"),
     "namespace": ("", "namespace of all nodes; empty: none"),
     "pairs": ("1", PAIRS.description),
-    "equation": (
-        "",
-        "the problem's PDE; your own code (file.py:Class) must also be named here",
-    ),
+    "equation": ("", "the problem's PDE; your own code (file.py:Class) must also be named here"),
     "plant": (
         "",
         "a plant instead of an equation; your own code (file.py:Class) must also be named here",

@@ -14,15 +14,7 @@ from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plants.batch import BatchPlant
 from pdeloop.fast_path import channel
 from pdeloop.fast_path.handler import FastPath, fast_handler, plan_type
-from pdeloop.fast_path.messages import (
-    FIRST,
-    SAMPLE_BATCH,
-    STEP,
-    TIME,
-    append,
-    full,
-    write_answer,
-)
+from pdeloop.fast_path.messages import FIRST, SAMPLE_BATCH, STEP, TIME, append, full, write_answer
 from pdeloop.jit.cache import jit, jit_in_closure
 from pdeloop.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
 from pdeloop.jit.simd import load_unaligned, write

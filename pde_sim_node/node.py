@@ -225,8 +225,7 @@ class PlantNode:
                 self._batcher.begin(self._loop.now())
             elif send.topic is COST and self._lockstep.contradiction:
                 self._node.get_logger().error(
-                    f"episode is void: {self._lockstep.contradiction}",
-                    throttle_duration_sec=1.0,
+                    f"episode is void: {self._lockstep.contradiction}", throttle_duration_sec=1.0
                 )
             self._senders[send.topic].send(send.frame)
             if send.topic is COST:

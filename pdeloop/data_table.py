@@ -226,11 +226,7 @@ def places_of(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
     if len(found["--time"]) > 1:
         names = listed([head[i] for i in found["--time"]])
         raise ValueError(f"expected one column for --time, got {names}")
-    for one, other in (
-        ("--time", "--states"),
-        ("--time", "--inputs"),
-        ("--states", "--inputs"),
-    ):
+    for one, other in (("--time", "--states"), ("--time", "--inputs"), ("--states", "--inputs")):
         if both := sorted({*found[one]} & {*found[other]}):
             names = listed([head[i] for i in both])
             raise ValueError(

@@ -85,10 +85,7 @@ class Frames:
             )
             self._canvas: Any = FigureCanvasAgg(figure)
             axes = figure.subplots(
-                rows + 1,
-                count + self._flat,
-                squeeze=False,
-                height_ratios=[high] * rows + [1.0],
+                rows + 1, count + self._flat, squeeze=False, height_ratios=[high] * rows + [1.0]
             )
             self._shows: list[list[Show]] = [[] for _ in titles]
             self._bars: list[tuple[Any, Axes]] = []

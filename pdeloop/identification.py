@@ -264,10 +264,7 @@ class Identified:
             more = "" if self.model.b is None else " + b"
             law = f"a = K_a x + K_b s_r{more}, x = p + L (U^T z - p), and then p = A x + B a{drift}"
             names += "; p = U^T z at first"
-        return [
-            *loop.text(self.sample_time),
-            f"to apply the law elsewhere: {law}{every}{names}",
-        ]
+        return [*loop.text(self.sample_time), f"to apply the law elsewhere: {law}{every}{names}"]
 
 
 def _finite(value: float) -> float | None:
@@ -502,11 +499,7 @@ def _identified(
     order = model_order({**defaults, **values}) or suggested
     if not order and not of_past:
         raise ParameterError(f"no order can be suggested: {none}; or give one with --order")
-    own = {
-        "n_a": n_a,
-        "reduced_order": order or 0,
-        "dmdc_order": order or 0,
-    }
+    own = {"n_a": n_a, "reduced_order": order or 0, "dmdc_order": order or 0}
     settings = DesignSettings.of({**defaults, **values, **own})
     settings = replace(settings, input_delay=delays if any(delays) else ())
     method, p = settings.identification, settings.dmdc_rank

@@ -227,9 +227,7 @@ def _actuators(plant: Plant) -> Finding:
         )
     waves = named_waves(plant.grid, lost)
     return Finding(
-        name,
-        False,
-        f"{text}; the actuators do not reach {waves}: move, add or narrow some",
+        name, False, f"{text}; the actuators do not reach {waves}: move, add or narrow some"
     )
 
 

@@ -33,10 +33,7 @@ def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:
     """
     rest = {**DEFAULTS, **options}
     first, seeds, iterations = (rest.pop(name) for name in ("seed", "seeds", "iterations"))
-    budgets = {
-        "two_point": {"iterations": iterations},
-        "model_based": {"rollouts": 2 * iterations},
-    }
+    budgets = {"two_point": {"iterations": iterations}, "model_based": {"rollouts": 2 * iterations}}
     return Study.of(
         {
             "problems": list(problems) or list(PAPER),

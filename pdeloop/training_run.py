@@ -271,11 +271,7 @@ def carry_out(
 
 
 def _train_here(
-    folder: Path,
-    values: dict[str, Any],
-    display: Display,
-    check: Callable[[], None],
-    advice: str,
+    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None], advice: str
 ) -> None:
     with RunFolder(folder).locked():
         training = build_training(values)
@@ -340,12 +336,7 @@ def _train_over_topics(
             display.line(f"  {text}")
         waiting = Waiting(list(children.values()), display.line)
         supervisor = Supervisor(
-            list(children.values()),
-            "tuner_node",
-            domain,
-            logs,
-            display.line,
-            environment,
+            list(children.values()), "tuner_node", domain, logs, display.line, environment
         )
         try:
             done = False

@@ -19,11 +19,7 @@ OF_A_METHOD = {
 """Parameters of one method: which parameter chooses it, and by which word."""
 OF_THE_COMMAND = ("out", "resume", "recorder", "pairs", "plant_fingerprint")
 """Parameters of the tuner that follow from where and how a training runs."""
-OF_NODES = {
-    *(spec.name for spec in (*PLANT, *EXECUTION)),
-    "episode_timeout",
-    "max_attempts",
-}
+OF_NODES = {*(spec.name for spec in (*PLANT, *EXECUTION)), "episode_timeout", "max_attempts"}
 """Parameters of processes and messages, which a training in this process does not have."""
 ELSEWHERE = {spec.name for spec in (*RECORDER, *VIEWER)} - {spec.name for spec in PROBLEM}
 

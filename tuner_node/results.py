@@ -313,8 +313,7 @@ def seeming_noise(training: Training, m: int) -> float:
         states = [z[:, : settings.sensors] for z in states]
     declared = settings.measurement_noise
     seeming = contradicting_noise(
-        [row for z in states for row in rows_of(z, settings.shape)],
-        declared,
+        [row for z in states for row in rows_of(z, settings.shape)], declared
     )
     if not declared and seeming and not settings.sensors:
         share = share_of_noise(seeming, states, training.target)

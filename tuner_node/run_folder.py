@@ -180,13 +180,7 @@ class RunFolder:
             raise
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
-        except (
-            LookupError,
-            TypeError,
-            ValueError,
-            ArithmeticError,
-            AttributeError,
-        ) as error:
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
 
     def give_up(self, reason: str) -> None:

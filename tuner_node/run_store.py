@@ -121,10 +121,7 @@ class RunWriter:
 
 
 def open_run(
-    values: Mapping[str, Any],
-    training: Training,
-    locks: ExitStack,
-    warn: Callable[[str], None],
+    values: Mapping[str, Any], training: Training, locks: ExitStack, warn: Callable[[str], None]
 ) -> tuple[RunWriter | None, RunIdentity]:
     """Begin the run in the folder `out` of the tuner's parameters, or continue it (`resume`).
 

@@ -80,11 +80,7 @@ class RecordedRun:
     """The episodes of one run, compared with their recomputation."""
 
     def __init__(
-        self,
-        number: int,
-        values: Mapping[str, Any] | None,
-        report: Report,
-        target: Array | None,
+        self, number: int, values: Mapping[str, Any] | None, report: Report, target: Array | None
     ) -> None:
         self._name, self._report = f"run {number}", report
         self._recomputed = 0

@@ -42,11 +42,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="start from the mean of the initial distribution instead of sampled fields",
     )
-    add_set(
-        evaluate,
-        "change a parameter of the plant or the cost",
-        trains=False,
-    )
+    add_set(evaluate, "change a parameter of the plant or the cost", trains=False)
     add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
     add_json(evaluate, "print the costs as JSON: {controller: [[cost per field] per seed]}")
 
@@ -66,11 +62,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     run = load_run(options.folder)
     refuse_other_code(options, run.values)
     costs = evaluate(
-        run,
-        fields=fields,
-        seed=options.seed,
-        mean_field=options.mean_field,
-        changes=changes,
+        run, fields=fields, seed=options.seed, mean_field=options.mean_field, changes=changes
     )
     if options.json:
         print_json({name: table.tolist() for name, table in costs.items()})

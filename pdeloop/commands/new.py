@@ -40,12 +40,7 @@ def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], st
     words = module.split("_")
     kind = "".join(word.capitalize() for word in words)
     _refuse_taken(name, module, kind, plant=plant)
-    filled = {
-        "name": name,
-        "module": module,
-        "kind": kind,
-        "title": " ".join(words).capitalize(),
-    }
+    filled = {"name": name, "module": module, "kind": kind, "title": " ".join(words).capitalize()}
     folder = into / name
     try:
         folder.mkdir()

@@ -82,11 +82,7 @@ def add_path(policy: Any, K: Array, b: Array, std: float, squashed: bool) -> Non
 
 
 def warm_start(
-    agent: Any,
-    run: FinishedRun,
-    which: str = "adapted",
-    seed: int | None = None,
-    std: float = 0.05,
+    agent: Any, run: FinishedRun, which: str = "adapted", seed: int | None = None, std: float = 0.05
 ) -> None:
     """Make a run's law the mean action of an agent's policy.
 

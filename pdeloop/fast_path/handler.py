@@ -65,11 +65,7 @@ class FastPath(ABC):
     """
 
     def __init__(
-        self,
-        handler: MachineCode,
-        plan: np.dtype[np.void],
-        incoming: ArrayCodec,
-        outgoing: Topic,
+        self, handler: MachineCode, plan: np.dtype[np.void], incoming: ArrayCodec, outgoing: Topic
     ) -> None:
         self.plans = np.zeros(1, plan)
         self.plan = self.plans[0]

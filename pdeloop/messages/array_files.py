@@ -14,12 +14,7 @@ from pdeloop.messages.files import FileError, open_ordinary
 MAX_ARRAY_BYTES = 2**30
 """Most bytes of all arrays in a file of policies or models."""
 Arrays = Mapping[str, NDArray[Any]]
-_TYPES: Mapping[str, type] = {
-    "f": np.float64,
-    "c": np.complex128,
-    "i": np.int64,
-    "b": np.bool_,
-}
+_TYPES: Mapping[str, type] = {"f": np.float64, "c": np.complex128, "i": np.int64, "b": np.bool_}
 """The type in which each NumPy kind is stored; others would change results or cannot be stored."""
 
 
@@ -56,12 +51,7 @@ def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
 
 
 def checked_array(
-    arrays: Arrays,
-    name: str,
-    kind: str,
-    shape: tuple[int | None, ...],
-    *,
-    finite: bool = True,
+    arrays: Arrays, name: str, kind: str, shape: tuple[int | None, ...], *, finite: bool = True
 ) -> NDArray[Any]:
     """The array of this name, of this NumPy kind and shape (None: of any length), or a FileError.
 

@@ -65,10 +65,7 @@ ACTUATORS = _section(
         "equation's"
     ),
     Spec(
-        "actuator_shape",
-        "equation",
-        choices=("equation", "indicator", "gaussian"),
-        group="problem",
+        "actuator_shape", "equation", choices=("equation", "indicator", "gaussian"), group="problem"
     ).means(
         "indicator: 1 on the actuator's width; gaussian: the width is the standard deviation; "
         "equation: the equation's own shape, by default an indicator"

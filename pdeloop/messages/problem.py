@@ -17,13 +17,7 @@ from pdeloop.messages.parameters import (
     with_budget,
     with_names,
 )
-from pdeloop.messages.spec import (
-    SETTINGS,
-    ParameterError,
-    check,
-    check_names,
-    exponent_hint,
-)
+from pdeloop.messages.spec import SETTINGS, ParameterError, check, check_names, exponent_hint
 from pdeloop.messages.text import alike, shown
 
 

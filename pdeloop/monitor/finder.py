@@ -20,10 +20,7 @@ class Finder:
     """
 
     def __init__(
-        self,
-        folder: Path | None,
-        domain: int | None,
-        loops: Callable[[], list[Live]] = running,
+        self, folder: Path | None, domain: int | None, loops: Callable[[], list[Live]] = running
     ) -> None:
         self._folder = None if folder is None else folder.resolve()
         self._domain = domain

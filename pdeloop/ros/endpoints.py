@@ -222,11 +222,7 @@ class Receiver:
     """A subscription of one topic whose frames go to a callback."""
 
     def __init__(
-        self,
-        node: Node,
-        topic: Topic,
-        callback: Callable[[Frame], None],
-        namespace: str = "",
+        self, node: Node, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
     ) -> None:
         self.callback = callback
         self.codec = topic.codec()

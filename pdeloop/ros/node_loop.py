@@ -133,10 +133,7 @@ class NodeLoop(EventLoop):
         self._fast = _Fast(receiver, sender, path)
 
     def observe(
-        self,
-        namespace: str,
-        on_state: Callable[[Frame], None],
-        on_action: Callable[[Frame], None],
+        self, namespace: str, on_state: Callable[[Frame], None], on_action: Callable[[Frame], None]
     ) -> None:
         """Call back with every state and action of a pair, without taking part in its loop.
 

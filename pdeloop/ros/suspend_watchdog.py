@@ -34,9 +34,7 @@ class SuspendWatchdog:
     """
 
     def __init__(
-        self,
-        on_tick: Callable[[], None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, on_tick: Callable[[], None] | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._clock, self._on_tick = clock, on_tick
         self._lock = threading.Lock()

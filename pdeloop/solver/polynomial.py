@@ -147,21 +147,11 @@ def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
         for j in range(0, t.m, 8):
             u = get(w, tape + j, d)
             ur, ui = clamp(u[0], clip), clamp(u[1], clip)
-            put(
-                w,
-                plan.z1 + j,
-                d,
-                (ur * horner(own, terms, c, ur), ui * horner(own, terms, c, ui)),
-            )
+            put(w, plan.z1 + j, d, (ur * horner(own, terms, c, ur), ui * horner(own, terms, c, ui)))
         z = forward(w, plan.z1, plan.z2, d, t, c, e)
         for k in range(0, modes, 8):
             g = rfft_pack(w, z, d, t.m, t.split, k, c, e)
-            put(
-                w,
-                plan.sum + k,
-                d,
-                plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g),
-            )
+            put(w, plan.sum + k, d, plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g))
     for part in range(plan.varying):
         multiplier = plan.factors + part * modes
         for j in range(0, t.m, 8):
@@ -172,12 +162,7 @@ def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
         z = forward(w, plan.z1, plan.z2, d, t, c, e)
         for k in range(0, modes, 8):
             g = rfft_pack(w, z, d, t.m, t.split, k, c, e)
-            put(
-                w,
-                plan.sum + k,
-                d,
-                plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g),
-            )
+            put(w, plan.sum + k, d, plus_product(get(w, plan.sum + k, d), c, multiplier + k, e, g))
     at: int = plan.sum
     return at
 

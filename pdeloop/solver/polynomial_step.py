@@ -270,10 +270,7 @@ def coefficients(linear: bytes, kind: np.dtype[Any], h: float, fine: int) -> Spe
     """The COEFFICIENTS of steps of this length, for a linear operator of these numbers, as rows."""
     c, m = etdrk4_coefficients(np.frombuffer(linear, kind), h), 1.0 / (4 * fine)
     return np.stack(
-        (
-            *(c.e, c.e2, c.q, c.q * m, c.f1 * m, 2 * c.f2 * m, c.f3 * m),
-            c.f1 + 4 * c.f2 + c.f3,
-        )
+        (*(c.e, c.e2, c.q, c.q * m, c.f1 * m, 2 * c.f2 * m, c.f3 * m), c.f1 + 4 * c.f2 + c.f3)
     )
 
 

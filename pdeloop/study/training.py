@@ -181,12 +181,7 @@ def _shipped(module: str) -> bool:
 
 
 def _opened(
-    stack: ExitStack,
-    place: Place | None,
-    parameters: Mapping[str, Any],
-    plant: int,
-    *,
-    anew: bool,
+    stack: ExitStack, place: Place | None, parameters: Mapping[str, Any], plant: int, *, anew: bool
 ) -> RunFolder:
     """The run folder of a training, with what an earlier process has left of it; else a temporary one.
 
