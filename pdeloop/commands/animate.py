@@ -5,21 +5,14 @@ from __future__ import annotations
 
 import argparse
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_own_code,
-    allow_own_code,
-    command,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 
 NAME = "animation.gif"
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `animate`."""
-    animate = command(
+    animate = common.command(
         commands,
         "animate",
         _animate,
@@ -30,8 +23,13 @@ def add(commands: Commands) -> None:
         example="pdeloop animate runs/burgers --out burgers.gif",
     )
     add = animate.add_argument
-    add("folder", type=a_path, metavar="RUN", help="folder of a finished run")
-    add("--out", type=a_path, metavar="FILE", help=f"file to write, .gif or .mp4 [RUN/{NAME}]")
+    add("folder", type=common.a_path, metavar="RUN", help="folder of a finished run")
+    add(
+        "--out",
+        type=common.a_path,
+        metavar="FILE",
+        help=f"file to write, .gif or .mp4 [RUN/{NAME}]",
+    )
     add(
         "--field",
         type=int,
@@ -40,20 +38,17 @@ def add(commands: Commands) -> None:
         help="number of the initial field in the closing evaluation [0]",
     )
     add("--seconds", type=float, default=6.0, metavar="S", help="duration in seconds [6]")
-    add_own_code(animate, ("equation", "plant", "optimizer", "law"))
+    common.add_own_code(animate)
 
 
 def _animate(options: argparse.Namespace) -> int:
     from pdeloop.animation import animated, write, writes
-    from pdeloop.finished_run import load_run
 
     if not 0 < options.seconds <= 60:
         options.refuse(f"--seconds is {options.seconds:g}; expected a number above 0, at most 60")
     path = options.out or options.folder / NAME
     writes(path)
-    allow_own_code(options)
-    run = load_run(options.folder)
-    refuse_other_code(options, run.values)
+    run = common.finished_run(options)
     write(path, animated(run, field=options.field, seconds=options.seconds))
     print(f"animation in {path}")
     return 0

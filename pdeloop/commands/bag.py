@@ -6,22 +6,14 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_json,
-    add_own_code,
-    allow_own_code,
-    command,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `bag`."""
-    bag = command(
+    bag = common.command(
         commands,
         "bag",
         None,
@@ -31,14 +23,14 @@ def add(commands: Commands) -> None:
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
     actions = bag.add_subparsers(required=True, metavar="ACTION")
-    info = command(
+    info = common.command(
         actions,
         "info",
         _bag_info,
         help="list the topics and episodes of a bag",
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
-    verify = command(
+    verify = common.command(
         actions,
         "verify",
         _bag_verify,
@@ -47,24 +39,24 @@ def add(commands: Commands) -> None:
         "the bit. The exit code is 1 if anything differs or is missing, or nothing can be recomputed.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
-    info.add_argument("bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
+    info.add_argument("bag", type=common.a_path, metavar="BAG", help="folder of a bag or of a run")
     verify.add_argument(
         "bag",
-        type=a_path,
+        type=common.a_path,
         metavar="BAG",
         nargs="+",
         help="folder of a bag, or of a run with all its bags",
     )
     verify.add_argument(
         "--parameters",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         help="take the parameters from this file, not from the bag: a run's parameters.yaml, or a "
         "bag's parameters.json",
     )
-    add_own_code(verify, ("equation", "plant", "optimizer", "law"))
+    common.add_own_code(verify)
     for action in (info, verify):
-        add_json(action)
+        common.add_json(action)
 
 
 def _bag_info(options: argparse.Namespace) -> int:
@@ -81,9 +73,9 @@ def _bag_info(options: argparse.Namespace) -> int:
 def _bag_verify(options: argparse.Namespace) -> int:
     from pdeloop.bags.verify import recorded_parameters, verify
 
-    allow_own_code(options)
+    common.allow_own_code(options)
     if known := recorded_parameters(*options.bag, parameters=options.parameters):
-        refuse_other_code(options, *known)
+        common.refuse_other_code(options, *known)
     report = verify(*options.bag, parameters=options.parameters)
     if options.json:
         print_json(asdict(report))

@@ -9,16 +9,7 @@ from dataclasses import asdict
 from math import nan
 from typing import TYPE_CHECKING
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_flags,
-    add_json,
-    add_own_code,
-    allow_own_code,
-    command,
-    given_flags,
-)
+from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, joined, read_settings
 from pdeloop.messages.parameters import flags
 from pdeloop.output import print_json
@@ -35,9 +26,9 @@ OF_A_NODE = {
 OF_A_FILE = ("equation", "plant", "optimizer", "law", "picture")
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `check`."""
-    check = command(
+    check = common.command(
         commands,
         "check",
         _check,
@@ -76,16 +67,16 @@ def add(commands: Commands) -> None:
         "--network", action="store_true", default=None, help="the node may run on another machine"
     )
     problem = check.add_argument_group("problem")
-    add_own_code(problem, ("equation", "plant", "optimizer", "law"))
-    add_flags(problem, "problem")
+    common.add_own_code(problem)
+    common.add_flags(problem, "problem")
     add_set(problem)
     check.add_argument(
         "--picture",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         help="draw initial fields, target and the actuators' supports to this .png",
     )
-    add_json(check, "print the findings as JSON")
+    common.add_json(check, "print the findings as JSON")
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -113,8 +104,8 @@ def _check(options: argparse.Namespace) -> int:
         from pdeloop.problem_picture import draw
         from pdeloop.training_run import load_compiled, resolve
 
-        settings = joined(given_flags(options), read_settings(options.set))
-        values = resolve(options.problem, settings | allow_own_code(options))
+        settings = joined(common.given_flags(options), read_settings(options.set))
+        values = resolve(options.problem, settings | common.allow_own_code(options))
         if options.picture is not None:
             draw(values, options.picture)  # before the check, which takes longer
         load_compiled(values)

@@ -6,12 +6,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from pdeloop.messages.own_code import identity
 from pdeloop.messages.parameters import LAW, OPTIMIZER, PROBLEM, TUNER, flags
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.messages.spec import ParameterError
+
+if TYPE_CHECKING:
+    from pdeloop.finished_run import FinishedRun
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """The collection to which a command adds its parser."""
@@ -74,7 +77,7 @@ def spellings(flag: str) -> tuple[str, ...]:
 
 
 def add_own_code(
-    parser: argparse._ActionsContainer, words: Sequence[str] = ("equation", "plant")
+    parser: argparse._ActionsContainer, words: Sequence[str] = tuple(_OWN_CODE)
 ) -> None:
     """The flags --equation, --plant, --optimizer and --law, or some of them; see `allow_own_code`."""
     for word in words:
@@ -120,6 +123,16 @@ def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) 
                 f"--{word} is {named}, but that of the run is {theirs}; leave it out, or name the "
                 "run's"
             )
+
+
+def finished_run(options: argparse.Namespace) -> FinishedRun:
+    """The run in the folder that a command names, with the code that its flags allow."""
+    from pdeloop.finished_run import load_run
+
+    allow_own_code(options)
+    run = load_run(options.folder)
+    refuse_other_code(options, run.values)
+    return run
 
 
 def add_problem(

@@ -6,24 +6,15 @@ from __future__ import annotations
 import argparse
 import sys
 
-from pdeloop.commands.common import (
-    DEFAULTS,
-    Commands,
-    a_path,
-    add_json,
-    add_own_code,
-    allow_own_code,
-    command,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `evaluate`."""
-    evaluate = command(
+    evaluate = common.command(
         commands,
         "evaluate",
         _evaluate,
@@ -32,7 +23,9 @@ def add(commands: Commands) -> None:
         "adapted policy, from the same initial fields, and print the mean stage costs.",
         example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
     )
-    evaluate.add_argument("folder", type=a_path, metavar="DIR", help="folder of a finished run")
+    evaluate.add_argument(
+        "folder", type=common.a_path, metavar="DIR", help="folder of a finished run"
+    )
     evaluate.add_argument("--fields", type=int, metavar="N", help="number of initial fields [10]")
     evaluate.add_argument(
         "--seed", type=int, default=0, metavar="S", help="seed of these fields [0]"
@@ -43,24 +36,21 @@ def add(commands: Commands) -> None:
         help="start from the mean of the initial distribution instead of sampled fields",
     )
     add_set(evaluate, "change a parameter of the plant or the cost", trains=False)
-    add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
-    add_json(evaluate, "print the costs as JSON: {controller: [[cost per field] per seed]}")
+    common.add_own_code(evaluate)
+    common.add_json(evaluate, "print the costs as JSON: {controller: [[cost per field] per seed]}")
 
 
 def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.evaluation import as_text, evaluate, outcome
-    from pdeloop.finished_run import load_run
     from tuner_node import narration
 
-    allow_own_code(options)
     if options.mean_field and options.fields is not None:
         raise ParameterError("--mean-field is one field: leave out --fields")
     fields = 10 if options.fields is None else options.fields
-    DEFAULTS["evaluation_fields"].check(fields, "--fields")
-    DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
+    common.DEFAULTS["evaluation_fields"].check(fields, "--fields")
+    common.DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     changes = read_settings(options.set)
-    run = load_run(options.folder)
-    refuse_other_code(options, run.values)
+    run = common.finished_run(options)
     costs = evaluate(
         run, fields=fields, seed=options.seed, mean_field=options.mean_field, changes=changes
     )

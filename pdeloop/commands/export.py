@@ -7,14 +7,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_own_code,
-    allow_own_code,
-    command,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 from pdeloop.messages.spec import ParameterError
 
 if TYPE_CHECKING:
@@ -32,9 +25,9 @@ MODEL_FILES = {
 """Exports of laws made of matrices: the ending of the file, and what it holds."""
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `export`."""
-    export = command(
+    export = common.command(
         commands,
         "export",
         _export,
@@ -49,24 +42,29 @@ def add(commands: Commands) -> None:
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )
     add_argument = export.add_argument
-    add_argument("folder", type=a_path, metavar="RUN", help="folder of a finished run")
-    add_argument("--out", type=a_path, metavar="FILE", help="write the law to this .npz or .c")
+    add_argument("folder", type=common.a_path, metavar="RUN", help="folder of a finished run")
+    add_argument(
+        "--out", type=common.a_path, metavar="FILE", help="write the law to this .npz or .c"
+    )
     add_argument(
         "--ros2",
-        type=a_path,
+        type=common.a_path,
         metavar="DIR",
         help="write the law as a ROS 2 package, with the name of this new folder, of rclpy and NumPy",
     )
     for name, (ending, what) in MODEL_FILES.items():
         add_argument(
-            f"--{name}", type=a_path, metavar="FILE", help=f"write {what} to this {ending}"
+            f"--{name}", type=common.a_path, metavar="FILE", help=f"write {what} to this {ending}"
         )
     add_argument(
         "--controller", choices=LAWS, help="the adapted law, or the first one (lqt) [adapted]"
     )
     add_argument("--seed", type=int, metavar="S", help="training seed of the law [the first]")
     add_argument(
-        "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
+        "--curve",
+        type=common.a_path,
+        metavar="FILE",
+        help="write the curves of all seeds to this .csv",
     )
     add_argument(
         "--minari",
@@ -74,20 +72,19 @@ def add(commands: Commands) -> None:
         help="make a data set of Minari of the rollouts, by this new name",
     )
     add_argument(
-        "--parquet", type=a_path, metavar="FILE", help="write the rollouts to this .parquet"
+        "--parquet", type=common.a_path, metavar="FILE", help="write the rollouts to this .parquet"
     )
     add_argument(
         "--tensorboard",
-        type=a_path,
+        type=common.a_path,
         metavar="DIR",
         help="write the curves and the optimiser's other numbers to this new folder",
     )
-    add_own_code(export, ("equation", "plant", "optimizer", "law"))
+    common.add_own_code(export)
 
 
 def _export(options: argparse.Namespace) -> int:
     from pdeloop.export import curve_csv, law_of
-    from pdeloop.finished_run import load_run
     from pdeloop.messages.files import write_atomically
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
@@ -112,9 +109,7 @@ def _export(options: argparse.Namespace) -> int:
             raise ParameterError(
                 f"{flag} is {path}; expected a file that ends in {' or '.join(suffixes)}"
             )
-    allow_own_code(options)
-    run = load_run(options.folder)
-    refuse_other_code(options, run.values)
+    run = common.finished_run(options)
     contents = {}
     if options.ros2 is not None:
         from pdeloop.ros2_package import write_package

@@ -8,14 +8,7 @@ import sys
 from functools import partial
 from math import inf, isfinite, nan
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_json,
-    add_own_code,
-    allow_own_code,
-    command,
-)
+from pdeloop.commands import common
 from pdeloop.messages.parameters import IDENTIFICATION
 from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
@@ -29,9 +22,9 @@ MOST_DELAYED = 100
 """Rows by which inputs may be shifted."""
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `identify`."""
-    identify = command(
+    identify = common.command(
         commands,
         "identify",
         _identify,
@@ -43,10 +36,12 @@ def add(commands: Commands) -> None:
         example="pdeloop identify --data examples/measurements.csv --out model.npz",
     )
     source = identify.add_mutually_exclusive_group(required=True)
-    source.add_argument("--bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
+    source.add_argument(
+        "--bag", type=common.a_path, metavar="BAG", help="folder of a bag or of a run"
+    )
     source.add_argument(
         "--data",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         nargs="+",
         help="states, actions, target and sampling time as .npz, .csv, .mat or .parquet, one file or "
@@ -99,7 +94,7 @@ def add(commands: Commands) -> None:
     )
     add(
         "--validate",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         nargs="+",
         help="other logs of the plant, in the same form: the FIT of the model's simulation of each",
@@ -125,21 +120,26 @@ def add(commands: Commands) -> None:
         "in reduced coordinates; subspace: a model with its filter, from measurements alone; dmdc: "
         "truncated DMDc [the run's, or field]",
     )
-    add_own_code(identify, ("law",))
+    common.add_own_code(identify, ("law",))
     add("--rank", type=int, metavar="P", help="rank p of --identification dmdc [the run's]")
     add("--episode", metavar="N", help="use only this episode, as `pdeloop bag info` names it")
     add("--environment", type=int, metavar="M", help="use only this environment of each episode")
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [the run's, or 1]")
     add("--action-weight", type=float, metavar="R", help="r of R = r I [the run's, or 1]")
-    add("--out", type=a_path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    add(
+        "--out",
+        type=common.a_path,
+        metavar="FILE",
+        help="write A, B, U, K_a, K_b, s_r to this .npz",
+    )
     add(
         "--plot",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         help="draw the orders, the model against the data, and the law on the model to this .png, .svg "
         "or .pdf",
     )
-    add_json(identify)
+    common.add_json(identify)
 
 
 def _identify(options: argparse.Namespace) -> int:
@@ -155,7 +155,7 @@ def _identify(options: argparse.Namespace) -> int:
         "action_weight": options.action_weight,
     }
     given = {name: value for name, value in given.items() if value is not None}
-    given |= allow_own_code(options)
+    given |= common.allow_own_code(options)
     if options.data is not None:
         if options.episode is not None or options.environment is not None:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")

@@ -5,20 +5,13 @@ from __future__ import annotations
 
 import argparse
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_own_code,
-    allow_own_code,
-    command,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 from pdeloop.messages.text import printable
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `report`."""
-    report = command(
+    report = common.command(
         commands,
         "report",
         _report,
@@ -28,14 +21,14 @@ def add(commands: Commands) -> None:
         example="pdeloop report runs/paper",
     )
     report.add_argument(
-        "folder", type=a_path, metavar="DIR", help="folder of a finished run or reproduction"
+        "folder", type=common.a_path, metavar="DIR", help="folder of a finished run or reproduction"
     )
-    add_own_code(report, ("equation", "plant", "optimizer", "law"))
+    common.add_own_code(report)
     report.add_argument(
         "--animate", action="store_true", help="also make the animation of `pdeloop animate`"
     )
     report.add_argument(
-        "--out", type=a_path, metavar="DIR", help="folder of the report [DIR/report]"
+        "--out", type=common.a_path, metavar="DIR", help="folder of the report [DIR/report]"
     )
 
 
@@ -43,9 +36,9 @@ def _report(options: argparse.Namespace) -> int:
     from pdeloop.report.data import gather
     from pdeloop.report.page import report
 
-    allow_own_code(options)
+    common.allow_own_code(options)
     data = gather(options.folder)
-    refuse_other_code(options, *(one.first.values for one in data.problems))
+    common.refuse_other_code(options, *(one.first.values for one in data.problems))
     page = report(data, options.out, animate=options.animate)
     for sentence in data.missing:
         print(f"not shown: {printable(sentence)}")

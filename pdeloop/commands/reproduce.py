@@ -7,14 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pdeloop.commands.common import (
-    DEFAULTS,
-    Commands,
-    add_own_code,
-    add_problem,
-    allow_own_code,
-    command,
-)
+from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.commands.study import add_execution, carry_out
 from pdeloop.messages.spec import ParameterError
@@ -23,9 +16,9 @@ if TYPE_CHECKING:
     from pdeloop.study import Study
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `reproduce`."""
-    reproduce = command(
+    reproduce = common.command(
         commands,
         "reproduce",
         _reproduce,
@@ -36,7 +29,9 @@ def add(commands: Commands) -> None:
         example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
     add = reproduce.add_argument
-    add_problem(reproduce, "shipped names or YAML files [the paper's problems]", "problems", "*")
+    common.add_problem(
+        reproduce, "shipped names or YAML files [the paper's problems]", "problems", "*"
+    )
     add("--seeds", type=int, metavar="N", help="number of trainings of each problem [6]")
     add("--iterations", type=int, metavar="N", help="iterations of the adapt phase [40]")
     add("--seed", type=int, metavar="S", help="the first seed [0]")
@@ -45,21 +40,22 @@ def add(commands: Commands) -> None:
         type=int,
         metavar="N",
         help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
-        f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
+        f"unchecked, as in the paper [{common.DEFAULTS['identification_attempts'].default}]",
     )
     add_set(reproduce, "any parameter, for all trainings")
-    add_own_code(reproduce)
+    common.add_own_code(reproduce, ("equation", "plant"))
+
     add_execution(reproduce)
 
 
 def _reproduce(options: argparse.Namespace) -> int:
     from pdeloop.reproduction import beside_the_paper, reproduction_in, study_of
 
-    allow_own_code(options)
+    common.allow_own_code(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():
-        DEFAULTS[name].check(value)
+        common.DEFAULTS[name].check(value)
     if options.iterations == 0:
         raise ParameterError("--iterations is 0; expected a whole number of at least 1")
 

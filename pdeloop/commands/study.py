@@ -14,14 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_json,
-    add_own_code,
-    allow_own_code,
-    command,
-)
+from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
@@ -39,9 +32,9 @@ if TYPE_CHECKING:
     from pdeloop.study import Study
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `study`."""
-    study = command(
+    study = common.command(
         commands,
         "study",
         _study,
@@ -54,20 +47,23 @@ def add(commands: Commands) -> None:
     study.add_argument(
         "words",
         nargs="*",
-        type=a_path,
+        type=common.a_path,
         metavar="STUDY.yaml",
         help="file with problems, seeds, variants and settings; or `status DIR`: how far the study in "
         "DIR is, while it is carried out or later",
     )
     add_set(study, "any parameter, for all trainings")
-    add_own_code(study, ("equation", "plant", "optimizer", "law"))
+    common.add_own_code(study)
+
     add_execution(study)
 
 
 def add_execution(parser: argparse.ArgumentParser) -> None:
     """The options for where a study's trainings run, and for output; see `carry_out`."""
     name, add = parser.prog.rpartition(" ")[2], parser.add_argument
-    add("--out", type=a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
+    add(
+        "--out", type=common.a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]"
+    )
     add(
         "--processes",
         type=int,
@@ -80,7 +76,12 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
         help="train on the workers of this Dask scheduler (tcp://HOST:PORT) instead",
     )
     for flag, (_, what) in TLS.items():
-        add(flag, type=a_path, metavar="FILE", help=f"{what}, for a scheduler tls://HOST:PORT")
+        add(
+            flag,
+            type=common.a_path,
+            metavar="FILE",
+            help=f"{what}, for a scheduler tls://HOST:PORT",
+        )
     add(
         "--worker-deaths",
         type=int,
@@ -107,7 +108,7 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
         help="train anew what has failed, and what was made with other parameters or another plant "
         "than the study has now",
     )
-    add_json(parser, "print the table as JSON; progress goes to stderr")
+    common.add_json(parser, "print the table as JSON; progress goes to stderr")
 
 
 def carry_out(
@@ -209,7 +210,7 @@ def _study(options: argparse.Namespace) -> int:
     if len(words) > 1:
         options.refuse("expected one file, or: status DIR")
     file = words[0] if words else None
-    allow_own_code(options)
+    common.allow_own_code(options)
     if file is None and options.out is None:
         raise ParameterError(
             "no study given; expected a YAML file, or --out DIR of one to continue"

@@ -5,28 +5,16 @@ from __future__ import annotations
 
 import argparse
 
-from pdeloop.commands.common import (
-    Commands,
-    a_path,
-    add_flags,
-    add_json,
-    add_own_code,
-    add_problem,
-    allow_own_code,
-    command,
-    forget_named_anew,
-    given_flags,
-    refuse_other_code,
-)
+from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, joined, read_settings
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.messages.spec import ParameterError
 from pdeloop.process.quick_imports import quick_imports
 
 
-def add(commands: Commands) -> None:
+def add(commands: common.Commands) -> None:
     """The command `train`."""
-    train = command(
+    train = common.command(
         commands,
         "train",
         _train,
@@ -38,15 +26,15 @@ def add(commands: Commands) -> None:
     )
     problem = train.add_argument_group("problem")
     names = ", ".join(shipped_problems())
-    add_problem(problem, f"{names}, or the path of a problem's YAML file")
-    add_own_code(problem)
-    add_flags(problem, "problem")
+    common.add_problem(problem, f"{names}, or the path of a problem's YAML file")
+    common.add_own_code(problem, ("equation", "plant"))
+    common.add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
-    add_flags(method, "budget and method")
+    common.add_flags(method, "budget and method")
     add = method.add_argument
     add(
         "--model",
-        type=a_path,
+        type=common.a_path,
         metavar="FILE",
         help="start from this model instead of identifying one: of `pdeloop identify --out`, or an "
         ".npz with the arrays A and B, and U, d and C where it has them",
@@ -54,14 +42,16 @@ def add(commands: Commands) -> None:
     add_set(method)
     run = train.add_argument_group("run")
     add = run.add_argument
-    add("--out", type=a_path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]")
-    add("--resume", type=a_path, metavar="DIR", help="continue the interrupted run in DIR")
+    add(
+        "--out", type=common.a_path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
+    )
+    add("--resume", type=common.a_path, metavar="DIR", help="continue the interrupted run in DIR")
     add(
         "--in-process",
         action="store_true",
         help="run the same code without ROS; the policy is the same to the bit",
     )
-    add_json(run, "print the result as JSON at the end; progress goes to stderr")
+    common.add_json(run, "print the result as JSON at the end; progress goes to stderr")
     add = train.add_argument_group("recording").add_argument
     add("--record", action="store_true", help="record all topics to a rosbag2 bag in the folder")
     add(
@@ -114,22 +104,22 @@ def _train(options: argparse.Namespace) -> int:
     )
     transport.require()
     settings = read_settings(options.set)
-    given = joined(given_flags(options), settings)
+    given = joined(common.given_flags(options), settings)
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
             raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")
-    own = allow_own_code(options)
+    own = common.allow_own_code(options)
     if options.model is not None:
         given["model"] = str(options.model.resolve())
     if options.resume is not None:
-        forget_named_anew(given, own)
+        common.forget_named_anew(given, own)
         if options.problem or given or options.out:
             raise ParameterError(
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
         values = reopen(options.resume)
-        refuse_other_code(options, values)
+        common.refuse_other_code(options, values)
         return run(options.resume, values, transport, options.json)
     if options.problem is None and options.plant is None:
         raise ParameterError(
