@@ -3,7 +3,7 @@
 
 from controller_node.responder import Responder
 from pdeloop.messages.diagnostics import ConditionTimer, Level, Rate, Status
-from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.topics import episode_name
 
 SILENT = 5.0
 """Seconds without a state, within an episode, after which the plant counts as silent."""

@@ -9,8 +9,7 @@ from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitations
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import KEPT_ARRAY, Frame
-from pdeloop.messages.protocol import ModelFailure, Publication
-from pdeloop.messages.signature import design_digest, digest_of, signature
+from pdeloop.messages.protocol import ModelFailure, Publication, design_digest, digest_of, signature
 from pdeloop.messages.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
 
 

@@ -14,12 +14,11 @@ from scipy import linalg
 
 from controller_node.policy import ProjectedLaw
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
-from pdeloop.messages.cost import Cost
+from pdeloop.messages.cost import Cost, measured_cost
 from pdeloop.messages.grid import axes_of
-from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import model_order
-from pdeloop.messages.signature import CONSTANTS
+from pdeloop.messages.protocol import CONSTANTS
 from pdeloop.messages.spec import IDENTIFICATION_SETTINGS
 from pdeloop.method.design import lqg, lqt
 from pdeloop.method.design.field_law import FieldLaw, field_law
@@ -79,7 +78,7 @@ class DesignSettings:
     sensors, sensor_delays : int
         n_y, 0 where the whole state is measured, and d.
     constants : dict
-        Parameters of `pdeloop.messages.signature.CONSTANTS` as given; others have their
+        Parameters of `pdeloop.messages.protocol.CONSTANTS` as given; others have their
         defaults.
     """
 
@@ -114,7 +113,7 @@ class DesignSettings:
 
     @property
     def measured_cost(self) -> list[str]:
-        """The cost of what is measured (`pdeloop.messages.measured_cost`)."""
+        """The cost of what is measured (`pdeloop.messages.cost`)."""
         return measured_cost(vars(self))
 
     @property

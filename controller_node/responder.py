@@ -30,11 +30,17 @@ from controller_node.run_state import (
     forget,
 )
 from pdeloop.messages import model_rows
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import KEPT_ARRAY, Frame, FrameError
-from pdeloop.messages.protocol import ModelFailure, Publication
-from pdeloop.messages.signature import NOT_SIGNED, digest_of, signature
-from pdeloop.messages.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
+from pdeloop.messages.protocol import NOT_SIGNED, ModelFailure, Publication, digest_of, signature
+from pdeloop.messages.topics import (
+    ACTION,
+    COMPLETED,
+    MAX_GAIN,
+    CostColumn,
+    StartColumn,
+    episode_name,
+    start_rows,
+)
 from pdeloop.method.laws.registry import law_kind, laws_of
 
 MAX_BYTES = 2**29

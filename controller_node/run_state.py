@@ -12,7 +12,7 @@ from controller_node.exploration import Exploration
 from controller_node.law_batch import LawBatch
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.signature import digest_of
+from pdeloop.messages.protocol import digest_of
 from pdeloop.messages.topics import VOID
 from pdeloop.method.laws.base import Law
 
@@ -28,7 +28,7 @@ class Answering:
     """The law in use in an episode of a plant, made at its first state.
 
     law: None where the controller explores; signature: what the actions carry, see
-    pdeloop.messages.signature.
+    pdeloop.messages.protocol.
     """
 
     plant: int
@@ -125,7 +125,7 @@ class RunState:
 
 
 def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_set: ActionSet) -> int:
-    """D of an episode, see pdeloop.messages.signature. inputs: None where it explores."""
+    """D of an episode, see pdeloop.messages.protocol. inputs: None where it explores."""
     published: list[Any] = [start.values, action_set.signed]
     if inputs is not None:
         policy, models = inputs
@@ -163,7 +163,12 @@ NONE: Ids = (-1, -1, -1)
 
 
 class AnsweredSteps:
-    """The last answered step of an episode, and its last step according to its cost."""
+    """The last answered step of an episode, and its last step according to its cost.
+
+    A cost that says that the episode went further, and the plant that gives it up before that step,
+    together are a contradiction. One of the two alone is none: a second controller may have answered
+    the others, or a second plant be slower.
+    """
 
     def __init__(self) -> None:
         self._episode = NONE

@@ -22,9 +22,8 @@ from launch_ros.actions import Node
 from pde_sim_node.build import complete
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.parameters import OF_THE_PLANT, flags
-from pdeloop.messages.problem import find_problem, load_parameters, shipped_problems
+from pdeloop.messages.problem import find_problem, load_parameters, read_problem, shipped_problems
 from pdeloop.method.laws.registry import OWN_LAWS
 from pdeloop.pairs import PAIRS, pair_cores, pair_nodes
 from pdeloop.process.isolation import NETWORK

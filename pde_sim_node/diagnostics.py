@@ -5,8 +5,7 @@ import numpy as np
 
 from pde_sim_node.lockstep import Lockstep
 from pdeloop.messages.diagnostics import Level, Rate, Status
-from pdeloop.messages.episodes import episode_name
-from pdeloop.messages.topics import VOID, CostColumn
+from pdeloop.messages.topics import VOID, CostColumn, episode_name
 
 
 class PlantDiagnostics:

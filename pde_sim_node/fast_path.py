@@ -19,8 +19,8 @@ from pdeloop.jit.cache import jit, jit_in_closure
 from pdeloop.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
 from pdeloop.jit.simd import load_unaligned, write
 from pdeloop.messages.frames import ArrayCodec, digest
+from pdeloop.messages.protocol import NOT_SIGNED
 from pdeloop.messages.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
-from pdeloop.messages.signature import NOT_SIGNED
 from pdeloop.messages.topics import STATE
 
 if TYPE_CHECKING:

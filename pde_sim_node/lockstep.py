@@ -37,8 +37,7 @@ from pde_sim_node.real_time import RealTimePacer, Timing
 from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_starts
 from pdeloop.messages import topics
 from pdeloop.messages.frames import MAX_VALUES, Frame, FrameError, digest
-from pdeloop.messages.protocol import Publication
-from pdeloop.messages.signature import signature
+from pdeloop.messages.protocol import Publication, signature
 from pdeloop.messages.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 
 PAUSED_REPORT = 1.0

@@ -26,7 +26,6 @@ from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import PHYSICAL, physical_of
 from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.files import FileError
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.parameters import PLANT, taken_by
@@ -35,7 +34,7 @@ from pdeloop.messages.problem import own_values
 from pdeloop.messages.protocol import Publication
 from pdeloop.messages.samples import ACTION_KIND, clock_message
 from pdeloop.messages.spec import Spec, check
-from pdeloop.messages.topics import ACTION, COST, PAUSED, START, STATE, TARGET
+from pdeloop.messages.topics import ACTION, COST, PAUSED, START, STATE, TARGET, episode_name
 from pdeloop.process.affinity import pin_process
 from pdeloop.process.isolation import keep_on_this_machine
 from pdeloop.ros.node_loop import NodeLoop

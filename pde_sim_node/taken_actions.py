@@ -6,7 +6,7 @@ Which of them was taken is random, so the episode is void. The same holds for tw
 episode. If the second one arrives after the end of one of the last episodes, the cost of that episode
 is sent again, void.
 
-Where the tuner asks for it (pdeloop.messages.signature), the first action of a run says whether its
+Where the tuner asks for it (pdeloop.messages.protocol), the first action of a run says whether its
 controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
 one comes from a second controller, and contradicts.
 """
@@ -15,10 +15,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import Frame, FrameError, digest
-from pdeloop.messages.signature import NOT_SIGNED, signature_in
-from pdeloop.messages.topics import START_COLUMNS, VOID, CostColumn
+from pdeloop.messages.protocol import NOT_SIGNED, signature_in
+from pdeloop.messages.topics import START_COLUMNS, VOID, CostColumn, episode_name
 
 REMEMBERED = 16
 """Ended episodes whose actions can still be contradicted."""

@@ -20,7 +20,7 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.episode import Law as ActingLaw
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array, float_array
-from pdeloop.messages.measured_cost import measured_cost
+from pdeloop.messages.cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import noisy
 from pdeloop.messages.spec import ParameterError

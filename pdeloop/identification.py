@@ -23,12 +23,11 @@ from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.files import write_atomically
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import as_recorded, model_order, recorded_values, table
 from pdeloop.messages.spec import ParameterError
-from pdeloop.messages.topics import COMPLETED, CostColumn
+from pdeloop.messages.topics import COMPLETED, CostColumn, episode_name
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, followed_the_state
 from pdeloop.method.reduce.identifiability import (

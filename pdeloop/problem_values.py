@@ -13,10 +13,9 @@ from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.parameters import LAW
-from pdeloop.messages.problem import find_problem
+from pdeloop.messages.problem import find_problem, read_problem
 from pdeloop.messages.spec import flatten
 from pdeloop.method.models.settings import SENSED_MOST
 from pdeloop.method.reduce.input_delay import LATEST

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.actuators import indicators, placed_indicators
 from pdeloop.messages.array_files import read_arrays
+from pdeloop.messages.cost import measured_cost
 from pdeloop.messages.grid import Grid, axes_of
-from pdeloop.messages.measured_cost import measured_cost
 from pdeloop.messages.model_rows import completed, unpack
 from pdeloop.messages.parameters import measured_size, model_order, noisy
-from pdeloop.messages.signature import design_digest
+from pdeloop.messages.protocol import design_digest
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
 from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large

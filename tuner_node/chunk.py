@@ -14,8 +14,7 @@ from pdeloop.messages import topics
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.protocol import Publication
-from pdeloop.messages.signature import digest_of
+from pdeloop.messages.protocol import Publication, digest_of
 from pdeloop.messages.topics import COMPLETED, CostColumn
 from pdeloop.method.adapt import Trajectory
 from tuner_node.batch import Batch, BatchResult

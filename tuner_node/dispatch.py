@@ -30,11 +30,16 @@ import numpy as np
 from pdeloop.messages import topics
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
 from pdeloop.messages.frames import Frame, FrameError
-from pdeloop.messages.protocol import ModelFailure, Publication
-from pdeloop.messages.signature import digest_of
-from pdeloop.messages.topics import START_COLUMNS, VOID, CostColumn, Topic
+from pdeloop.messages.protocol import ModelFailure, Publication, digest_of
+from pdeloop.messages.topics import (
+    EPISODES_PER_START,
+    START_COLUMNS,
+    VOID,
+    CostColumn,
+    Topic,
+    episode_name,
+)
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, less_often, most_environments
 from tuner_node.chunk import ChunkQueue, messages_of
 from tuner_node.errors import ContradictionError
@@ -93,7 +98,7 @@ class Dispatcher:
     many; max_batch, episode_timeout, max_attempts: see pdeloop.messages.parameters.TUNER, they may
     be set later; state_size, horizon: of an episode, 0: not known; plant: fingerprint of the one
     that this run is about, that of the first cost if not known; design: digest of how the run's
-    models are identified, see pdeloop.messages.signature, 0: not known.
+    models are identified, see pdeloop.messages.protocol, 0: not known.
     """
 
     def __init__(

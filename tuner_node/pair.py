@@ -4,11 +4,9 @@
 import math
 from dataclasses import dataclass, field
 
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import Frame, FrameError, digest
-from pdeloop.messages.protocol import ModelFailure, Publication
-from pdeloop.messages.signature import NOT_SIGNED, signature, signature_in
-from pdeloop.messages.topics import COST, MODEL_FAILED, VOID, CostColumn
+from pdeloop.messages.protocol import NOT_SIGNED, ModelFailure, Publication, signature, signature_in
+from pdeloop.messages.topics import COST, MODEL_FAILED, VOID, CostColumn, episode_name
 from tuner_node.batch import Batch, less_often
 from tuner_node.chunk import Chunk
 from tuner_node.errors import ContradictionError, DispatchError, NoModelError
@@ -53,7 +51,7 @@ class Pair:
     answers: dict[tuple[str, int], tuple[int, int]] = field(default_factory=dict)
     """By topic and episode: a digest of the answer that was taken, and its step."""
     signed: dict[int, int] = field(default_factory=dict)
-    """D of the last episodes, see pdeloop.messages.signature."""
+    """D of the last episodes, see pdeloop.messages.protocol."""
     last_start: Publication | None = None
     """Sent again while nothing new is begun, to keep the plant for this run."""
 

@@ -41,7 +41,6 @@ from pdeloop.messages.files import (
     write_atomically,
 )
 from pdeloop.messages.frames import MAX_ID
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.parameter_file import yaml_text
 from pdeloop.messages.parameters import (
     EXECUTION,
@@ -53,6 +52,7 @@ from pdeloop.messages.parameters import (
     recorded_values,
     table,
 )
+from pdeloop.messages.problem import read_problem
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.text import shown
 from pdeloop.method.laws.registry import OWN_LAWS

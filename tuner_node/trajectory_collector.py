@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import KEPT_ARRAY, Frame, FrameError
-from pdeloop.messages.topics import COMPLETED
+from pdeloop.messages.topics import COMPLETED, episode_name
 from pdeloop.method.adapt import Trajectory
 from pdeloop.method.adapt.trajectories import kept
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pdeloop.messages.diagnostics import Level, Rate, Status
-from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.topics import episode_name
 from viewer_node.loop_view import SILENT, LoopView
 
 

@@ -12,6 +12,9 @@ Second order in time, and in space as accurate as the waves.
 References
 ----------
 Strang, "On the construction and comparison of difference schemes", SIAM J. Numer. Anal. 5, 1968.
+LeVeque, "Finite Volume Methods for Hyperbolic Problems", Cambridge 2002, section 4.2 (fluxes of
+diffusion); Hundsdorfer, Verwer, "Numerical Solution of Time-Dependent Advection-Diffusion-Reaction
+Equations", Springer 2003, chapter I.
 """
 
 from __future__ import annotations
@@ -23,14 +26,25 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
-from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
-from pde_sim_node.dynamics import Dynamics, arguments_of
+from pde_sim_node.dynamics import (
+    Coefficient,
+    Dynamics,
+    arguments_of,
+    internal_steps,
+    positive,
+    values_at,
+    whole,
+)
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Axis, Grid
 
 
 class VariableDiffusion:
-    """Steps of diffusion of one component.
+    """Steps of diffusion with a coefficient that depends on the place, u_t = div(D grad u).
+
+    Finite volumes: the flux D du/dn through each face between two cells by central differences, and at
+    a wall where u = 0 by the difference over half a cell. Crank-Nicolson in time, with one sparse LU
+    factorisation. Second order in space and time.
 
     Parameters
     ----------

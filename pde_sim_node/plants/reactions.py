@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pde_sim_node.arguments import Coefficient, positive, values_at
+from pde_sim_node.dynamics import Coefficient, positive, values_at
 from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion, VariableDiffusion
 from pdeloop.messages.arrays import Array
 

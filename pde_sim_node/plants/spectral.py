@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.compiled_step import compiled_step, load
 from pde_sim_node.definition import Definition, sources_of
+from pde_sim_node.dynamics import grid_points, internal_steps, positive, whole
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.equations.base import result_of
 from pde_sim_node.plant import MEAN_FIELD, Adjoint

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.protocol import ModelFailure
 from pdeloop.messages.topics import (
@@ -28,6 +27,7 @@ from pdeloop.messages.topics import (
     VOID,
     CostColumn,
     StartColumn,
+    episode_name,
     start_rows,
 )
 from recorder_node.sources import Source

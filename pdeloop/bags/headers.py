@@ -5,7 +5,7 @@ With the sample time dt, states and costs have the times of docs/protocol.md:
 
     t_0 = max(the plant's time before, the start's time) + dt,    t_{k+1} = t_k + dt
 
-and a start has the newest time that its tuner knew. See pdeloop.messages.signature for signatures.
+and a start has the newest time that its tuner knew. See pdeloop.messages.protocol for signatures.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from pde_sim_node.plant import Plant
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.report import Report
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
 from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import design_digest, digest_of, signature
 from pdeloop.messages.samples import MAX_TIME
-from pdeloop.messages.signature import design_digest, digest_of, signature
+from pdeloop.messages.topics import EPISODES_PER_START, episode_name
 
 NANOSECONDS = 1e9
 

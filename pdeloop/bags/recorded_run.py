@@ -18,11 +18,17 @@ from pdeloop.bags.run_claims import RunClaims, compare_parameters, compare_resul
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.episodes import EPISODES_PER_START, episode_name
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.parameters import PLANT, recorded_values, with_budget
 from pdeloop.messages.spec import ParameterError
-from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from pdeloop.messages.topics import (
+    COMPLETED,
+    EPISODES_PER_START,
+    CostColumn,
+    StartColumn,
+    episode_name,
+    noise_seeds,
+)
 from tuner_node.batch import Batch
 from tuner_node.budget import PURPOSES
 from tuner_node.build import build_training

@@ -24,7 +24,7 @@ from pdeloop.bags.run_claims import RunClaims, claims_of
 from pdeloop.bags.survey import by_run
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.files import FileError, read_bounded
-from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import read_problem
 from pdeloop.messages.spec import MAX_YAML_BYTES, ParameterError
 from recorder_node.bag import BagError
 

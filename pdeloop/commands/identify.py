@@ -253,7 +253,7 @@ def _delays(text: str) -> tuple[int, ...] | str:
 
 
 def _episode(name: str | None) -> int | None:
-    from pdeloop.messages.episodes import episode_number
+    from pdeloop.messages.topics import episode_number
 
     try:
         return None if name is None else episode_number(name)

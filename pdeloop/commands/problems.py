@@ -7,8 +7,7 @@ import argparse
 from typing import Any
 
 from pdeloop.commands.common import Commands, add_json, command
-from pdeloop.messages.loop_parameters import read_problem
-from pdeloop.messages.problem import shipped_problems
+from pdeloop.messages.problem import read_problem, shipped_problems
 from pdeloop.output import print_json
 
 

@@ -1,5 +1,11 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A run's law as the start of an agent of stable-baselines3."""
+"""A run's law as the start of an agent of stable-baselines3: a linear path beside its network.
+
+    mean action = K y + b + n(y),    n = 0 at first
+
+where SAC and CrossQ squash: tanh(artanh(K y + b) + n(y)) in units of the action space. K and b are
+learnt like the network's weights.
+"""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class ActionSet:
     bounded : bool
         Whether there is an action that is not in it.
     signed : (n,) array
-        What signatures are of (`pdeloop.messages.signature`): the parameters `action_limit`,
+        What signatures are of (`pdeloop.messages.protocol`): the parameters `action_limit`,
         `action_bounds` and `exploration_mean`.
     exploration_mean, exploration_scale : (n_a,) array, or () for any number
         m, and the diagonal of D.

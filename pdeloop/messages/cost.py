@@ -14,7 +14,7 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.documents import parse_json
+from pdeloop.messages.grid import Grid
 from pdeloop.messages.text import shown
 
 _SEMIDEFINITE = 1e-10
@@ -398,3 +399,27 @@ def _unpacked(value: Any) -> Array:
     if len(raw) != wanted:
         raise ValueError(f"an array of shape {shape} has {wanted} bytes, got {len(raw)}")
     return np.frombuffer(raw, dtype="<f8").reshape(shape).astype(np.float64)
+
+
+def measured_cost(values: Mapping[str, Any]) -> list[str]:
+    """The texts of the parameter `cost`, of what the plant publishes.
+
+    With few sensors that is o = sqrt(n_z / (n_y d)) [y_k, y_{k-1}, ...], and the state in the cost is
+    the one that the newest readings suggest (`Grid.between`), or without outputs its distance from the
+    target the one that theirs suggest: the target is known between the sensors, too.
+
+    values: parameters of a plant or a run.
+    """
+    texts = list(values.get("cost", ()))
+    sensors, delays = int(values.get("sensors", 0)), int(values.get("sensor_delays", 1))
+    cost = Cost.parse(texts)
+    if cost is None or cost.plain or not sensors:
+        return texts
+    text = str(values.get("grid", ""))
+    grid = Grid.parse(text) if text else Grid(numbers=cost.n_z)
+    between, target = grid.between(sensors), None
+    newest = between / math.sqrt(grid.points / (sensors * delays))
+    older = np.zeros((cost.n_z, newest.shape[1] * (delays - 1)))
+    if cost.output is None:
+        target = cost.target[..., grid.measured(sensors)] @ between.T
+    return cost.through(np.hstack([newest, older]), target).packed

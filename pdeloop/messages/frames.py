@@ -7,7 +7,7 @@ in, whose `layout.data_offset` is 5 and whose `data` is
     [run, episode, step, time, plant, values...]      (values in row-major order of the dims)
 
 `run`, `episode`, `step` and `plant` are whole numbers below 2^53 (exact in float64), `time` is
-simulated time in seconds, or in an action its signature (signature.py). `plant` is a fingerprint of
+simulated time in seconds, or in an action its signature (protocol.py). `plant` is a fingerprint of
 the plant's parameters: an action carries that of the state it answers, so two different plants on
 one topic are never mixed up. The bytes are the plain CDR encoding of the message (OMG CDR 1.0, as
 every ROS 2 middleware uses it), so a node with ordinary message objects reads and writes the same

@@ -163,3 +163,25 @@ VIEWS = {
     **{f"view/{name}": "std_msgs/msg/Float64" for name in VIEW_NUMBERS},
 }
 """Topics that a viewer publishes for other tools, with their types."""
+
+
+EPISODES_PER_START = 2**32
+"""Numbers for the episodes between two starts of the tuner, so that a continued run uses none twice."""
+
+
+def episode_name(number: int) -> str:
+    """The number of an episode as text: 2.17 is the 17th after the tuner's second start.
+
+    Another tuner may count from 1 as it likes; such a number is its own name.
+
+    >>> episode_name(2 * EPISODES_PER_START + 17), episode_name(17)
+    ('2.17', '17')
+    """
+    start, index = divmod(number, EPISODES_PER_START)
+    return f"{start}.{index}" if start else str(index)
+
+
+def episode_number(name: str) -> int:
+    """The number of the episode with this `episode_name`. ValueError if there is none."""
+    start, _, index = name.rpartition(".")
+    return int(start or 0) * EPISODES_PER_START + int(index)

@@ -22,7 +22,7 @@ from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array, unpack_arrays
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.measured_cost import measured_cost
+from pdeloop.messages.cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws.registry import law_kind, laws_of
 from pdeloop.method.reduce.regression import OrderStudy, study_orders

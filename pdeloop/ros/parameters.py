@@ -18,10 +18,9 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from pdeloop.messages.loop_parameters import nothing_for, of_ros
 from pdeloop.messages.parameter_file import ParameterFile
 from pdeloop.messages.parameters import table, with_names
-from pdeloop.messages.problem import code_from, completed
+from pdeloop.messages.problem import code_from, completed, nothing_for, of_ros
 from pdeloop.messages.spec import ParameterError, Spec, check_names
 
 UNANSWERED = 1.0

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pdeloop.messages.loop_parameters import read_problem
-from pdeloop.messages.problem import code_from, find_problem
+from pdeloop.messages.problem import code_from, find_problem, read_problem
 from pdeloop.messages.text import shown
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training

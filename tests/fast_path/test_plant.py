@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.frames import HEADER, ArrayCodec, FrameError
-from pdeloop.messages.signature import signature
+from pdeloop.messages.protocol import signature
 from pdeloop.messages.topics import COST, STATE
 from tests.support.fast_path_pair import Plant, armed, fast, with_number
 from tests.support.lockstep import PLANT, RUN, is_void

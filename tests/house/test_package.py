@@ -24,8 +24,8 @@ import yaml
 from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import ALLOWED
 from pdeloop import cli
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.parameters import flags, table
+from pdeloop.messages.problem import read_problem
 from pdeloop.process.isolation import NETWORK
 from tests.house.test_house import imports
 from tests.support.colcon_workspace import ROOT, Workspace, build

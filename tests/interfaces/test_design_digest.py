@@ -11,7 +11,7 @@ import pytest
 
 from controller_node.identification import DesignSettings
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.signature import DESIGN, design_digest, digest_of
+from pdeloop.messages.protocol import DESIGN, design_digest, digest_of
 
 N_A, N_S = 4, 3
 

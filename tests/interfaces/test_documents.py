@@ -18,7 +18,7 @@ from pdeloop.messages import documents, places
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.documents import MAX_DEPTH, MAX_YAML_NODES, parse_json, parse_yaml
 from pdeloop.messages.grid import Grid
-from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import read_problem
 from pdeloop.messages.protocol import ModelFailure
 from pdeloop.messages.spec import ParameterError, Spec
 from pdeloop.messages.text import MAX_SHOWN, shown

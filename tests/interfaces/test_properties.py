@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdeloop.messages.frames import HEADER, MAX_ID, ArrayCodec, Frame, FrameError
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.parameter_file import yaml_text
 from pdeloop.messages.parameters import table
+from pdeloop.messages.problem import read_problem
 from pdeloop.messages.protocol import ModelFailure
 from pdeloop.messages.samples import unpack
 from pdeloop.messages.spec import ParameterError, Spec, check

@@ -14,7 +14,7 @@ from controller_node.responder import Responder
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.model_rows import ModelRows, pack
-from pdeloop.messages.signature import design_digest
+from pdeloop.messages.protocol import design_digest
 from pdeloop.messages.topics import (
     COMPLETED,
     COST,

@@ -20,9 +20,8 @@ from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.identification import identify_bag
-from pdeloop.messages.episodes import episode_name, episode_number
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.topics import START, STATE
+from pdeloop.messages.topics import START, STATE, episode_name, episode_number
 from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import DIAGNOSTICS, ROSOUT, Source, sources

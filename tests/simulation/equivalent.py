@@ -33,7 +33,7 @@ ARGUED: dict[tuple[str, str, str], str] = {
         "0 -> 1",
     ): "a byte among the hundreds of megabytes that are allowed",
     (
-        "pdeloop.messages.signature",
+        "pdeloop.messages.protocol",
         'return (int.from_bytes(state.digest(), "big") >> 11) or 1',
         "1 -> 2",
     ): "one of 2^53 texts has the digest 0",

@@ -81,7 +81,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "controller_node.run_state": (*_CONTROLLER, *_MEMORY),
     "controller_node.law_batch": (*_MEMORY, *_CONTROLLER),
     "controller_node.exploration": _CONTROLLER,
-    "pdeloop.messages.signature": _SIGNATURE,
+    "pdeloop.messages.protocol": _SIGNATURE,
 }
 """The modules that are changed, and their tests."""
 ENDS = {4: "simulation", 2: "tests", 3: "time limit", 0: "survived"}

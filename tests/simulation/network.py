@@ -10,13 +10,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from pdeloop.messages.episodes import EPISODES_PER_START
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.protocol import ModelFailure, Publication
-from pdeloop.messages.signature import digest_of
+from pdeloop.messages.protocol import ModelFailure, Publication, digest_of
 from pdeloop.messages.topics import (
     ACTION,
     COST,
+    EPISODES_PER_START,
     MODEL,
     MODEL_IDENTIFIED,
     PAUSED,

@@ -26,7 +26,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import read_problem
 from tests.support.small import parameters
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolder, RunFolderError

@@ -18,14 +18,14 @@ from pdeloop.bags.reader import Bag
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_yaml
-from pdeloop.messages.episodes import EPISODES_PER_START
 from pdeloop.messages.frames import Frame
+from pdeloop.messages.protocol import design_digest, digest_of, signature
 from pdeloop.messages.samples import clock_message
-from pdeloop.messages.signature import design_digest, digest_of, signature
 from pdeloop.messages.topics import (
     ACTION,
     COMPLETED,
     COST,
+    EPISODES_PER_START,
     MODEL,
     MODEL_IDENTIFIED,
     POLICY,

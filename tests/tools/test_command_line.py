@@ -15,7 +15,7 @@ import pytest
 from pdeloop import cli
 from pdeloop.cli import main
 from pdeloop.commands import problems
-from pdeloop.messages.loop_parameters import read_problem
+from pdeloop.messages.problem import read_problem
 from pdeloop.output import print_json
 from tests.support.interpreter import python
 from tests.support.small import SMALL

@@ -11,8 +11,7 @@ import pytest
 from scipy.linalg import expm
 
 import pdeloop
-from pdeloop.messages.cost import Cost
-from pdeloop.messages.measured_cost import measured_cost
+from pdeloop.messages.cost import Cost, measured_cost
 from pdeloop.method.design.lqt import track_horizon
 from pdeloop.report.data import gather
 

@@ -21,9 +21,8 @@ from pde_sim_node.build import build_plant, complete
 from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import main
-from pdeloop.messages.loop_parameters import read_problem
 from pdeloop.messages.own_code import OwnCodeError
-from pdeloop.messages.problem import load_parameters
+from pdeloop.messages.problem import load_parameters, read_problem
 from pdeloop.method.models import selection as kinds
 from tests.support.interpreter import ROOT, python
 from tests.support.small import FEW_FITS, same_bits

@@ -172,7 +172,7 @@ LATE_SUBSCRIPTION = """
 import time
 import rclpy
 from std_msgs.msg import Float64MultiArray, String
-from pdeloop.messages.episodes import episode_name
+from pdeloop.messages.topics import episode_name
 from pdeloop.ros.endpoints import raw_subscription, reader_qos, writer_qos
 from pdeloop.messages.topics import MODEL, RECORDER_STATUS, START
 

@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.protocol import ModelFailure
-from pdeloop.messages.topics import POLICY, START
+from pdeloop.messages.topics import POLICY, START, episode_name
 from tests.support.dispatching import (
     EXPLORATION,
     RUN,

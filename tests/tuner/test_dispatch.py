@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdeloop.messages.episodes import episode_name
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.protocol import ModelFailure
-from pdeloop.messages.topics import COMPLETED, MODEL, POLICY, START
+from pdeloop.messages.topics import COMPLETED, MODEL, POLICY, START, episode_name
 from tests.support.dispatching import (
     EXPLORATION,
     RUN,
