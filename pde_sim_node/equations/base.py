@@ -36,7 +36,12 @@ def parameter(
     """Declare one parameter: a dataclass field with its range (ends included) and unit."""
     return field(
         default=default,
-        metadata={"description": description, "minimum": minimum, "maximum": maximum, "unit": unit},
+        metadata={
+            "description": description,
+            "minimum": minimum,
+            "maximum": maximum,
+            "unit": unit,
+        },
     )
 
 

@@ -14,7 +14,11 @@ from pde_sim_node.equations.ginzburg_landau import GinzburgLandau
 from pde_sim_node.equations.korteweg_de_vries import KortewegDeVries
 from pde_sim_node.equations.kuramoto_sivashinsky import KuramotoSivashinsky
 from pde_sim_node.equations.kuramoto_sivashinsky_22 import KuramotoSivashinsky22
-from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
+from pde_sim_node.equations.random_modes import (
+    AllenCahnModes,
+    BurgersModes,
+    KortewegDeVriesModes,
+)
 from pde_sim_node.equations.schrodinger import Schrodinger
 from pde_sim_node.equations.wave import Wave
 

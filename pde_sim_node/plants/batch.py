@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pde_sim_node.dynamics import positive, whole
+from pde_sim_node.arguments import positive, whole
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array

@@ -19,7 +19,8 @@ from abc import abstractmethod
 
 import numpy as np
 
-from pde_sim_node.dynamics import Coefficient, Dynamics, internal_steps, positive, values_at, whole
+from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
+from pde_sim_node.dynamics import Dynamics
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Grid
 

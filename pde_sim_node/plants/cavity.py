@@ -23,7 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from pde_sim_node.dynamics import Dynamics, internal_steps, positive, whole
+from pde_sim_node.arguments import internal_steps, positive, whole
+from pde_sim_node.dynamics import Dynamics
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Axis, Grid
 

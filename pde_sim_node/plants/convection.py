@@ -25,7 +25,8 @@ import math
 
 import numpy as np
 
-from pde_sim_node.dynamics import Dynamics, arguments_of, positive, whole
+from pde_sim_node.arguments import positive, whole
+from pde_sim_node.dynamics import Dynamics, arguments_of
 from pde_sim_node.plants.buoyant_flow import Cells, flow
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Axis, Grid

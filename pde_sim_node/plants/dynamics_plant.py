@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
-from pde_sim_node.dynamics import Dynamics, positive, refuse_misspelt, whole
+from pde_sim_node.dynamics import Dynamics, refuse_misspelt
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
 from pdeloop.messages.action_set import ActionSet

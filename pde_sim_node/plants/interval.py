@@ -24,7 +24,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from pde_sim_node.dynamics import Coefficient, Dynamics, internal_steps, positive, values_at, whole
+from pde_sim_node.arguments import Coefficient, internal_steps, positive, values_at, whole
+from pde_sim_node.dynamics import Dynamics
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.grid import Grid
 

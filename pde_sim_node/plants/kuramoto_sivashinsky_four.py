@@ -24,7 +24,8 @@ import math
 
 import numpy as np
 
-from pde_sim_node.dynamics import Dynamics, arguments_of, positive, whole
+from pde_sim_node.arguments import positive, whole
+from pde_sim_node.dynamics import Dynamics, arguments_of
 from pdeloop.jit.cache import cached_njit
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Grid

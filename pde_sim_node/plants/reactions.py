@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from pde_sim_node.dynamics import Coefficient, positive, values_at
-from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion, VariableDiffusion
+from pde_sim_node.arguments import Coefficient, positive, values_at
+from pde_sim_node.plants.reaction_diffusion import OnInterval, ReactionDiffusion
+from pde_sim_node.plants.variable_diffusion import VariableDiffusion
 from pdeloop.messages.arrays import Array
 
 
@@ -29,7 +30,7 @@ class Plate(ReactionDiffusion):
 
     With r > 0 rest is unstable: without flux through the walls for all waves with D |k|^2 < r. D, r and
     b are numbers, functions of x and y, or values at the points, row by row. Where D is not a number,
-    diffusion is solved as in `pde_sim_node.plants.reaction_diffusion` in place of exact waves.
+    diffusion is solved as in `pde_sim_node.plants.variable_diffusion` in place of exact waves.
     """
 
     horizon, sample_time = 50, 0.1

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from pde_sim_node.dynamics import Dynamics, arguments_of, internal_steps, positive, whole
+from pde_sim_node.arguments import internal_steps, positive, whole
+from pde_sim_node.dynamics import Dynamics, arguments_of
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Axis, Grid
 
