@@ -37,7 +37,7 @@ from pdeloop.study import run as carry_out
 from pdeloop.study.executors import local_workers
 from pdeloop.study.results import Ended, reading
 from pdeloop.study.run import Pool, ended_well
-from pdeloop.study.status import status
+from pdeloop.study.table import status
 from pdeloop.study.training import train_one
 
 SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 20}

@@ -26,10 +26,10 @@ from pde_sim_node.plant import Plant
 from pde_sim_node.plants.loading import PHYSICAL, physical_of
 from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord
+from pdeloop.messages.actuators import boxes_of, text_of
 from pdeloop.messages.files import FileError
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.parameters import PLANT, taken_by
-from pdeloop.messages.places import boxes_of, text_of
 from pdeloop.messages.problem import own_values
 from pdeloop.messages.protocol import Publication
 from pdeloop.messages.samples import ACTION_KIND, clock_message

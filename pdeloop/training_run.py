@@ -25,17 +25,16 @@ from controller_node.identification import DesignSettings, check_sizes
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
-from pdeloop.domain import own_domain
+from pdeloop.domain import announced, own_domain
 from pdeloop.given_model import FILE as GIVEN
 from pdeloop.given_model import file_of_gains, with_gains
 from pdeloop.in_process import LocalPair, train
 from pdeloop.interruption import Interruption, interruptible
 from pdeloop.jit.cache import is_on_disk
-from pdeloop.live import announced
 from pdeloop.messages.files import FileError, make_own_folder, write_atomically
 from pdeloop.messages.frames import MAX_VALUES
 from pdeloop.messages.own_code import OwnCodeError
-from pdeloop.messages.parameters import model_order
+from pdeloop.messages.parameters import EXECUTION, PLANT, PROBLEM, RECORDER, VIEWER, model_order
 from pdeloop.messages.spec import ParameterError
 from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
@@ -44,10 +43,9 @@ from pdeloop.process.module_path import safe_children
 from pdeloop.process.start import die_with
 from pdeloop.solver import polynomial, polynomial_step, polynomial_sweep
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
-from pdeloop.unused import refuse_unused
 from tuner_node import narration
+from tuner_node.batch import NoModelError
 from tuner_node.build import build_training, remarks_on
-from tuner_node.errors import NoModelError
 from tuner_node.optimizer_parameters import kind_of
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
@@ -399,3 +397,54 @@ def unused(path: Path) -> Path:
     numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
     # A dangling link counts as present.
     return next(p for p in itertools.chain([path], numbered) if not os.path.lexists(p))
+
+
+OF_A_METHOD = {
+    "learning_rate": ("optimizer", "two_point"),
+    "learning_rate_from_zero": ("optimizer", "two_point"),
+    "smoothing_radius": ("optimizer", "two_point"),
+    "dmdc_rank": ("identification", "dmdc"),
+    "dmdc_order": ("identification", "dmdc"),
+}
+"""Parameters of one method: which parameter chooses it, and by which word."""
+OF_THE_COMMAND = ("out", "resume", "recorder", "pairs", "plant_fingerprint")
+"""Parameters of the tuner that follow from where and how a training runs."""
+OF_NODES = {*(spec.name for spec in (*PLANT, *EXECUTION)), "episode_timeout", "max_attempts"}
+"""Parameters of processes and messages, which a training in this process does not have."""
+ELSEWHERE = {spec.name for spec in (*RECORDER, *VIEWER)} - {spec.name for spec in PROBLEM}
+
+
+def refuse_unused(
+    given: Mapping[str, Any],
+    values: Mapping[str, Any],
+    *,
+    in_process: bool = False,
+    viewed: bool = False,
+) -> None:
+    """ParameterError for a parameter that was given for a training and has no effect on it.
+
+    given: those that the user named, not those of a problem's file; values: all of them, resolved;
+    viewed: whether a viewer runs as well.
+    """
+    for name in given:
+        reason = _reason(name, values, in_process=in_process, viewed=viewed)
+        if reason:
+            raise ParameterError(f"parameter '{name}' has no effect here: {reason}")
+
+
+def _reason(name: str, values: Mapping[str, Any], *, in_process: bool, viewed: bool) -> str:
+    if name in OF_A_METHOD:
+        chooser, word = OF_A_METHOD[name]
+        if values[chooser] != word:
+            return f"it applies to the {chooser} {word}, but this one is {values[chooser]}"
+    if name == "sensor_delays" and not values["sensors"]:
+        return "there are no sensors; give sensors as well"
+    if name in OF_THE_COMMAND:
+        return "it follows from how the training is started; see pdeloop train --help"
+    if name in OF_NODES and in_process:
+        return "it applies to nodes; train over topics, without --in-process"
+    if name in ELSEWHERE and not (viewed and name.startswith("view_")):
+        return "it belongs to a node that the training does not start" + (
+            "; add --view" if name.startswith("view_") else ""
+        )
+    return ""

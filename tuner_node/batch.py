@@ -17,6 +17,19 @@ from pdeloop.method.adapt import Context, Record, Rollout, RolloutResult, Trajec
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 
+
+class DispatchError(RuntimeError):
+    """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
+
+
+class NoModelError(DispatchError, ValueError):
+    """An exploration that gives no reduced model: the training ends there again if it is continued."""
+
+
+class ContradictionError(DispatchError):
+    """Something that the training has used was contradicted: it cannot be continued either."""
+
+
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
 

@@ -17,8 +17,7 @@ from pdeloop.messages.frames import Frame
 from pdeloop.messages.protocol import Publication, digest_of
 from pdeloop.messages.topics import COMPLETED, CostColumn
 from pdeloop.method.adapt import Trajectory
-from tuner_node.batch import Batch, BatchResult
-from tuner_node.errors import DispatchError
+from tuner_node.batch import Batch, BatchResult, DispatchError
 
 
 @dataclass

@@ -40,9 +40,15 @@ from pdeloop.messages.topics import (
     Topic,
     episode_name,
 )
-from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, less_often, most_environments
+from tuner_node.batch import (
+    UNKNOWN_PLANT,
+    Batch,
+    BatchResult,
+    ContradictionError,
+    less_often,
+    most_environments,
+)
 from tuner_node.chunk import ChunkQueue, messages_of
-from tuner_node.errors import ContradictionError
 from tuner_node.pair import Pair, PairPublication
 
 MAX_TARGETS, MAX_TARGET_BYTES = 64, 2**28

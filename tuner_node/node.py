@@ -34,9 +34,9 @@ from pdeloop.ros.node_main import ConfigurationError, node_main
 from pdeloop.ros.parameters import declare, given_parameters, on_change
 from pdeloop.ros.suspend_watchdog import sleep_for
 from tuner_node import narration
+from tuner_node.batch import ContradictionError, DispatchError, NoModelError
 from tuner_node.build import build_dispatcher, build_training, remarks_on
 from tuner_node.diagnostics import TunerDiagnostics
-from tuner_node.errors import ContradictionError, DispatchError, NoModelError
 from tuner_node.narration import Narration
 from tuner_node.optimizer_parameters import setting_specs, with_settings
 from tuner_node.pair import PairPublication

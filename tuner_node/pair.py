@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pdeloop.messages.frames import Frame, FrameError, digest
 from pdeloop.messages.protocol import NOT_SIGNED, ModelFailure, Publication, signature, signature_in
 from pdeloop.messages.topics import COST, MODEL_FAILED, VOID, CostColumn, episode_name
-from tuner_node.batch import Batch, less_often
+from tuner_node.batch import Batch, ContradictionError, DispatchError, NoModelError, less_often
 from tuner_node.chunk import Chunk
-from tuner_node.errors import ContradictionError, DispatchError, NoModelError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 PairPublication = tuple[int, Publication]

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pdeloop.messages.diagnostics import ConditionTimer
-from tuner_node.errors import DispatchError
+from tuner_node.batch import DispatchError
 from tuner_node.pair import PairPublication
 from tuner_node.session import Session
 

@@ -14,8 +14,7 @@ from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.registry import along
 from pdeloop.method.reduce.identifiability import examine_excitation
 from pdeloop.method.reduce.input_delay import study_delays
-from tuner_node.batch import BatchResult
-from tuner_node.errors import ContradictionError
+from tuner_node.batch import BatchResult, ContradictionError
 
 
 def same_steps(result: BatchResult, known: int) -> int:

@@ -8,8 +8,8 @@ results are all there, and assigns the next one. Events are given to `report` as
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from tuner_node.batch import DispatchError
 from tuner_node.dispatch import Dispatcher
-from tuner_node.errors import DispatchError
 from tuner_node.pair import PairPublication
 from tuner_node.training import Training
 

@@ -38,13 +38,13 @@ from tuner_node.batch import (
     UNKNOWN_PLANT,
     Batch,
     BatchResult,
+    NoModelError,
     TrainingSettings,
     batch_of,
     context_of,
     stacked,
 )
 from tuner_node.budget import Budget
-from tuner_node.errors import NoModelError
 from tuner_node.result_checks import check_excitation, check_law, same_steps
 from tuner_node.rollouts import CHECK, EVALUATED
 

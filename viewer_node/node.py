@@ -33,8 +33,7 @@ from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import MAX_COMPONENTS
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView, path_of
-from viewer_node.picture import Range, plane, space_time
-from viewer_node.shapes import shape_of
+from viewer_node.picture import Range, plane, shape_of, space_time
 
 GRAPH_PERIOD = 0.5
 """Period (s) of polling the ROS graph."""

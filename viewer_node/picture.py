@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -53,3 +54,82 @@ def middle(values: Array) -> Array:
     while values.ndim > 2:
         values = values[len(values) // 2]
     return values
+
+
+MOST_CELLS = 4096
+"""Most cells drawn of a component; on a finer grid every n-th along each axis."""
+APART = 1.1
+"""Distance of two pictures side by side, relative to their size."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Points of a marker, in m.
+
+    Attributes
+    ----------
+    points : (N, 2)
+        Of a line, or with `size` the centres of cells.
+    pairs : bool
+        Whether each two points are a line of their own, as of several components.
+    size : (float, float) or None
+        Of the cells.
+    colours : (N, 3)
+        Of the cells, from 0 to 1.
+    """
+
+    points: Array
+    pairs: bool = False
+    size: tuple[float, float] | None = None
+    colours: Array = field(default_factory=lambda: np.empty(0))
+
+
+def shape_of(grid: Grid, state: Array, ranges: Sequence[Range], *, beside: bool = False) -> Shape:
+    """The shape of a state, or of its target.
+
+    Parameters
+    ----------
+    grid
+        What the state is on; where the state has another size, as that of sensors, it is taken as
+        one component equally spaced over it.
+    state
+        Of all components.
+    ranges
+        Of the colours of each component; those without one are left out of a picture.
+    beside
+        Whether cells stand beside those of another state.
+
+    Returns
+    -------
+    Shape
+    """
+    if state.size != grid.size:
+        length = grid.axes[0].length if len(grid.axes) == 1 else float(state.size)
+        x = length / state.size * np.arange(state.size, dtype=np.float64)
+        return Shape(np.stack([x, state], axis=1))
+    if len(grid.axes) > 1:
+        return _cells(grid, state, ranges, beside)
+    lines = [np.stack([axis.points, state[own]], axis=1) for _, own, axis in grid.parts]
+    if len(lines) == 1:
+        return Shape(lines[0])
+    return Shape(np.concatenate([_pairs(line) for line in lines]), pairs=True)
+
+
+def _pairs(line: Array) -> Array:
+    """The two ends of each piece of a line."""
+    return np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 2)
+
+
+def _cells(grid: Grid, state: Array, ranges: Sequence[Range], beside: bool) -> Shape:
+    """The cells of the last two axes, of others the middle; the components one below the other."""
+    y, x = grid.axes[-2:]
+    step = int(np.ceil(np.sqrt(y.size * x.size / MOST_CELLS)))
+    Y, X = np.meshgrid(y.points[::step], x.points[::step], indexing="ij")
+    points, colours = [], []
+    for i, (values, limits) in enumerate(zip(grid.fields(state), ranges, strict=False)):
+        place = X + beside * APART * x.length, Y - i * APART * y.length
+        points.append(np.stack(place, axis=-1).reshape(-1, 2))
+        painted = diverging(middle(values)[::step, ::step], limits) / 255.0
+        colours.append(painted.reshape(-1, 3))
+    size = step * x.spacing, step * y.spacing
+    return Shape(np.concatenate(points), size=size, colours=np.concatenate(colours))

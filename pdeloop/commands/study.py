@@ -122,10 +122,9 @@ def carry_out(
     name: of the command; study_in: the study for a folder; remarks: lines that follow the table,
     from its rows.
     """
-    from pdeloop.display import StreamConsole
+    from pdeloop.display import Progress, StreamConsole
     from pdeloop.interruption import interruptible
     from pdeloop.messages.files import write_atomically
-    from pdeloop.progress import Progress
     from pdeloop.study.executors import local_workers
     from pdeloop.study.results import reading
     from pdeloop.study.run import run
@@ -231,8 +230,7 @@ def _study(options: argparse.Namespace) -> int:
 
 
 def _status(folder: Path, as_json: bool) -> int:
-    from pdeloop.study.status import status, status_text
-    from pdeloop.study.table import text
+    from pdeloop.study.table import status, status_text, text
 
     found = status(folder)
     if as_json:

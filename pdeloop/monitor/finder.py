@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
-from pdeloop.live import Live, is_locked, running
+from pdeloop.domain import Live, is_locked, running
 from pdeloop.messages.files import read_json
 
 

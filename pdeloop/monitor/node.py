@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
-from pdeloop.live import Live
+from pdeloop.domain import Live
 from pdeloop.messages.grid import Grid
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.process.isolation import keep_on_this_machine

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pdeloop.cli import FAILED, main
-from pdeloop.messages import documents, places
+from pdeloop.messages import actuators, documents
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.documents import MAX_DEPTH, MAX_YAML_NODES, parse_json, parse_yaml
 from pdeloop.messages.grid import Grid
@@ -280,9 +280,9 @@ def zeros() -> str:
         (Grid.parse, '[[["y", 1, 9999, 0, 0, "m"], ["x", 1, 9999, 0, 0, "m"]], "u", "", 0]'),
         (Grid.parse, '[[], ["u"], "", -3]'),
         (Grid.parse, '[[], ["u"], "", 1e999]'),
-        (places.parse, "[" * 20_000),
-        (places.parse, "[[1e999, [0, 1]]]"),
-        (places.parse, '{"a": 1}'),
+        (actuators.parse, "[" * 20_000),
+        (actuators.parse, "[[1e999, [0, 1]]]"),
+        (actuators.parse, '{"a": 1}'),
     ],
 )
 def test_a_hostile_text_of_a_parameter_is_refused_in_one_short_sentence(

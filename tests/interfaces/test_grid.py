@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pdeloop.messages.actuators import boxes_of
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.places import boxes_of
 
 
 def test_the_points_of_an_axis_are_on_a_circle_on_walls_or_in_cells() -> None:

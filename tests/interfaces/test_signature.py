@@ -29,8 +29,7 @@ from pdeloop.messages.topics import (
 )
 from tests.support.lockstep import is_void, plant_protocol
 from tests.support.small import dispatcher_of
-from tuner_node.batch import Batch
-from tuner_node.errors import DispatchError
+from tuner_node.batch import Batch, DispatchError
 
 N_Z, N_A, N_S = 32, 4, 3
 RNG = np.random.default_rng(0)

@@ -8,7 +8,7 @@ import os
 import pytest
 
 from pde_sim_node import run_record
-from pdeloop import domain, live
+from pdeloop import domain
 from pdeloop.cli import FAILED, main
 from pdeloop.messages.files import FileError, private_folder
 from pdeloop.training_run import unused
@@ -60,16 +60,15 @@ def test_links_in_the_folder_of_the_domains_harm_nobody(tmp_path, monkeypatch):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     folder = tmp_path / "domains"
-    for module in (domain, live):
-        monkeypatch.setattr(module, "DOMAINS_FOLDER", folder)
+    monkeypatch.setattr(domain, "DOMAINS_FOLDER", folder)
     folder.mkdir(mode=0o777)
     for number in domain.DOMAINS:
         (folder / str(number)).symlink_to(victim)
         (folder / f"new-live-{os.getpid()}-{number}").symlink_to(victim)
     with pytest.raises(OSError, match="it is a symbolic link"), domain.own_domain():
         pass
-    with live.announced(7, tmp_path):
-        assert [found.domain for found in live.running()] == [7]
+    with domain.announced(7, tmp_path):
+        assert [found.domain for found in domain.running()] == [7]
     assert victim.read_text() == "precious"
     assert folder.stat().st_mode & 0o777 == 0o700
 
@@ -79,12 +78,11 @@ def test_the_folder_of_the_domains_must_be_this_users_own(tmp_path, monkeypatch)
     (tmp_path / "elsewhere").mkdir()
     link = tmp_path / "domains"
     link.symlink_to(tmp_path / "elsewhere")
-    for module in (domain, live):
-        monkeypatch.setattr(module, "DOMAINS_FOLDER", link)
+    monkeypatch.setattr(domain, "DOMAINS_FOLDER", link)
     with pytest.raises(domain.DomainError, match="is not a folder of this user"):
         domain.own_domain().__enter__()
-    with live.announced(7, tmp_path):
-        assert live.running() == []
+    with domain.announced(7, tmp_path):
+        assert domain.running() == []
     assert list((tmp_path / "elsewhere").iterdir()) == []
     if os.getuid() == 0:
         foreign = tmp_path / "foreign"

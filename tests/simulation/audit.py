@@ -13,7 +13,7 @@ from tests.simulation.history import History
 from tests.simulation.plan import Plan, aimed, draw
 from tests.simulation.processes import remembering, values
 from tests.support.small import same_bits, train_here
-from tuner_node.errors import DispatchError
+from tuner_node.batch import DispatchError
 from tuner_node.training import Training
 
 GAVE_UP = "gave up after"

@@ -22,7 +22,7 @@ from tests.simulation.processes import (
     UnsignedController,
     values,
 )
-from tuner_node.errors import DispatchError
+from tuner_node.batch import DispatchError
 from tuner_node.training import Training
 
 LEASE = 4.0

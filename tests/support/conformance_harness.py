@@ -30,9 +30,9 @@ from pdeloop.messages.topics import (
 from pdeloop.problem_check import Finding
 from tests.support.lockstep import plant_protocol
 from tests.support.small import parameters
+from tuner_node.batch import DispatchError
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher
-from tuner_node.errors import DispatchError
 from tuner_node.session import Session
 
 Mistake = Callable[[Topic, Message], Message]

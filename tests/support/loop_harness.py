@@ -29,7 +29,6 @@ from typing import Any
 import pytest
 
 import pdeloop.domain
-import pdeloop.live
 from pde_sim_node import run_record
 from pdeloop import supervisor
 from pdeloop.domain import DOMAINS_FOLDER, own_domain
@@ -151,7 +150,7 @@ def become(log: Path, environment: Mapping[str, str]) -> None:
     os.environ.update(environment)
     tempfile.tempdir = None  # which it looks for again, as a program that starts
     domains = Path(tempfile.gettempdir()) / DOMAINS_FOLDER.name
-    pdeloop.domain.DOMAINS_FOLDER = pdeloop.live.DOMAINS_FOLDER = domains
+    pdeloop.domain.DOMAINS_FOLDER = pdeloop.domain.DOMAINS_FOLDER = domains
     os.chdir(log.parent)
 
 

@@ -6,13 +6,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from pdeloop.live import Live, announced, running
+from pdeloop.domain import Live, announced, running
 from pdeloop.monitor.finder import Finder
 from tuner_node.run_folder import RunFolder
 
 
 def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr("pdeloop.live.DOMAINS_FOLDER", tmp_path / "domains")
+    monkeypatch.setattr("pdeloop.domain.DOMAINS_FOLDER", tmp_path / "domains")
     assert running() == []
     with announced(17, tmp_path / "first"):
         (live,) = running()
@@ -24,7 +24,7 @@ def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
 
 
 def test_what_a_killed_loop_left_behind_is_not_found_and_goes_away(tmp_path, monkeypatch):
-    monkeypatch.setattr("pdeloop.live.DOMAINS_FOLDER", tmp_path)
+    monkeypatch.setattr("pdeloop.domain.DOMAINS_FOLDER", tmp_path)
     left = tmp_path / "live-1-17"
     left.write_text(json.dumps({"domain": 17, "folder": "x", "started": 1, "network": False}))
     assert running() == [] and not left.exists()

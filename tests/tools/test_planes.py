@@ -13,14 +13,13 @@ import pdeloop
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.environments.signals import told
 from pdeloop.frames import Frames
+from pdeloop.messages.actuators import Box, boxes_of, parse, text_of
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.places import Box, boxes_of, parse, text_of
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
 from pdeloop.report.data import Behaviour
 from viewer_node.loop_view import LoopView
-from viewer_node.picture import UNSEEN, plane, space_time
-from viewer_node.shapes import shape_of
+from viewer_node.picture import UNSEEN, plane, shape_of, space_time
 
 GRID = pdeloop.Grid(
     (pdeloop.Axis("y", 1.0, 3, periodic=False), pdeloop.Axis("x", 2.0, 4)), ("u", "v")

@@ -15,13 +15,12 @@ from controller_node.identification import DesignSettings, designed
 from pde_sim_node.build import build_plant
 from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
-from pdeloop.control_effect import judged
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.model_rows import pack
 from pdeloop.messages.topics import CostColumn
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.registry import laws_of
-from pdeloop.problem_check import check
+from pdeloop.problem_check import check, judged
 from pdeloop.training_run import resolve
 from tests.support.small import SMALL, parameters
 from tuner_node.batch import Batch

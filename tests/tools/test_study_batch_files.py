@@ -18,7 +18,7 @@ import yaml
 
 from pdeloop.study import Study, run
 from pdeloop.study.cluster import cluster
-from pdeloop.study.status import status
+from pdeloop.study.table import status
 from tests.support.dask_cluster import dask_cluster
 from tests.support.interpreter import ROOT
 from tests.support.loop_harness import until

@@ -22,7 +22,7 @@ from pdeloop.study import Study, StudyError, run, training
 from pdeloop.study.deaths import Deaths
 from pdeloop.study.executors import local_workers
 from pdeloop.study.results import Ended, reading, writing
-from pdeloop.study.status import status
+from pdeloop.study.table import status
 from pdeloop.study.training import Place, listening, train_one
 from tests.support import study_tasks
 from tests.support.interpreter import ROOT

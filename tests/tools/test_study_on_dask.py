@@ -25,7 +25,7 @@ from pdeloop.study import Study, StudyError, run
 from pdeloop.study import cluster as dask_client
 from pdeloop.study.cluster import cluster
 from pdeloop.study.results import read_study, reading
-from pdeloop.study.status import status
+from pdeloop.study.table import status
 from tests.support import study_tasks
 from tests.support.dask_cluster import DaskCluster, address_in, dask_cluster
 from tests.support.interpreter import ROOT

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pdeloop.progress import Progress
+from pdeloop.display import Progress
 from tests.support.interpreter import ROOT
 from tests.support.small import SMALL
 from tests.support.terminal import COLOUR, CONTROL, LIMIT, PDELOOP, run, terminal
@@ -97,7 +97,7 @@ def test_progress_becomes_lines() -> None:
 def test_news_after_long_silence_is_a_line(monkeypatch) -> None:
     file = io.StringIO()
     progress = Progress(Console(file=file, width=80), "adapting", "rollouts")
-    monkeypatch.setattr("pdeloop.progress.PERIOD", -1.0)
+    monkeypatch.setattr("pdeloop.display.PERIOD", -1.0)
     for done in (9, 10, 10, 11, 11, 11):
         progress.tell(done, 80, "cost 1.5")
     progress.close()

@@ -45,7 +45,7 @@ REFUSED = "WebSocket connection to"
 INTERRUPTED = """
 import os, signal
 from pathlib import Path
-from pdeloop.live import Live
+from pdeloop.domain import Live
 from pdeloop.monitor.node import show_loops
 from viewer_node.web.page import Page
 class Finder:

@@ -24,8 +24,8 @@ from tests.support.dispatching import (
 )
 from tests.support.small import same_bits
 from tuner_node import dispatch as dispatching
+from tuner_node.batch import DispatchError
 from tuner_node.dispatch import MAX_TARGET_BYTES, MAX_TARGETS
-from tuner_node.errors import DispatchError
 from tuner_node.pair import FOREIGN_PLANT_GRACE, REMEMBERED
 
 

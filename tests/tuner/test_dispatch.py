@@ -22,8 +22,7 @@ from tests.support.dispatching import (
     void_of,
 )
 from tests.support.small import dispatcher_of, same_bits
-from tuner_node.batch import Batch
-from tuner_node.errors import DispatchError
+from tuner_node.batch import Batch, DispatchError
 
 
 @pytest.mark.parametrize("pairs", [1, 2, 3, 5])

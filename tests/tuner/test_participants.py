@@ -13,9 +13,8 @@ import pytest
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import POLICY, START
 from tests.support.small import dispatcher_of
-from tuner_node.batch import Batch
+from tuner_node.batch import Batch, DispatchError
 from tuner_node.dispatch import PAUSE_LEASE
-from tuner_node.errors import DispatchError
 from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
 
 

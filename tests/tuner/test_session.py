@@ -12,9 +12,8 @@ from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import MODEL, POLICY, START, StartColumn
 from tests.support.small import dispatcher_of, parameters, same_bits, train_here
 from tuner_node import training_state
-from tuner_node.batch import Batch
+from tuner_node.batch import Batch, DispatchError
 from tuner_node.build import build_training
-from tuner_node.errors import DispatchError
 from tuner_node.session import Session
 from tuner_node.training import Training
 

@@ -14,10 +14,9 @@ from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn
 from pdeloop.method.reduce.regression import study_orders
 from tests.support.small import CHECKED, FEW_STEPS, parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
-from tuner_node.batch import Batch, BatchResult
+from tuner_node.batch import Batch, BatchResult, ContradictionError
 from tuner_node.build import build_training
 from tuner_node.chunk import Chunk, gathered
-from tuner_node.errors import ContradictionError
 from tuner_node.narration import Narration
 
 

@@ -12,8 +12,7 @@ import pytest
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.topics import COMPLETED
 from tests.support.dispatching import RUN, batch, costs_of, dispatcher, starts
-from tuner_node.batch import Batch
-from tuner_node.errors import DispatchError
+from tuner_node.batch import Batch, DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector, cut
 
 STEPS = 30

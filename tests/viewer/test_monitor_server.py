@@ -16,10 +16,10 @@ import aiohttp
 import numpy as np
 import pytest
 
+from pdeloop.messages.actuators import Box, text_of
 from pdeloop.messages.colour_scale import DARK, LIGHT, colours
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.places import Box, text_of
 from tests.support.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.loop_view import LoopView

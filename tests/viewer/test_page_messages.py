@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pdeloop.messages.actuators import Box, text_of
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.places import Box, text_of
 from pdeloop.monitor.node import component_names
 from tests.support.viewed import frame, state
 from viewer_node.loop_view import LoopView

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.actuators import parse
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.places import parse
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples
 from viewer_node.loop_view import SILENT, LoopView, path_of
 from viewer_node.operation import Call
