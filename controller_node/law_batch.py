@@ -79,12 +79,8 @@ class LawBatch:
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take theta of each environment for the next episode.
 
-        Parameters
-        ----------
-        policies : (M, *shape) array
-            Theta, as messages have it (`Law.shape`).
-        model_index : (M,) array of int, optional
-            Which of the models an environment uses; the first one if not given.
+        policies (M, *shape): theta, as messages have it (`Law.shape`); model_index ((M,) array of int,
+        optional): which of the models an environment uses; the first one if not given.
         """
         theta, shape = np.asarray(policies, dtype=np.float64), self._laws[0].shape
         longer = self._laws[0].extends and theta.ndim == 2 and theta.shape[1:] > shape

@@ -95,12 +95,8 @@ class ProjectedLaw:
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take the policies of the next episode.
 
-        Parameters
-        ----------
-        policies : (M, n_a, 2 n_s) array
-            [K_a K_b] of every environment.
-        model_index : (M,) array of int, optional
-            Which of the models an environment projects with; the first one if not given.
+        policies (M, n_a, 2 n_s): [K_a K_b] of every environment; model_index ((M,) array of int,
+        optional): which of the models an environment projects with; the first one if not given.
         """
         gains = np.asarray(policies, dtype=np.float64)
         columns = 2 * self._n_s
@@ -139,16 +135,9 @@ class ProjectedLaw:
     def actions(self, states: ArrayLike) -> Array:
         """The actions that answer the states.
 
-        Parameters
-        ----------
-        states : (M, n_z) array
-            The fields at t_k. An environment whose field is not finite gets an action that is not
-            finite and does not disturb the others.
-
-        Returns
-        -------
-        (M, n_a) array
-            The actions held over [t_k, t_{k+1}).
+        states (M, n_z): the fields at t_k. An environment whose field is not finite gets an action that
+        is not finite and does not disturb the others. Returns (M, n_a) array: the actions held over
+        [t_k, t_{k+1}).
         """
         if not self._set:
             raise ValueError("the law has no policies yet; call set() before actions().")

@@ -21,12 +21,7 @@ from pdeloop.messages.frames import MAX_ID
 class Definition:
     """Everything that the states and costs of a plant depend on.
 
-    Attributes
-    ----------
-    values : mapping
-        Its parameters.
-    sources : sequence of str
-        The source of its code.
+    values: its parameters; sources: the source of its code.
     """
 
     values: Mapping[str, Any]
@@ -72,10 +67,7 @@ def code_of(code: CodeType) -> Any:
 def described(name: str, value: Any) -> Any:
     """A parameter as JSON can hold it.
 
-    Raises
-    ------
-    ValueError
-        It is an object that cannot be told from another one.
+    ValueError if it is an object that cannot be told from another one.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value

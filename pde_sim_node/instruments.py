@@ -73,18 +73,8 @@ class InstrumentedPlant:
     As the plant, but `reset` and `step` return the measurement, `target` is its target, and
     actions saturate. `states` are the true ones. An environment is forced only after a step that did
     not diverge, and has diverged as well if the forcing takes it beyond the bound.
-
-    Parameters
-    ----------
-    plant
-        Is advanced by this one alone from now on.
-    instruments
-        What is between.
-
-    Raises
-    ------
-    ValueError
-        There are more sensors than grid points, or more delays than steps.
+    plant: is advanced by this one alone from now on; instruments: what is between. ValueError if there
+    are more sensors than grid points, or more delays than steps.
     """
 
     parallel = None  # a step is more than compiled code

@@ -35,23 +35,9 @@ Pictures = list[NDArray[np.uint8]]
 def animated(run: FinishedRun, *, field: int = 0, seconds: float = 6.0) -> Pictures:
     """The pictures of a run's controllers on one of the fields of its closing evaluation.
 
-    Parameters
-    ----------
-    run
-        A finished run, whose first seed is shown.
-    field
-        Its number.
-    seconds
-        Duration of the episode in the animation.
-
-    Returns
-    -------
-    list of (height, width, 3) arrays
-
-    Raises
-    ------
-    ValueError
-        There is no such field, or the run had another plant or law than the built-in ones.
+    run: a finished run, whose first seed is shown; field: its number; seconds: duration of the episode
+    in the animation. Returns arrays (height, width, 3). ValueError if there is no such field, or the
+    run had another plant or law than the built-in ones.
     """
     fields = int(run.values["evaluation_fields"])
     if not 0 <= field < fields:

@@ -56,21 +56,10 @@ def data_episodes(run: FinishedRun) -> Iterator[DataEpisode]:
 def parquet(run: FinishedRun) -> bytes:
     """A table with a row per measurement; that of an episode's last one has no action and no reward.
 
-    Parameters
-    ----------
-    run
-        A run whose training can be repeated.
-
-    Returns
-    -------
-    bytes
-        Columns episode, seed, k, t (s), the measurements, a1 .. and reward, terminated, truncated. The
-        unit of a column is in its field's metadata, problem and sample time in the schema's.
-
-    Raises
-    ------
-    ValueError
-        pyarrow is not installed, or the run cannot be repeated.
+    run: a run whose training can be repeated. Returns columns episode, seed, k, t (s), the
+    measurements, a1 .. and reward, terminated, truncated. The unit of a column is in its field's
+    metadata, problem and sample time in the schema's. ValueError if pyarrow is not installed, or the
+    run cannot be repeated.
     """
     try:
         import pyarrow as pa
@@ -131,18 +120,9 @@ def measured_names(run: FinishedRun, n_y: int) -> list[str]:
 def write_minari(run: FinishedRun, name: str) -> None:
     """Make a data set of Minari, in the folder that Minari keeps them in.
 
-    Parameters
-    ----------
-    run
-        A run whose training can be repeated.
-    name
-        Its id in Minari, such as burgers/rollouts-v0.
-
-    Raises
-    ------
-    ValueError
-        Minari is not installed, there is such a data set, the name is none, or the run cannot be
-        repeated.
+    run: a run whose training can be repeated; name: its id in Minari, such as burgers/rollouts-v0.
+    ValueError if Minari is not installed, there is such a data set, the name is none, or the run cannot
+    be repeated.
     """
     try:
         import minari

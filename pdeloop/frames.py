@@ -40,19 +40,11 @@ Show = Callable[[int, Array], None]
 class Frames:
     """Draws plants of one kind side by side on one canvas, each picture in place of the one before.
 
-    Parameters
-    ----------
-    plant
-        Whose grid, target, actuators and sensors they are.
-    titles
-        One for each that is drawn.
-    colours
-        Of their curves and actions.
-    fields : (C, T + 1, n_z), optional
-        All that will be drawn: then the axes hold them from the first picture on, and fields on one
-        axis are also drawn in space and time. Otherwise the axes grow with the data.
-    largest
-        Magnitude of the actions that the axes hold from the first picture on.
+    plant: whose grid, target, actuators and sensors they are; titles: one for each that is drawn;
+    colours: of their curves and actions; fields ((C, T + 1, n_z), optional): all that will be drawn:
+    then the axes hold them from the first picture on, and fields on one axis are also drawn in space
+    and time. Otherwise the axes grow with the data; largest: magnitude of the actions that the axes
+    hold from the first picture on.
     """
 
     def __init__(
@@ -104,10 +96,7 @@ class Frames:
     def draw(self, states: Array, actions: Array, step: int) -> NDArray[np.uint8]:
         """The picture of states (C, n_z) at a step and the actions (C, n_a) taken there.
 
-        Returns
-        -------
-        (height, width, 3)
-            Red, green and blue of each pixel.
+        Returns (height, width, 3): red, green and blue of each pixel.
         """
         grid = self._plant.grid
         for shows, state in zip(self._shows, states, strict=True):

@@ -41,21 +41,10 @@ def file_of_gains(model: object) -> str:
 def with_gains(model: object, plant: Plant, values: Mapping[str, Any]) -> bytes:
     """A model with its LQ-tracking gains, as `pdeloop identify --out` writes it.
 
-    Parameters
-    ----------
-    model : ReducedModel, state-space system or path
-        See `ReducedModel.of` and `ReducedModel.load`.
-    plant : Plant
-        For its target and what it measures.
-    values : dict
-        The parameters of the training, for the cost and the sampling time.
-
-    Raises
-    ------
-    ParameterError
-        It is not a model of this plant, or the law needs more than A and B.
-    DesignError
-        It has no stabilising gains.
+    model (ReducedModel, state-space system or path): see `ReducedModel.of` and `ReducedModel.load`;
+    plant: for its target and what it measures; values: the parameters of the training, for the cost and
+    the sampling time. ParameterError if it is not a model of this plant, or the law needs more than A
+    and B. DesignError if it has no stabilising gains.
     """
     known = (
         ReducedModel.load(model)

@@ -31,20 +31,9 @@ from pdeloop.method.laws.neural import Neural
 class LawForm:
     """A law as matrices.
 
-    Attributes
-    ----------
-    kind : str
-        affine, observer or neural.
-    arrays : mapping
-        By the names above.
-    action_set : ActionSet
-        Admissible actions.
-    sample_time : float
-        Time (s) of a step.
-    name : str
-        What it is the law of, in words.
-    spectral_radius : float
-        Largest magnitude of an eigenvalue of the closed loop on the identified model, without bounds.
+    kind: affine, observer or neural; arrays: by the names above; action_set: admissible actions;
+    sample_time: time (s) of a step; name: what it is the law of, in words; spectral_radius: largest
+    magnitude of an eigenvalue of the closed loop on the identified model, without bounds.
     """
 
     kind: str

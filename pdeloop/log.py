@@ -89,18 +89,9 @@ class Log:
 class Table:
     """The contents of a log.
 
-    Attributes
-    ----------
-    channels : Channels
-        Names of the columns.
-    trajectories : list of (states (N + 1, n_z), actions (N, n_a))
-        a_k was held from z_k to z_{k+1}.
-    target : (n_z,) array or None
-        Of the row whose t is the word target.
-    sample_time : float or None
-        Of t, in s; None without such a column.
-    remarks : list of str
-        What was found and left out.
+    channels: names of the columns; trajectories: states (N + 1, n_z) and actions (N, n_a) each, of which
+    a_k was held from z_k to z_{k+1}; target (n_z,): of the row whose t is the word target;
+    sample_time: of t, in s; None without such a column; remarks: what was found and left out.
     """
 
     channels: Channels

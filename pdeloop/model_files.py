@@ -28,22 +28,8 @@ def fmu(law: LawForm, source: bytes) -> bytes:
 
     Its inputs are y[1] .. y[n_y], its outputs a[1] .. a[n_a]; a step of the law is made at each
     multiple of the sample time.
-
-    Parameters
-    ----------
-    law
-        The law.
-    source
-        Its C99, as `pdeloop export --out law.c` writes it.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ValueError
-        There is no compiler, or it fails.
+    source: the law in C99, as `pdeloop export --out law.c` writes it. ValueError if there is no
+    compiler, or it fails.
     """
     call = "pdeloop_law(&law->memory, law->y, law->a)"
     memory = "pdeloop_memory memory;"

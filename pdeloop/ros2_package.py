@@ -72,19 +72,8 @@ def write_package(
 ) -> None:
     """Write the package of a law of a run, which has the name of its folder.
 
-    Parameters
-    ----------
-    run
-        The run.
-    folder
-        A new or empty folder.
-    which, seed
-        As for `FinishedRun.law`.
-
-    Raises
-    ------
-    ValueError
-        The law has no such form, the folder has contents, or its name is none of a package.
+    folder: a new or empty folder; which, seed: as for `FinishedRun.law`. ValueError if the
+    law has no such form, the folder has contents, or its name is none of a package.
     """
     package = folder.absolute().name
     if not _NAME.fullmatch(package):

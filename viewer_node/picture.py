@@ -66,16 +66,9 @@ APART = 1.1
 class Shape:
     """Points of a marker, in m.
 
-    Attributes
-    ----------
-    points : (N, 2)
-        Of a line, or with `size` the centres of cells.
-    pairs : bool
-        Whether each two points are a line of their own, as of several components.
-    size : (float, float) or None
-        Of the cells.
-    colours : (N, 3)
-        Of the cells, from 0 to 1.
+    points (N, 2): of a line, or with `size` the centres of cells; pairs: whether each two points are a
+    line of their own, as of several components; size ((float, float) or None): of the cells; colours
+    (N, 3): of the cells, from 0 to 1.
     """
 
     points: Array
@@ -87,21 +80,10 @@ class Shape:
 def shape_of(grid: Grid, state: Array, ranges: Sequence[Range], *, beside: bool = False) -> Shape:
     """The shape of a state, or of its target.
 
-    Parameters
-    ----------
-    grid
-        What the state is on; where the state has another size, as that of sensors, it is taken as
-        one component equally spaced over it.
-    state
-        Of all components.
-    ranges
-        Of the colours of each component; those without one are left out of a picture.
-    beside
-        Whether cells stand beside those of another state.
-
-    Returns
-    -------
-    Shape
+    grid: what the state is on; where the state has another size, as that of sensors, it is taken as one
+    component equally spaced over it; state: of all components; ranges: of the colours of each
+    component; those without one are left out of a picture; beside: whether cells stand beside those of
+    another state.
     """
     if state.size != grid.size:
         length = grid.axes[0].length if len(grid.axes) == 1 else float(state.size)

@@ -93,12 +93,8 @@ MOST = 256
 class Box:
     """The region in which an actuator acts with at least half of its largest magnitude.
 
-    Attributes
-    ----------
-    component : int
-        The one on which it acts most.
-    sides : tuple of (low, high)
-        Along each axis, in m. On a periodic axis the low one is negative where the box goes around.
+    component: the one on which it acts most; sides: along each axis, in m. On a periodic axis the low
+    one is negative where the box goes around.
     """
 
     component: int
@@ -108,16 +104,8 @@ class Box:
 def boxes_of(grid: Grid, supports: Array) -> list[Box]:
     """The boxes of actuators; one that acts nowhere has none.
 
-    Parameters
-    ----------
-    grid
-        Of the state; a plain vector counts as one axis of its numbers.
-    supports : (n_z, n_a)
-        How each actuator acts on each number of a state.
-
-    Returns
-    -------
-    list of Box
+    grid: of the state; a plain vector counts as one axis of its numbers; supports (n_z, n_a): how each
+    actuator acts on each number of a state.
 
     Examples
     --------
@@ -172,10 +160,7 @@ def text_of(boxes: Sequence[Box]) -> str:
 def parse(text: str) -> list[Box]:
     """The boxes of a parameter.
 
-    Raises
-    ------
-    ValueError
-        The text does not describe boxes.
+    ValueError if the text does not describe boxes.
 
     Examples
     --------

@@ -50,17 +50,8 @@ def field_range(values: NDArray[np.floating], target: NDArray[np.floating]) -> t
 
     The middle is the target where that is constant, its mean where it is nowhere 0, and otherwise 0.
     The range holds the whole target and ROBUST % of the values.
-
-    Parameters
-    ----------
-    values
-        Of a component, of any shape; values that are not finite are ignored.
-    target
-        Its target, of any shape; empty if it is not known.
-
-    Returns
-    -------
-    tuple of float
+    values: of a component, of any shape; values that are not finite are ignored; target: its target, of
+    any shape; empty if it is not known.
 
     Examples
     --------
@@ -84,15 +75,8 @@ def field_range(values: NDArray[np.floating], target: NDArray[np.floating]) -> t
 def colours(levels: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Colours on a light background.
 
-    Parameters
-    ----------
-    levels : (...)
-        From 0, the lowest value, to 1, the highest; beyond that it is cut off. NaN is not allowed.
-
-    Returns
-    -------
-    (..., 3)
-        Red, green, blue.
+    levels (...): from 0, the lowest value, to 1, the highest; beyond that it is cut off. NaN is not
+    allowed. Returns (..., 3): red, green, blue.
 
     Examples
     --------

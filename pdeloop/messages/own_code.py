@@ -47,16 +47,10 @@ class OwnCodeError(RuntimeError):
 class OwnCode:
     """One kind of code that users may bring.
 
-    Attributes
-    ----------
-    word : str
-        What it is, and the parameter and the flag that name it: equation.
-    variable : str
-        The environment variable with the names of code that may be run, separated by commas.
-    shipped : mapping
-        What comes with the project, by name; no package takes these names.
-    files : mapping
-        By the ending, or the beginning, of names that are code as a whole, what loads one.
+    word: what it is, and the parameter and the flag that name it: equation; variable: the environment
+    variable with the names of code that may be run, separated by commas; shipped: what comes with the
+    project, by name; no package takes these names; files: by the ending, or the beginning, of names
+    that are code as a whole, what loads one.
     """
 
     word: str
@@ -79,10 +73,7 @@ class OwnCode:
     def take(self, code: object) -> str:
         """The name of code that a program gives, by name or as a class, which is thereby allowed.
 
-        Raises
-        ------
-        ValueError
-            It is neither.
+        ValueError if it is neither.
         """
         if isinstance(code, str):
             return self.allow(code)
@@ -99,10 +90,7 @@ class OwnCode:
     def configured(self, name: str, environment: Mapping[str, str] = os.environ) -> Any:
         """Load the code that a problem's parameters name, if it may be run.
 
-        Raises
-        ------
-        ValueError
-            The name is code that is not allowed; or see `load`.
+        ValueError if the name is code that is not allowed; or see `load`.
         """
         self.require(name, environment)
         return self.load(name)
@@ -122,10 +110,7 @@ class OwnCode:
     def load(self, name: str) -> Any:
         """The object that a name stands for. This executes code, whatever its origin.
 
-        Raises
-        ------
-        ValueError
-            Nothing of that name can be loaded.
+        ValueError if nothing of that name can be loaded.
         """
         if name in self.shipped:
             return self.shipped[name]
@@ -240,11 +225,7 @@ def called(name: str, function: Callable[..., Any], *given: Any, module: str = "
     """The result of a call of user code; a long call is reported while it runs.
 
     name: as the sentence has it, Class.method; module: see `located`.
-
-    Raises
-    ------
-    OwnCodeError
-        It fails; one sentence with the line.
+    OwnCodeError if it fails; one sentence with the line.
     """
     try:
         if _is_shipped(function):

@@ -308,12 +308,9 @@ class LinearAdjoint:
 def derivative_loop(nonlinearity: Callable[[float], float]) -> Any:
     """Machine code of u[i] = g'(u[i]), a cfunc of (double *, intp), by the complex step.
 
-    Raises
-    ------
-    ValueError
-        g does not compile for a complex number, or is not analytic (|u|, max, ...): then the
-        complex step does not agree with a finite difference. The functions of `math` do compile
-        (`pdeloop.solver.dual_math`).
+    ValueError if g does not compile for a complex number, or is not analytic (|u|, max, ...): then the
+    complex step does not agree with a finite difference. The functions of `math` do compile
+    (`pdeloop.solver.dual_math`).
     """
     g: Any = register_jitable(error_model="numpy")(on_duals(nonlinearity))
     signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]

@@ -231,18 +231,10 @@ SHOWN = 5
 def status(folder: Path) -> dict[str, Any]:
     """How far the study in `folder` is.
 
-    Returns
-    -------
-    dict
-        `total`, `finished` and `failed` trainings; the `workers_lost` and the trainings that have
-        lost most, `deaths`; `running`: whether a process carries the study out; the
-        `rate_per_minute` of the last trainings and the `minutes_left`, None where they are not
-        known; `failures`, by training; the `rows` of the table so far.
-
-    Raises
-    ------
-    StudyError
-        There is no study.
+    Returns `total`, `finished` and `failed` trainings; the `workers_lost` and the trainings that have
+    lost most, `deaths`; `running`: whether a process carries the study out; the `rate_per_minute` of
+    the last trainings and the `minutes_left`, None where they are not known; `failures`, by training;
+    the `rows` of the table so far. StudyError if there is no study.
     """
     study = read_study(folder)
     failures: dict[str, str] = {}

@@ -57,14 +57,9 @@ PLANT_FILE = "plant"
 class Place:
     """Where all processes that see it keep the run folder of a training.
 
-    Attributes
-    ----------
-    root : str
-        A folder of the study, whose file `study` has the study's id.
-    study : str
-        That id, by which a worker on another machine knows that it sees the same folder.
-    name : str
-        Of the training: its folder in `root`.
+    root: a folder of the study, whose file `study` has the study's id; study: that id, by which a
+    worker on another machine knows that it sees the same folder; name: of the training: its folder in
+    `root`.
     """
 
     root: str
