@@ -18,8 +18,6 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.files import FileError, open_ordinary
 from pdeloop.method.reduce.channels import Channels
 
-__all__ = ["read_mat", "read_parquet"]
-
 HDF5 = b"\x89HDF\r\n\x1a\n"
 TARGET = "target"
 

@@ -19,8 +19,6 @@ from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.files import FileError, read_bounded
 from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
 
-__all__ = ["Measurements", "read_measurements"]
-
 MAX_TEXT_BYTES = 2**28
 """Most bytes of a .csv file."""
 MAX_TRAJECTORIES = 100_000

@@ -25,8 +25,6 @@ from pdeloop.log import SECONDS, Log, in_seconds
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import Channels, listed
 
-__all__ = ["Columns", "places_of", "read_table"]
-
 SEPARATORS = (",", ";", "\t", "|")
 """Tried in this order; without any of them columns are separated by spaces."""
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")

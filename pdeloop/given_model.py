@@ -21,8 +21,6 @@ from pdeloop.method.design import lqt
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
-__all__ = ["file_of_gains", "with_gains"]
-
 FILE = "model.npz"
 """In the folder of a run that was given the matrices of a model."""
 

@@ -16,8 +16,6 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 
-__all__ = ["looks_like_instant", "seconds_of"]
-
 DAY = 86400.0
 GAP = 1.5
 """Median steps up to which one time follows another without a gap."""

@@ -15,8 +15,6 @@ from pdeloop.log_findings import Finding, Flags, findings, sentinels
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import Channels, listed
 
-__all__ = ["Log", "Remedies", "Table", "in_seconds", "trajectories_of"]
-
 JITTER = 1e-3
 """Relative tolerance of a step of t to the median one."""
 GAP = 1.5
@@ -89,8 +87,8 @@ class Log:
 class Table:
     """The contents of a log.
 
-    channels: names of the columns; trajectories: states (N + 1, n_z) and actions (N, n_a) each, of which
-    a_k was held from z_k to z_{k+1}; target (n_z,): of the row whose t is the word target;
+    channels: names of the columns; trajectories: states (N + 1, n_z) and actions (N, n_a) each, a_k
+    held from z_k to z_{k+1}; target (n_z,): of the row whose t is the word target;
     sample_time: of t, in s; None without such a column; remarks: what was found and left out.
     """
 

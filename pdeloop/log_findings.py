@@ -20,8 +20,6 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import SHOWN, Channels, listed
 from pdeloop.method.reduce.input_delay import LATEST
 
-__all__ = ["Finding", "findings", "sentinels"]
-
 FULL_SCALE = (32767.0, -32768.0, 65535.0, 2147483647.0, -2147483648.0, 4294967295.0, 1e20, 1e30)
 """Values besides 99, 999.9, -9999, ... that stand for no reading."""
 ISOLATED = 3.0

@@ -17,8 +17,14 @@ from pdeloop.messages.colour_scale import field_range
 from pdeloop.method.laws import Affine
 from pdeloop.report import figures, learning, planes
 from pdeloop.report.data import ProblemData, of_run
-from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
-from pdeloop.report.places import beside, moving_target
+from pdeloop.report.places import (
+    action_range,
+    beside,
+    held_actions,
+    moving_target,
+    name_actions,
+    share_text,
+)
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
 __all__ = [

@@ -35,8 +35,6 @@ from tuner_node.build import build_training, few_sensors, remarks_on
 from tuner_node.optimizer_parameters import kind_of
 from tuner_node.result_checks import check_excitation
 
-__all__ = ["Finding", "check", "field_plant"]
-
 LITTLE = 0.02
 """Share of the cost without control; a law that changes it by less does next to nothing."""
 SMALL = 1e-6

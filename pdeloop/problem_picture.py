@@ -12,8 +12,6 @@ import numpy as np
 from pde_sim_node.plant import MEAN_FIELD
 from pdeloop.problem_check import DRAWN, field_plant
 
-__all__ = ["draw"]
-
 
 def draw(values: Mapping[str, Any], path: Path) -> None:
     """A picture of the initial fields, the target and the actuators' supports."""

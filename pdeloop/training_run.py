@@ -213,7 +213,7 @@ def reopen(folder: Path) -> dict[str, Any]:
                 raise RunFolderError(
                     f"the run in {folder} is complete; there is nothing to continue"
                 )
-            run.hold(False)
+            run.change(paused=False)
     except FileError as error:
         raise RunFolderError(f"{folder}/run.json cannot be used: {error}") from error
     return values

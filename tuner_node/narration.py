@@ -173,7 +173,7 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         lines.append(
             "  nothing was adapted: the policies are those with which the adaptation started"
         )
-    elif worse := _worse_than_lqt(summary):
+    elif worse := _costlier(summary, "lqt"):
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
     lines += [f"  {text}" for text in differences(summary)]
@@ -265,11 +265,11 @@ def against_lqt(reduction: float) -> str:
     return f"{abs(100 * reduction):.1f} % {'below' if reduction >= 0 else 'above'} LQT"
 
 
-def _worse_than_lqt(summary: Row) -> list[int]:
-    """The seeds whose adapted law costs more than their LQT law, or diverged where that did not."""
+def _costlier(summary: Row, than: str) -> list[int]:
+    """The seeds whose adapted law costs more than another, or diverged where that did not."""
     costs = summary["costs"]
-    pairs = zip(costs["lqt"], costs["adapted"], strict=True)
-    return [summary["seed"] + m for m, (lqt, adapted) in enumerate(pairs) if not adapted <= lqt]
+    pairs = zip(costs[than], costs["adapted"], strict=True)
+    return [summary["seed"] + m for m, (other, adapted) in enumerate(pairs) if not adapted <= other]
 
 
 def several_publishers(found: Mapping[str, Sequence[str]]) -> list[str]:
@@ -368,16 +368,9 @@ def _share(found: Sequence[float], summary: Row) -> str:
     return f" for {len(found)} of {summary['seeds']} seeds" if summary["seeds"] > 1 else ""
 
 
-def costlier_than_none(summary: Row) -> bool:
-    """True if the law of a seed costs more than no control."""
-    costs = summary["costs"]
-    pairs = zip(costs["none"], costs["adapted"], strict=True)
-    return any(not adapted <= none for none, adapted in pairs)
-
-
 def exit_code(summary: Row) -> int:
     """Of the command that shows the outcome: 0, 1 where `failed`, or 3 where a law is costlier."""
-    return 1 if failed(summary) else COSTLIER * costlier_than_none(summary)
+    return 1 if failed(summary) else COSTLIER * bool(_costlier(summary, "none"))
 
 
 def failed(summary: Row) -> bool:

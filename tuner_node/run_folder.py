@@ -183,14 +183,6 @@ class RunFolder:
         except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
 
-    def give_up(self, reason: str) -> None:
-        """Let `reopen` refuse from now on. OSError or FileError where that cannot be written."""
-        self._change(contradiction=reason)
-
-    def fail(self, reason: str) -> None:
-        """Remember why the training failed. OSError or FileError where that cannot be written."""
-        self._change(failure=reason)
-
     def without_results(self) -> str:
         """Why the training here has no results, and what to do, in words."""
         if ended := self._ended_early():
@@ -212,11 +204,8 @@ class RunFolder:
             return f"the training failed, and would fail again ({known['failure']})"
         return ""
 
-    def hold(self, paused: bool) -> None:
-        """Remember whether an operator has paused it. OSError or FileError where that fails."""
-        self._change(paused=paused)
-
-    def _change(self, **entries: Any) -> None:
+    def change(self, **entries: Any) -> None:
+        """Change entries of run.json: `contradiction`, `failure`, `paused`. OSError or FileError."""
         path = self.path / "run.json"
         write_atomically(path, json.dumps(read_json(path) | entries).encode())
 

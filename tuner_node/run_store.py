@@ -76,9 +76,7 @@ class RunWriter:
 
     def give_up(self, reason: str) -> None:
         """Prevent the training, which used contradicted results, from being continued."""
-        try:
-            self._folder.give_up(reason)
-        except (OSError, FileError) as error:
+        if error := self._recorded(contradiction=reason):
             self._warn(
                 f"do not continue the run in {self._folder.path}: it used contradicted results, "
                 f"which could not be recorded ({error})"
@@ -86,17 +84,21 @@ class RunWriter:
 
     def fail(self, reason: str) -> None:
         """Remember why the training failed, and would fail again."""
-        try:
-            self._folder.fail(reason)
-        except (OSError, FileError) as error:
+        if error := self._recorded(failure=reason):
             self._warn(f"cannot record that the training failed: {error}")
 
     def hold(self, paused: bool) -> None:
         """Remember whether an operator has paused the training, for its tuner's next process."""
-        try:
-            self._folder.hold(paused)
-        except (OSError, FileError) as error:
+        if error := self._recorded(paused=paused):
             self._warn(f"cannot record the pause, which is lost when this process ends: {error}")
+
+    def _recorded(self, **entries: Any) -> Exception | None:
+        """Keep entries of run.json; the error where that fails."""
+        try:
+            self._folder.change(**entries)
+        except (OSError, FileError) as error:
+            return error
+        return None
 
     def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write the results of the finished training. Raises OSError if they cannot be written."""

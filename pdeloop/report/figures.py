@@ -19,8 +19,15 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.regression import OrderStudy
 from pdeloop.report import planes
 from pdeloop.report.data import ProblemData
-from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
-from pdeloop.report.places import beside, mark_places, moving_target
+from pdeloop.report.places import (
+    action_range,
+    beside,
+    held_actions,
+    mark_places,
+    moving_target,
+    name_actions,
+    share_text,
+)
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
 Eigenvalues = NDArray[Any]

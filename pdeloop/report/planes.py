@@ -14,8 +14,15 @@ from pde_sim_node.plant import Plant
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Grid
-from pdeloop.report.held_actions import action_range, held_actions, name_actions, share_text
-from pdeloop.report.places import mark_places, moving_target, supports_of
+from pdeloop.report.places import (
+    action_range,
+    held_actions,
+    mark_places,
+    moving_target,
+    name_actions,
+    share_text,
+    supports_of,
+)
 from pdeloop.report.style import FIELD_MAP, NAMES
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import pdeloop
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.report.data import of_run
 from pdeloop.report.figures import behaviour
-from pdeloop.report.held_actions import FEW, saturated, share_text
+from pdeloop.report.places import FEW, saturated, share_text
 from pdeloop.report.style import STYLE
 
 

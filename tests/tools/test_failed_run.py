@@ -79,7 +79,7 @@ def test_data_that_allow_no_model_are_remembered_too(tmp_path, capsys, monkeypat
 def test_a_run_with_contradicted_results_is_not_to_be_continued_either(tmp_path, capsys):
     run = RunFolder(tmp_path / "run")
     run.create(parameters())
-    run.give_up("two different messages")
+    run.change(contradiction="two different messages")
     for task in (lambda: load_run(run.path), lambda: run.reopen(parameters())):
         with pytest.raises(RunFolderError, match=r"contradicted later \(two different") as refused:
             task()

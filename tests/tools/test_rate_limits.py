@@ -17,7 +17,7 @@ from pdeloop.export import law_of
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.laws import Affine
 from pdeloop.problem_check import check
-from pdeloop.report.held_actions import share_text
+from pdeloop.report.places import share_text
 from tests.tools.test_exported_bounds import N_A, N_Z, model
 
 RATE = 0.15
