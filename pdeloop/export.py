@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from io import BytesIO, StringIO
+from io import StringIO
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.spec import ParameterError
@@ -57,15 +58,10 @@ class Parameters:
         """`law`, its name, `theta`, its parts as `theta.NAME`, and the reduced model."""
         parts = self.law.parts(self.theta) if self.law else {}
         arrays = {f"theta.{name}": part for name, part in parts.items()}
-        known = self.model.arrays
-        return _archive(
-            law=np.array(self.kind),
-            theta=self.theta,
-            sample_time=np.array(self.sample_time),
-            **_bounds(self.action_set, len(self.model.K_a)),
-            **arrays,
-            **known,
-        )
+        own = {"law": np.array(self.kind), "theta": self.theta}
+        own["sample_time"] = np.array(self.sample_time)
+        own |= _bounds(self.action_set, len(self.model.K_a))
+        return packed_arrays(own | arrays | self.model.arrays)
 
     def c(self) -> bytes:
         """One function in C99 for the laws `feedforward`, `observer` and `neural`.
@@ -118,12 +114,9 @@ class GainLaw:
 
     def npz(self) -> bytes:
         """Arrays in the form of `pdeloop identify --out`, which `pdeloop train --model` takes."""
-        return _archive(
-            model=pack(self.model)[np.newaxis],
-            sample_time=np.array(self.sample_time),
-            **_bounds(self.action_set, len(self.model.K_a)),
-            **self.model.arrays,
-        )
+        own = {"model": pack(self.model)[np.newaxis], "sample_time": np.array(self.sample_time)}
+        own |= _bounds(self.action_set, len(self.model.K_a))
+        return packed_arrays(own | self.model.arrays)
 
     def c(self) -> bytes:
         """One function in C99 without a library, whose numbers are the law's own to the bit."""
@@ -160,12 +153,6 @@ def _loaded(run: FinishedRun, m: int) -> Law | None:
         return run.laws[m]
     except ValueError:
         return None
-
-
-def _archive(**arrays: Any) -> bytes:
-    content = BytesIO()
-    np.savez(content, **arrays)
-    return content.getvalue()
 
 
 def curve_csv(run: FinishedRun) -> bytes:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw
 from pde_sim_node.plant import Plant
-from pdeloop.messages.array_files import read_arrays
+from pdeloop.messages.array_files import packed_arrays, read_arrays
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.spec import ParameterError
@@ -81,7 +80,5 @@ def with_gains(model: object, plant: Plant, values: Mapping[str, Any]) -> bytes:
     except ValueError as error:
         raise ParameterError(str(error)) from error
     rows = ModelRows(known.A, known.B, known.U, K_a, K_b, s_r)
-    arrays: dict[str, Any] = {"model": pack(rows)[np.newaxis], "d": known.d, **rows.arrays}
-    content = BytesIO()
-    np.savez(content, sample_time=np.array(values["sample_time"]), **arrays)
-    return content.getvalue()
+    arrays: dict[str, Any] = {"sample_time": np.array(values["sample_time"])}
+    return packed_arrays(arrays | {"model": pack(rows)[np.newaxis], "d": known.d, **rows.arrays})

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -22,6 +21,7 @@ from controller_node.identification import DesignSettings, designed, examined, i
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.files import write_atomically
 from pdeloop.messages.model_rows import ModelRows, pack
@@ -628,10 +628,8 @@ def save(found: Identified, path: Path) -> None:
     if found.field is not None and found.field.fitted is not None:
         own = found.field.fitted.model.arrays()
         arrays |= {f"field_{name}": values for name, values in own.items()}
-    content = BytesIO()
-    np.savez(content, **arrays)
     try:
-        write_atomically(path, content.getvalue())
+        write_atomically(path, packed_arrays(arrays))
     except OSError as error:
         raise ParameterError(f"cannot write {path}: {error.strerror}") from error
 

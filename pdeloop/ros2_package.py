@@ -8,7 +8,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -19,6 +18,7 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.law_form import law_form
 from pdeloop.messages import action_set
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.files import write_atomically
 from pdeloop.messages.spec import ParameterError
@@ -105,8 +105,6 @@ def write_package(
         "sample_time": np.array(law.sample_time),
         "n_y": np.array(law.n_y),
     }
-    content = BytesIO()
-    np.savez(content, **{**law.arrays, **numbers})  # type: ignore[arg-type]
     files = {
         "package.xml": _filled(_MANIFEST, words),
         "setup.py": _filled(_SETUP, words),
@@ -118,7 +116,7 @@ def write_package(
         f"{package}/__init__.py": b"",
         f"{package}/law.py": _template("ros2_law.py", words),
         f"{package}/node.py": _template("ros2_node.py", words),
-        f"{package}/law.npz": content.getvalue(),
+        f"{package}/law.npz": packed_arrays({**law.arrays, **numbers}),
     }
     for name, text in files.items():
         path = folder / name

@@ -23,7 +23,6 @@ import shlex
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages import model_rows
-from pdeloop.messages.array_files import checked_array, read_arrays
+from pdeloop.messages.array_files import checked_array, packed_arrays, read_arrays
 from pdeloop.messages.files import (
     FileError,
     make_folder,
@@ -277,9 +276,7 @@ class RunFolder:
         """Write policy.npz and result.json; returns the latter's content."""
         known = {"plant": training.plant, "versions": versions()}
         summary = summarise(training) | dict(extra) | known
-        buffer = BytesIO()
-        np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]
-        write_atomically(self.path / "policy.npz", buffer.getvalue())
+        write_atomically(self.path / "policy.npz", packed_arrays(policy_arrays(training)))
         text = json.dumps(summary, indent=1)
         write_atomically(self.path / "result.json", text.encode())
         return summary

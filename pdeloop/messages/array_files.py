@@ -3,6 +3,7 @@
 
 import zipfile
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +17,13 @@ MAX_ARRAY_BYTES = 2**30
 Arrays = Mapping[str, NDArray[Any]]
 _TYPES: Mapping[str, type] = {"f": np.float64, "c": np.complex128, "i": np.int64, "b": np.bool_}
 """The type in which each NumPy kind is stored; others would change results or cannot be stored."""
+
+
+def packed_arrays(arrays: Mapping[str, Any]) -> bytes:
+    """The content of an npz file with these arrays."""
+    content = BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from pde_sim_node.definition import source_of
 from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
+from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.files import make_folder, write_atomically
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.training_run import built_in
@@ -229,6 +229,5 @@ def curve(
     distinct, which = np.unique(laws, axis=0, return_inverse=True)
     count, seed = parameters["evaluation_fields"], parameters["evaluation_seed"]
     costs = mean_costs(pair, parameters, distinct, [0] * len(distinct), fields=count, seed=seed)
-    content = BytesIO()
-    np.savez(content, policies=laws, costs=costs[which.ravel()], rollouts=np.array(rollouts))
-    return content.getvalue()
+    known = {"policies": laws, "costs": costs[which.ravel()], "rollouts": np.array(rollouts)}
+    return packed_arrays(known)
