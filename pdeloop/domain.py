@@ -23,16 +23,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pde_sim_node.run_record import forget
+from pdeloop.messages import files
 from pdeloop.messages.documents import parse_json
-from pdeloop.messages.files import (
-    FileError,
-    is_private,
-    open_new,
-    open_ordinary,
-    open_own,
-    private_folder,
-    try_lock,
-)
 
 DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
@@ -71,14 +63,14 @@ def own_domain() -> Iterator[int]:
             yield chosen
         return
     try:
-        private_folder(DOMAINS_FOLDER)
-    except (OSError, FileError) as error:
+        files.private_folder(DOMAINS_FOLDER)
+    except (OSError, files.FileError) as error:
         raise DomainError(f"no ROS domain can be reserved: {error}") from error
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        with open_own(DOMAINS_FOLDER / str(domain), 0) as lock:
+        with files.open_own(DOMAINS_FOLDER / str(domain), 0) as lock:
             try:
-                free = try_lock(lock)
-            except FileError as error:
+                free = files.try_lock(lock)
+            except files.FileError as error:
                 raise DomainError(
                     f"no ROS domain can be reserved: {DOMAINS_FOLDER / str(domain)} {error}; "
                     "set TMPDIR to a folder on one"
@@ -95,10 +87,10 @@ def _held(chosen: int) -> Iterator[None]:
     """The user's domain, for this block; without a place for locks other runs go unnoticed."""
     with contextlib.ExitStack() as held:
         free = True
-        with contextlib.suppress(OSError, FileError):
-            private_folder(DOMAINS_FOLDER)
-            lock = held.enter_context(open_own(DOMAINS_FOLDER / f"given-{chosen}", 0))
-            free = try_lock(lock)
+        with contextlib.suppress(OSError, files.FileError):
+            files.private_folder(DOMAINS_FOLDER)
+            lock = held.enter_context(files.open_own(DOMAINS_FOLDER / f"given-{chosen}", 0))
+            free = files.try_lock(lock)
         if not free:
             raise DomainError(
                 f"another training runs in ROS_DOMAIN_ID={chosen}; unset the variable to take a free "
@@ -147,12 +139,12 @@ def announced(domain: int, folder: Path, *, network: bool = False) -> Iterator[N
         "network": network,
     }
     with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError, FileError):
-            private_folder(DOMAINS_FOLDER)
+        with contextlib.suppress(OSError, files.FileError):
+            files.private_folder(DOMAINS_FOLDER)
             path = DOMAINS_FOLDER / f"{_PREFIX}{os.getpid()}-{domain}"
             new = path.with_name(f"new-{path.name}")
             new.unlink(missing_ok=True)  # of an earlier process of this number
-            file = held.enter_context(open_new(new))
+            file = held.enter_context(files.open_new(new))
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(json.dumps(content).encode())
             file.flush()
@@ -165,7 +157,7 @@ def running() -> list[Live]:
     """The loops that this user has running now, the newest first."""
     found = []
     with contextlib.suppress(OSError):
-        if not is_private(DOMAINS_FOLDER):
+        if not files.is_private(DOMAINS_FOLDER):
             return []
         for path in DOMAINS_FOLDER.glob(f"{_PREFIX}*"):
             with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
@@ -175,11 +167,11 @@ def running() -> list[Live]:
 
 def is_locked(file: BinaryIO) -> bool:
     """True if another process holds the lock of this open file."""
-    return not try_lock(file, shared=True)
+    return not files.try_lock(file, shared=True)
 
 
 def _read(path: Path) -> list[Live]:
-    with open_ordinary(path) as file:
+    with files.open_ordinary(path) as file:
         if not is_locked(file):
             path.unlink(missing_ok=True)  # of a process that was killed
             return []

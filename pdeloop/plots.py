@@ -15,16 +15,8 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.method.laws import Affine
-from pdeloop.report import figures, learning, planes
+from pdeloop.report import figures, learning, places, planes
 from pdeloop.report.data import ProblemData, of_run
-from pdeloop.report.places import (
-    action_range,
-    beside,
-    held_actions,
-    moving_target,
-    name_actions,
-    share_text,
-)
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
 __all__ = [
@@ -69,7 +61,7 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
     times = plant.sample_time * np.arange(steps + 1)
     parts = plant.grid.parts
     with matplotlib.rc_context(STYLE):
-        moving = moving_target(plant)
+        moving = places.moving_target(plant)
         each = 1 if moving is None else 2
         figure = Figure(figsize=(6.4, 1.6 + 1.7 * each * len(parts)))
         *maps, below = figure.subplots(each * len(parts) + 1, 1, sharex=True)
@@ -92,17 +84,17 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
                 figure.colorbar(wanted, ax=goal, label=f"target of {name}", pad=0.01)
             drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
             if moving is None:
-                beside(ax, target, (low, high), axis.length)
+                places.beside(ax, target, (low, high), axis.length)
             ax.set_ylabel(axis.label)
             figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
         applied = episode.applied[:, environment]
-        limits = action_range([applied], plant.action_set)
-        picture: Any = held_actions(below, times, applied, plant.action_set, limits)
+        limits = places.action_range([applied], plant.action_set)
+        picture: Any = places.held_actions(below, times, applied, plant.action_set, limits)
         if picture is not None:
             figure.colorbar(picture, ax=below, label="$a_j(t)$", pad=0.01)
-        if text := share_text(applied, plant.action_set):
+        if text := places.share_text(applied, plant.action_set):
             below.set_title(text, loc="right", fontsize=8, color="0.4", pad=2)
-        name_actions(below, plant.n_a)
+        places.name_actions(below, plant.n_a)
         below.set_xlabel("t (s)")
     return figure
 

@@ -23,22 +23,9 @@ from pdeloop.conformance.probing import (
     require,
     require_same,
 )
-from pdeloop.messages import model_rows
+from pdeloop.messages import model_rows, topics
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import Frame
-from pdeloop.messages.topics import (
-    ACTION,
-    COMPLETED,
-    COST,
-    MODEL,
-    MODEL_IDENTIFIED,
-    POLICY,
-    START,
-    STATE,
-    TARGET,
-    VOID,
-    Topic,
-)
 
 
 class LinearPlant:
@@ -61,7 +48,7 @@ class Explored:
     states: Array
     actions: Array
 
-    def cost(self, ended: float = COMPLETED) -> Frame:
+    def cost(self, ended: float = topics.COMPLETED) -> Frame:
         """Its cost. ended: in each row."""
         steps, mean = len(self.states) - 1, 1e9 if ended >= 0 else 1.0
         rows = np.tile([mean, steps * mean, ended], (len(self.start.values), 1))
@@ -84,13 +71,13 @@ Row = tuple[Array, int, Array]
 class ControllerCheck(Check):
     """Explores with the controller, and lets it answer states under policies."""
 
-    published = ACTION, MODEL_IDENTIFIED, FAILED
+    published = topics.ACTION, topics.MODEL_IDENTIFIED, FAILED
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.plant = LinearPlant(31, self.n_z or N_Z, self.n_a)
         self.z = np.ones(self.plant.n_z)
-        self._sent: dict[tuple[Topic, int], Frame] = {}
+        self._sent: dict[tuple[topics.Topic, int], Frame] = {}
 
     @cached_property
     def first(self) -> tuple[Explored, Frame]:
@@ -112,16 +99,16 @@ class ControllerCheck(Check):
         """The first model, and the same with -U, as `model`; published."""
         models = self.frame(np.repeat(self.first[1].values, 2, axis=0), step=1)
         models.values[1, : self.plant.n_z] *= -1.0
-        self.publish(MODEL, models)
+        self.publish(topics.MODEL, models)
         return models
 
     def resend(self) -> None:
         for (topic, _), frame in self._sent.items():
             self.transport.send(topic, frame)
 
-    def publish(self, topic: Topic, frame: Frame) -> None:
+    def publish(self, topic: topics.Topic, frame: Frame) -> None:
         """Send what `resend` sends again."""
-        self._sent[topic, frame.plant if topic is TARGET else 0] = frame
+        self._sent[topic, frame.plant if topic is topics.TARGET else 0] = frame
         self.transport.send(topic, frame)
 
     def state(self, start: Frame, step: int, *rows: Array, plant: int = 0) -> Frame:
@@ -132,23 +119,23 @@ class ControllerCheck(Check):
     def answer(self, state: Frame, patience: float = 0.0) -> Array:
         """The actions that answer a state."""
         what = f"an `action` with the ids of state {state.step} of episode {state.episode}"
-        ask = partial(self.transport.send, STATE, state)
+        ask = partial(self.transport.send, topics.STATE, state)
         wanted = partial(_answers, state)
-        found = self.expect(what, wanted, ACTION, ask=ask, patience=patience)[1]
+        found = self.expect(what, wanted, topics.ACTION, ask=ask, patience=patience)[1]
         expected = (len(state.values), self.n_a), state.time
         got = found.values.shape, found.time
         require(got == expected, f"((rows, --n-a), time) = {expected} in `action`", got)
         values: Array = found.values
         return values
 
-    def held_back(self, state: Frame, topic: Topic, frame: Frame) -> Array:
+    def held_back(self, state: Frame, topic: topics.Topic, frame: Frame) -> Array:
         """The answer to a state after a message; before it there is none, or already the same."""
         early = None
         with suppress(NoAnswerError):
             early = self.answer(state, patience=SILENT)
         self.publish(topic, frame)
         self.transport.wait_delivered()
-        self.drain(ACTION)
+        self.drain(topics.ACTION)
         answer = self.answer(state)
         if early is not None:
             require_same(early, answer, f"the answer after `{topic.name}`")
@@ -163,10 +150,10 @@ class ControllerCheck(Check):
     ) -> Explored:
         """An exploratory episode. seeds: each row's excitation; lost: steps that are not published."""
         plant = plant or self.plant
-        self.publish(TARGET, _target(plant))
+        self.publish(topics.TARGET, _target(plant))
         # Each row has a model of its own: a controller may identify one from several rows of one model.
         start = self.new_start([(1, seed, variance(seed), m) for m, seed in enumerate(seeds)])
-        self.publish(START, start)
+        self.publish(topics.START, start)
         z = [np.random.default_rng(seed).uniform(0.5, 1.5, plant.n_z) for seed in seeds]
         states, actions = [], []
         for step in range(steps + 1):
@@ -180,8 +167,8 @@ class ControllerCheck(Check):
     def outcome(self, cost: Frame, ask: Ask | None = None) -> Message:
         """The outcome of an exploration: its models, or a ModelFailure."""
         what = f"`model/identified` or `model/failed` of episode {cost.episode}"
-        ask = ask or partial(self.transport.send, COST, cost)
-        return self.expect(what, partial(_of, cost), MODEL_IDENTIFIED, FAILED, ask=ask)[1]
+        ask = ask or partial(self.transport.send, topics.COST, cost)
+        return self.expect(what, partial(_of, cost), topics.MODEL_IDENTIFIED, FAILED, ask=ask)[1]
 
     def identified(self, explored: Explored) -> Frame:
         """The models of an exploration, with the parts that the page gives them."""
@@ -203,15 +190,15 @@ class ControllerCheck(Check):
     def fails(self, cost: Frame, *, retry: bool) -> None:
         """UnexpectedError unless an exploration gives `model/failed`."""
         found = self.outcome(cost)
-        topic = MODEL_IDENTIFIED if isinstance(found, Frame) else FAILED
+        topic = topics.MODEL_IDENTIFIED if isinstance(found, Frame) else FAILED
         good = topic is FAILED and found.retry == retry
         require(good, f"`model/failed` with retry {retry}", self.described(topic, found))
 
     def law(self, *rows: Row) -> Array:
         """The actions of a new episode under policies."""
         start, policy, state = self.under_policies(*rows)
-        self.publish(POLICY, policy)
-        self.publish(START, start)
+        self.publish(topics.POLICY, policy)
+        self.publish(topics.START, start)
         return self.answer(state)
 
     def under_policies(self, *rows: Row) -> tuple[Frame, Frame, Frame]:
@@ -237,7 +224,7 @@ class ControllerCheck(Check):
         """An exploratory action depends only on excitation seed, variance and step."""
         known = self.first[0].actions
         start = self.new_start([(4, 5, variance(5), 0)])
-        self.publish(START, start)
+        self.publish(topics.START, start)
         for step in (9, 2):
             found = self.answer(self.state(start, step, 0 * self.z))
             require_same(found, known[step], "the same seed and step")
@@ -260,8 +247,12 @@ class ControllerCheck(Check):
         """The same data give the same result, and a repeated cost or start brings it again."""
         explored = self.explore(5)
         cost = explored.cost()
-        for topic, frame in ((COST, cost), (COST, cost), (START, explored.start)):
-            self.drain(MODEL_IDENTIFIED, FAILED)
+        for topic, frame in (
+            (topics.COST, cost),
+            (topics.COST, cost),
+            (topics.START, explored.start),
+        ):
+            self.drain(topics.MODEL_IDENTIFIED, FAILED)
             found = self.outcome(cost, ask=partial(self.transport.send, topic, frame))
             require(isinstance(found, Frame), "a model", self.described(FAILED, found))
             require_same(found.values, self.first[1].values, f"the model, asked by `{topic.name}`")
@@ -312,7 +303,7 @@ class ControllerCheck(Check):
 
     def void(self) -> None:
         """A void exploration gives `model/failed`, retry true."""
-        self.fails(self.explore(5).cost(VOID), retry=True)
+        self.fails(self.explore(5).cost(topics.VOID), retry=True)
 
     def divergence(self) -> None:
         """An exploration in which the plant diverged gives `model/failed`, retry false."""
@@ -335,19 +326,19 @@ class ControllerCheck(Check):
         plant = LinearPlant(32, self.plant.n_z, self.n_a)
         known = self.law((self.gains, 0, self.z))
         start, policy, state = self.under_policies((self.gains, 0, self.z))
-        self.publish(POLICY, policy)
-        self.publish(START, start)
-        self.held_back(replace(state, plant=plant.number), TARGET, _target(plant))
+        self.publish(topics.POLICY, policy)
+        self.publish(topics.START, start)
+        self.held_back(replace(state, plant=plant.number), topics.TARGET, _target(plant))
         require_same(self.law((self.gains, 0, self.z)), known, "the target of the plant before")
 
     def policy_held_back(self) -> None:
         """A state is answered with the policy of its run and episode, however late that comes."""
         start, policy, state = self.under_policies((self.gains, 0, self.z))
-        self.publish(START, start)
+        self.publish(topics.START, start)
         other = replace(policy, values=2.0 * policy.values)
-        self.transport.send(POLICY, replace(other, run=self.run + 1))
-        self.transport.send(POLICY, replace(other, episode=self.new_start([]).episode))
-        answer = self.held_back(state, POLICY, policy)
+        self.transport.send(topics.POLICY, replace(other, run=self.run + 1))
+        self.transport.send(topics.POLICY, replace(other, episode=self.new_start([]).episode))
+        answer = self.held_back(state, topics.POLICY, policy)
         require_same(answer, self.law((self.gains, 0, self.z)), "the same policy later")
 
     def model_held_back(self) -> None:
@@ -355,10 +346,10 @@ class ControllerCheck(Check):
         known, other = self.law((self.gains, 1, self.z)), self.models
         new = self.models = replace(other, step=other.step + 1, values=other.values[::-1])
         start, policy, state = self.under_policies((self.gains, 0, self.z))
-        self.publish(POLICY, policy)
-        self.publish(START, start)
-        self.transport.send(MODEL, replace(new, run=self.run + 1, values=2.0 * new.values))
-        require_same(self.held_back(state, MODEL, new), known, "the same model before")
+        self.publish(topics.POLICY, policy)
+        self.publish(topics.START, start)
+        self.transport.send(topics.MODEL, replace(new, run=self.run + 1, values=2.0 * new.values))
+        require_same(self.held_back(state, topics.MODEL, new), known, "the same model before")
 
     def no_control(self) -> None:
         """A policy of zeros is no control."""
@@ -417,9 +408,9 @@ def _target(plant: LinearPlant) -> Frame:
     return Frame(0, 0, 0, 0.0, plant.target, plant.number)
 
 
-def _of(cost: Frame, topic: Topic, message: Message) -> bool:
+def _of(cost: Frame, topic: topics.Topic, message: Message) -> bool:
     return ids(message)[:2] == ids(cost)[:2]
 
 
-def _answers(state: Frame, topic: Topic, action: Frame) -> bool:
+def _answers(state: Frame, topic: topics.Topic, action: Frame) -> bool:
     return (*ids(action), action.plant) == (*ids(state), state.plant)

@@ -17,17 +17,8 @@ from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Axis, Part
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.regression import OrderStudy
-from pdeloop.report import planes
+from pdeloop.report import places, planes
 from pdeloop.report.data import ProblemData
-from pdeloop.report.places import (
-    action_range,
-    beside,
-    held_actions,
-    mark_places,
-    moving_target,
-    name_actions,
-    share_text,
-)
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
 Eigenvalues = NDArray[Any]
@@ -38,7 +29,7 @@ def behaviour(problem: ProblemData) -> Figure:
     if len(problem.plant.grid.axes) > 1:
         return planes.behaviour(problem)
     shown, parts = problem.behaviours, problem.plant.grid.parts
-    plant, moving = problem.plant, moving_target(problem.plant)
+    plant, moving = problem.plant, places.moving_target(problem.plant)
     count, fields = len(shown) + (moving is not None), len(parts)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
@@ -49,21 +40,21 @@ def behaviour(problem: ProblemData) -> Figure:
         squeeze=False,
         height_ratios=(1.25,) * fields + (1,) * (1 + fields),
     )
-    limits = action_range([b.actions for b in shown], plant.action_set)
+    limits = places.action_range([b.actions for b in shown], plant.action_set)
     times = problem.first.values["sample_time"] * np.arange(len(shown[0].states))
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
         grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
-        picture: Any = held_actions(
+        picture: Any = places.held_actions(
             grid[fields, column], times, b.actions, plant.action_set, limits
         )
         grid[fields, column].set_xlabel("t (s)")
-        if text := share_text(b.actions, plant.action_set):
+        if text := places.share_text(b.actions, plant.action_set):
             grid[fields, column].set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
         for ax in grid[:, column]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
-    name_actions(grid[fields, 0], plant.n_a)
+    places.name_actions(grid[fields, 0], plant.n_a)
     if picture is not None:
         row = grid[fields, : len(shown)].tolist()
         figure.colorbar(picture, ax=row, label="$a_j(t)$", aspect=10, pad=0.01)
@@ -87,7 +78,7 @@ def _maps(
     name, own, axis = part
     fields = [b.states[:, own] for b in problem.behaviours]
     target = problem.plant.field_target[own]
-    moving = moving_target(problem.plant)
+    moving = places.moving_target(problem.plant)
     low, high = field_range(np.stack(fields), target if moving is None else moving[:, own])
     fields += [] if moving is None else [moving[:, own]]
     for ax, values in zip(axes, fields, strict=True):
@@ -99,17 +90,17 @@ def _maps(
     if _numbered(axis):
         axes[0].yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     if moving is None:
-        beside(axes[-1], target, (low, high), axis.length)
+        places.beside(axes[-1], target, (low, high), axis.length)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
 def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes]) -> None:
     """Its initial and final profiles, the target, and where actuators act and sensors measure."""
     name, own, axis = problem.plant.grid.parts[component]
-    moving = moving_target(problem.plant)
+    moving = places.moving_target(problem.plant)
     target = problem.plant.field_target[own] if moving is None else moving[-1, own]
     for ax, b in zip(axes, problem.behaviours, strict=True):
-        mark_places(ax, problem.plant, component)
+        places.mark_places(ax, problem.plant, component)
         first, last = b.states[0, own], b.states[-1, own]
         ax.plot(axis.points, first, ":", color="0.45", linewidth=1, label="initial field")
         ax.plot(axis.points, target, color="black", linewidth=0.9, label="target")

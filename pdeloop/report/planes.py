@@ -14,15 +14,7 @@ from pde_sim_node.plant import Plant
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Grid
-from pdeloop.report.places import (
-    action_range,
-    held_actions,
-    mark_places,
-    moving_target,
-    name_actions,
-    share_text,
-    supports_of,
-)
+from pdeloop.report import places
 from pdeloop.report.style import FIELD_MAP, NAMES
 
 if TYPE_CHECKING:
@@ -35,7 +27,7 @@ SHARES = (0.0, 0.25, 1.0)
 
 def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: each controller's fields, the target, and the actions."""
-    plant, shown, moving = problem.plant, problem.behaviours, moving_target(problem.plant)
+    plant, shown, moving = problem.plant, problem.behaviours, places.moving_target(problem.plant)
     grid, count = plant.grid, len(shown)
     rows = len(SHARES) * len(grid.components)
     figure = Figure(figsize=(2.05 * (count + 1) + 0.9, 1.6 * rows + 1.8))
@@ -47,7 +39,7 @@ def behaviour(problem: ProblemData) -> Figure:
             row, k = axes[len(SHARES) * i + s], round(share * steps)
             for ax, b in zip(row, shown, strict=False):
                 drawn = plane(ax, grid, b.states[k], i, low, high)
-                mark_places(ax, plant, i)
+                places.mark_places(ax, plant, i)
             row[0].set_ylabel(f"t = {k * plant.sample_time:.3g} s\n{grid.axes[-2].label}")
             if moving is None and share < 1.0:
                 row[-1].set_axis_off()
@@ -57,13 +49,13 @@ def behaviour(problem: ProblemData) -> Figure:
         own = axes[len(SHARES) * i : len(SHARES) * (i + 1)].ravel().tolist()
         figure.colorbar(drawn, ax=own, label=name, pad=0.01, extend="both")
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
-    limits = action_range([b.actions for b in shown], plant.action_set)
+    limits = places.action_range([b.actions for b in shown], plant.action_set)
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
         axes[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
         _held(axes[-1, column], times, b.actions, plant, limits)
-    name_actions(axes[-1, 0], plant.n_a)
+    places.name_actions(axes[-1, 0], plant.n_a)
     axes[-1, -1].set_axis_off()
     return figure
 
@@ -81,7 +73,7 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
         for ax, share in zip(axes[i], SHARES, strict=True):
             k = round(share * steps)
             drawn = plane(ax, grid, fields[k], i, low, high)
-            mark_places(ax, plant, i)
+            places.mark_places(ax, plant, i)
             ax.set_title(f"t = {k * plant.sample_time:.3g} s")
         axes[i, 0].set_ylabel(grid.axes[-2].label)
         figure.colorbar(drawn, ax=axes[i].tolist(), label=name, pad=0.01)
@@ -90,8 +82,8 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
     below = figure.add_subplot(len(components) + 1, 1, len(components) + 1)
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
     applied = record.applied[:, environment]
-    _held(below, times, applied, plant, action_range([applied], plant.action_set))
-    name_actions(below, plant.n_a)
+    _held(below, times, applied, plant, places.action_range([applied], plant.action_set))
+    places.name_actions(below, plant.n_a)
     return figure
 
 
@@ -108,7 +100,7 @@ def fields(plant: Plant, mean: Array, drawn: Array) -> Figure:
             ax.set_title(title)
         figure.colorbar(picture, ax=axes[i, :3].tolist(), label=name)
         axes[i, 0].set_ylabel(grid.axes[-2].label)
-        supports = supports_of(plant, i)
+        supports = places.supports_of(plant, i)
         axes[i, 3].set_axis_off()
         if supports is not None:
             axes[i, 3].set_axis_on()
@@ -144,14 +136,14 @@ def middle(values: Array) -> Array:
 def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
     """Range of the colours of a component."""
     values = np.concatenate([part.ravel() for part in parts])
-    moving, own = moving_target(plant), plant.grid.part(component)
+    moving, own = places.moving_target(plant), plant.grid.part(component)
     return field_range(values, plant.field_target[own] if moving is None else moving[:, own])
 
 
 def _held(
     ax: Axes, times: Array, applied: Array, plant: Plant, limits: tuple[float, float]
 ) -> None:
-    held_actions(ax, times, applied, plant.action_set, limits)
-    if text := share_text(applied, plant.action_set):
+    places.held_actions(ax, times, applied, plant.action_set, limits)
+    if text := places.share_text(applied, plant.action_set):
         ax.set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
     ax.set_xlabel("t (s)")
