@@ -44,42 +44,13 @@ modes are those of large numbers, whatever their units."""
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """Identification method, design objective and kind of law.
+    """Identification method, design objective and kind of law, by the names of docs/parameters.md.
 
-    Attributes
-    ----------
-    n_a : int
-        Actuators.
-    reduced_order : int
-        n_s of "field" and "regression"; 0: as `study_orders` suggests.
-    state_weight, action_weight : float
-        Of the stage cost.
-    action_set : ActionSet
-        Admissible actions. The gains are designed without it.
-    measurement_noise : float
-        Standard deviation of the noise on every number of the states, for "field"; 0: none.
-    cost : sequence of str
-        The whole cost (`pdeloop.messages.cost.Cost.texts`) where the weights do not say it.
-    identification : {"field", "regression", "subspace", "dmdc"}
-        "field": the regression, or a law from a model of the whole field (`field_law`) that is better;
-        "subspace": a model in innovation form, for a law with a filter gain.
-    dmdc_rank, dmdc_order : int
-        p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
-    law : str
-        Name of the law that answers.
-    horizon : int
-        Steps of an episode, for a law that has parameters for each of them.
-    input_delay : sequence of int
-        Steps after which each input acts (`pdeloop.method.reduce.input_delay`); empty: none. A dead
-        time needs a law with a filter, in whose state the last inputs are.
-    grid : str
-        Axes and components of the state (`pdeloop.messages.grid.Grid.parse`), for "field"; empty: one
-        axis.
-    sensors, sensor_delays : int
-        n_y, 0 where the whole state is measured, and d.
-    constants : dict
-        Parameters of `pdeloop.messages.protocol.CONSTANTS` as given; others have their
-        defaults.
+    action_set: admissible actions, without which the gains are designed; cost: the whole cost
+    (`pdeloop.messages.cost.Cost.texts`) where the weights do not say it; input_delay: steps after which
+    each input acts (`pdeloop.method.reduce.input_delay`), empty: none. A dead time needs a law with a
+    filter, in whose state the last inputs are. grid, measurement_noise: for "field"; constants:
+    parameters of `pdeloop.messages.protocol.CONSTANTS` as given; others have their defaults.
     """
 
     n_a: int
@@ -139,29 +110,12 @@ def identify(
     settings: IdentificationSettings = DEFAULTS,
     constant: bool | None = None,
 ) -> ReducedModel:
-    """The reduced model of one plant.
+    """The reduced model of one plant; see `pdeloop.identify`.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        a_k is held from z_k to z_{k+1}.
-    method : {"regression", "dmdc"}
-        Least squares in reduced coordinates, or truncated DMDc.
-    n_s : int
-        Its order; 0: the suggested one (`study_orders`).
-    p : int
-        Rank of "dmdc"; 0: n_s + n_a.
-    channels : Channels
-        Names of states and inputs in error messages.
-    settings : IdentificationSettings
-        How an order is suggested.
-    constant : bool, optional
-        Whether the regression has a constant term; None: if it predicts held-out data better.
-
-    Raises
-    ------
-    ValueError
-        The data allow no such model, or do not determine it, or there is no such method.
+    trajectories: (states (N + 1, n_z), actions (N, n_a)) each; n_s, p: order and rank of "dmdc", 0 as
+    there; channels: names of states and inputs in error messages; settings: how an order is suggested;
+    constant: whether the regression has a constant term; None: if it predicts held-out data better.
+    ValueError where the data allow no such model, or do not determine it, or there is no such method.
     """
     if method not in ("regression", "dmdc"):
         law = "; 'field' designs a law for a target: problem(..., identification='field')"
@@ -236,31 +190,15 @@ def designed(
 ) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
-    Parameters
-    ----------
-    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
-        a_k is held from z_k to z_{k+1}.
-    target : (n_z,) array
-        z_r.
-    settings : DesignSettings
-        Method, order, which is lowered to the size of the state where that is smaller, and weights.
-    channels : Channels
-        Names of states and inputs in error messages.
-    further : sequence of (states (N + 1, n_z), actions (N, n_a))
-        Other trajectories, for a model of the whole field alone: POD modes of several fields together
-        are those of none.
-    or_no_control : bool
-        Gains of 0 where there are no stabilising ones.
-    constant : bool, optional
-        Whether regression and subspace models have a constant term; None: as `needs_constant` says.
-    innovations : InnovationModel, optional
-        The model of "subspace", where it is known.
+    trajectories: (states (N + 1, n_z), actions (N, n_a)) each; target (n_z,): z_r; settings: the order
+    is lowered to the size of the state where that is smaller; further: other trajectories, for a model
+    of the whole field alone: POD modes of several fields together are those of none; or_no_control:
+    gains of 0 where there are no stabilising ones; constant: whether regression and subspace models
+    have a constant term, None: as `needs_constant` says; innovations: the model of "subspace", where it
+    is known.
 
-    Raises
-    ------
-    ValueError
-        The data allow or determine no model of this order, or the model no stabilising gains and,
-        for "field", that of the whole field no law.
+    ValueError where the data allow or determine no model of this order, or the model no stabilising
+    gains and, for "field", that of the whole field no law.
     """
     weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
     given = Cost.parse(settings.measured_cost)

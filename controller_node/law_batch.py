@@ -36,16 +36,9 @@ class MemoryUnknownError(Exception):
 class LawBatch:
     """A law of M environments. Call `set` before the first `actions` of an episode.
 
-    Parameters
-    ----------
-    laws : sequence of Law
-        That of each model that environments can use; all of one kind and size.
-    target : (n_z,) array
-        z_r.
-    action_set : ActionSet
-        Admissible actions, the nearest of which answers.
-
-    Anything malformed raises a ValueError and leaves it as it was.
+    laws: that of each model that environments can use, all of one kind and size; target (n_z,): z_r;
+    action_set: admissible actions, the nearest of which answers. Anything malformed raises a ValueError
+    and leaves it as it was.
     """
 
     def __init__(

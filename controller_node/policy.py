@@ -23,19 +23,11 @@ IndexArray = NDArray[np.int64]
 
 
 class ProjectedLaw:
-    """The projected law of M environments.
+    """The projected law of M environments. Call `set` before the first `actions`.
 
-    Parameters
-    ----------
-    models : sequence of (n_z, n_s) arrays
-        The bases U that environments can use; all of one shape.
-    target : (n_z,) array
-        The target field z_r.
-    action_set : ActionSet
-        Admissible actions.
-
-    Call `set` before the first `actions`. Anything malformed raises a ValueError and leaves the law
-    as it was.
+    models: the bases U that environments can use, all of one shape; target (n_z,): the target field
+    z_r; action_set: admissible actions. Anything malformed raises a ValueError and leaves the law as it
+    was.
     """
 
     def __init__(

@@ -57,14 +57,9 @@ Flags = NDArray[np.bool_]
 class Finding:
     """Rows of a log that are not what the plant did, or a property of its channels.
 
-    Attributes
-    ----------
-    text : str
-        One sentence with the channels, the first row, and the option that helps.
-    spoilt : (R,) array of bool
-        The rows that `--cut` leaves out.
-    step : int
-        Rows between two readings of a sensor that is slower than the log; 0: none.
+    text: one sentence with the channels, the first row, and the option that helps; spoilt (R,): the
+    rows that `--cut` leaves out; step: rows between two readings of a sensor that is slower than the
+    log, or 0.
     """
 
     text: str
@@ -177,18 +172,8 @@ def findings(
 ) -> list[Finding]:
     """What the rows of a log show.
 
-    Parameters
-    ----------
-    values : (R, n_z + n_a) array
-        States and inputs; NaN where a number is missing.
-    first : (R,) array of bool
-        The first row of each trajectory.
-    rows : (R,) array of int
-        Their numbers in the file.
-    channels : Channels
-        Names.
-    step : float
-        Seconds between two rows.
+    values (R, n_z + n_a): states and inputs, NaN where a number is missing; first (R,): whether a row
+    is the first of a trajectory; rows (R,): their numbers in the file; step: seconds between two rows.
     """
     if len(values) < LEAST:
         return []

@@ -87,38 +87,16 @@ def plane_of(grid: Grid) -> tuple[NDArray[np.intp], tuple[int, int]]:
 class EpisodeSamples:
     """The samples of one environment in one episode.
 
-    Parameters
-    ----------
-    frame
-        The first state that was seen.
-    environment
-        The one to keep; of a smaller batch the last.
-    components
-        Of the state.
-    horizon
-        Steps that are expected; the columns are enough for them.
-    grid
-        Of the state, if it is known; it matters on two axes or more, or with fields of different
-        lengths.
+    frame: the first state that was seen; environment: the one to keep, of a smaller batch the last;
+    components: of the state; horizon: steps that are expected, for which the columns are enough; grid:
+    of the state, where known; it matters on two axes or more, or with fields of different lengths.
 
-    Attributes
-    ----------
-    first, last
-        The step of column 0, and the newest step of which the state was seen.
-    stride
-        Steps of a column.
-    fields, actions
-        What was seen, (COLUMNS, rows) and (COLUMNS, n_a); NaN where nothing was.
-    rows
-        Indices in the state of the rows of `fields`.
-    z, z_first
-        The newest state (n_z,), and the first that was seen.
-    plane
-        Rows and columns of the picture of a component on two axes; None of fewer.
-    ended
-        Whether the episode is over.
-    version
-        Differs after each change, and from episode to episode.
+    It has the steps of its first column and of the newest state, `first` and `last`, and `stride`, the
+    steps of a column; `fields` and `actions`, (COLUMNS, rows) and (COLUMNS, n_a), NaN where nothing was
+    seen; `rows`, indices in the state of the rows of `fields`; the newest and the first state (n_z,),
+    `z` and `z_first`; `plane`, rows and columns of the picture of a component on two axes, None of
+    fewer; `ended`, whether the episode is over; and `version`, another one after each change and
+    episode.
     """
 
     def __init__(

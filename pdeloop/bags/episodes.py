@@ -46,28 +46,13 @@ _ONCE = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "mode
 
 @dataclass
 class RecordedEpisode:
-    """The recording of one episode.
+    """The recording of one episode: its messages by topic, states and actions by step.
 
-    Attributes
-    ----------
-    key : (str, int, int)
-        Namespace, run, and number of the episode.
-    first, last : int
-        Arrival of its first and last message, ns since the epoch.
-    start, policy, cost, model : Frame or None
-        What the topics of these names said; model is that of `model/identified`.
-    states, actions : dict of int to Frame
-        By step.
-    failure : ModelFailure or None
-        Why there is no model.
-    bases : Frame or None
-        The models that its policies are about.
-    contradictions : list of str
-        Messages that were recorded twice with different content, in words.
-    state_every : int
-        Steps from one state that was to be recorded to the next.
-    asked, stamps : set of float
-        The times (s) of all its starts, and of all its states.
+    key: namespace, run, and number of the episode; first, last: arrival of its first and last message,
+    ns since the epoch; model: what `model/identified` said; failure: why there is no model; bases: the
+    models that its policies are about; contradictions: messages that were recorded twice with different
+    content, in words; state_every: steps from one state that was to be recorded to the next; asked,
+    stamps: the times (s) of all its starts, and of all its states.
     """
 
     key: Key

@@ -30,19 +30,10 @@ FILES = (RUN, PROGRESS, "parameters.yaml", "policy.npz")
 class RunClaims:
     """The claims of a run's folder.
 
-    Attributes
-    ----------
-    folder : Path
-    run : int or None
-        The id on the network; None where run.json does not say.
-    result : dict or None
-        The content of result.json; None for a training that is not finished.
-    paid : dict of int to int
-        Minimum number of rollouts, by seed, that the training had used.
-    parameters : dict
-        Those in run.json that define the run.
-    unreadable : list of str
-        Files that are there and cannot be read, in words.
+    run: the id on the network, None where run.json does not say; result: the content of result.json,
+    None for a training that is not finished; paid: minimum number of rollouts, by seed, that the
+    training had used; parameters: those in run.json that define the run; unreadable: files that are
+    there and cannot be read, in words.
     """
 
     folder: Path

@@ -256,25 +256,10 @@ class Adjoint:
         return self._run(states, actions, np.zeros_like(states))[0]
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        """(df/dz)^T y and (df/da)^T y of every environment.
+        """(df/dz)^T y and (df/da)^T y of every environment, (M, n_z) and (M, n_a).
 
-        Parameters
-        ----------
-        states : (M, n_z)
-            z; one whose successor diverges gives numbers of no meaning.
-        actions : (M, n_a)
-            a, held for a sampling time.
-        covectors : (M, n_z)
-            y.
-
-        Returns
-        -------
-        (M, n_z), (M, n_a)
-
-        Raises
-        ------
-        ValueError
-            Shapes that do not fit.
+        states (M, n_z): one whose successor diverges gives numbers of no meaning; actions (M, n_a):
+        held for a sampling time; covectors (M, n_z): y. ValueError for shapes that do not fit.
         """
         return self._run(states, actions, covectors)[1:]
 
