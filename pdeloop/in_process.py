@@ -23,8 +23,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pdeloop.method.laws.registry import law_kind, laws_of
 from tuner_node.batch import Batch, BatchResult, NoModelError, most_environments
+from tuner_node.pair import cut
 from tuner_node.training import Training
-from tuner_node.trajectory_collector import cut
 
 Report = Callable[[Mapping[str, Any]], None]
 

@@ -25,7 +25,7 @@ from pdeloop.messages.parameters import VIEWER, taken_by
 from pdeloop.messages.topics import VIEWS
 from pdeloop.process.affinity import lower_priority
 from pdeloop.process.isolation import keep_on_this_machine
-from pdeloop.ros.message_types import message_class
+from pdeloop.ros.endpoints import message_class
 from pdeloop.ros.node_main import node_main
 from pdeloop.ros.observer import Observer
 from pdeloop.ros.parameters import declare, given_parameters, on_change

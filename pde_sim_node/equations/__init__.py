@@ -25,11 +25,11 @@ from pde_sim_node.equations.kuramoto_sivashinsky_22 import (
     KuramotoSivashinsky22 as KuramotoSivashinsky22,
 )
 from pde_sim_node.equations.loading import ALLOWED as ALLOWED
+from pde_sim_node.equations.loading import EQUATIONS as EQUATIONS
 from pde_sim_node.equations.loading import OWN_EQUATIONS as OWN_EQUATIONS
 from pde_sim_node.equations.loading import allow as allow
 from pde_sim_node.equations.loading import configured_equation as configured_equation
 from pde_sim_node.equations.loading import load_equation as load_equation
 from pde_sim_node.equations.random_modes import RandomModes as RandomModes
-from pde_sim_node.equations.registry import EQUATIONS as EQUATIONS
 from pde_sim_node.equations.schrodinger import Schrodinger as Schrodinger
 from pde_sim_node.equations.wave import Wave as Wave

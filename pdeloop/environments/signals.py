@@ -1,9 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Signals between an environment and its agent: the spaces, and `info`."""
+"""Signals between an environment and its agent: the spaces, `info`, and initial fields."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from pde_sim_node.plant import MEAN_FIELD, Plant
-from pdeloop.messages.arrays import Array
+from pdeloop.messages.arrays import Array, float_array
 
 
 def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
@@ -86,3 +87,33 @@ def masked(info: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]
         kept = value if whole else np.where(mask if value.ndim == 1 else mask[:, None], value, 0.0)
         found[name], found[f"_{name}"] = kept, mask.copy()
     return found
+
+
+def field_seed(generator: np.random.Generator) -> int:
+    """The seed of the next initial field."""
+    return int(generator.integers(2**53))
+
+
+def seed_of_each(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """s, s + 1, ..., or those of a list; None: to be drawn. ValueError unless there are M."""
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, Integral):
+        return [int(seed) + m for m in range(num_envs)]
+    given: list[int | None] = np.asarray(seed, dtype=object).ravel().tolist()
+    if len(given) != num_envs:
+        raise ValueError(f"expected {num_envs} seeds, one per environment, got {len(given)}")
+    return given
+
+
+def first_fields(options: Mapping[str, Any] | None, shape: tuple[int, ...]) -> Array | None:
+    """The initial fields that the options of a reset give. ValueError for other options or shapes."""
+    others = sorted(set(options or {}) - {"field"})
+    if others:
+        raise ValueError(f"unknown option {others[0]!r} of reset; expected 'field'")
+    if not options:
+        return None
+    field = float_array("options['field']", options["field"])
+    if field.shape != shape:
+        raise ValueError(f"options['field'] must have shape {shape}, got {field.shape}")
+    return field

@@ -16,8 +16,14 @@ from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
 from pdeloop.environments.keywords import Source, Specified
 from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
-from pdeloop.environments.seeds import field_seed, first_fields, seed_of_each
-from pdeloop.environments.signals import masked, spaces, told
+from pdeloop.environments.signals import (
+    field_seed,
+    first_fields,
+    masked,
+    seed_of_each,
+    spaces,
+    told,
+)
 from pdeloop.messages.arrays import Array
 
 Flags = NDArray[np.bool_]

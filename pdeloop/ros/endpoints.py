@@ -5,6 +5,7 @@ They hand serialised bytes to the middleware and take them from it, so that no p
 on the hot path. The receivers are driven by pdeloop.ros.node_loop.
 """
 
+import importlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -233,3 +234,12 @@ class Receiver:
         self.name = self.subscription.topic_name
         self.handle = self.subscription.handle
         self.take = self.handle.take_message
+
+
+def message_class(name: str) -> Any:
+    """The class of a message type like 'std_msgs/msg/String'; None if it is not installed."""
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind, None)
+    except ImportError:
+        return None

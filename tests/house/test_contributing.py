@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pde_sim_node.equations.registry import EQUATIONS
+from pde_sim_node.equations.loading import EQUATIONS
 from pde_sim_node.plants.loading import PLANTS
 from pdeloop.cli import COMMANDS
 from pdeloop.method.adapt.registry import OWN_OPTIMIZERS

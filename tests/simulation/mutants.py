@@ -73,7 +73,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "tuner_node.session": _TUNER,
     "tuner_node.batch": ("tuner/test_batch.py", *_TUNER),
     "tuner_node.participants": ("tuner/test_participants.py", *_TUNER),
-    "tuner_node.trajectory_collector": ("tuner/test_trajectory_collector.py", *_TUNER),
     "tuner_node.training_state": ("tuner/test_training_state.py", "tuner/test_session.py"),
     "pde_sim_node.lockstep": (*_PLANT, "plant/test_real_time.py"),
     "pde_sim_node.taken_actions": _PLANT,

@@ -13,7 +13,7 @@ from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.topics import COMPLETED
 from tests.support.dispatching import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch, DispatchError
-from tuner_node.trajectory_collector import TrajectoryCollector, cut
+from tuner_node.pair import TrajectoryCollector, cut
 
 STEPS = 30
 
@@ -73,7 +73,7 @@ def test_what_comes_after_the_trajectories_were_taken_is_not_kept():
 
 
 def test_a_stranger_with_the_right_ids_fills_no_memory(monkeypatch):
-    monkeypatch.setattr("tuner_node.trajectory_collector.MAX_BYTES", 100_000)
+    monkeypatch.setattr("tuner_node.pair.MAX_BYTES", 100_000)
     served = dispatcher()
     served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
     ((_, start),) = starts(served.assign(observed(1), 0.0))
