@@ -45,8 +45,7 @@ def test_half_the_internal_step_changes_no_cost(name: str) -> None:
     """So that a table is about the PDE, and not about its integrator."""
     own = problem_of(name)
     finer = problem(
-        own.source,
-        **{**own.given, "integration_time": own.values["integration_time"] / 2},
+        own.source, **{**own.given, "integration_time": own.values["integration_time"] / 2}
     )
     costs = []
     for each in (own, finer):

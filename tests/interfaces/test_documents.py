@@ -45,10 +45,7 @@ HOSTILE = {
     "a list in itself": (HEAD + "    horizon: &a [*a]\n", "by an alias"),
     "a merged alias": (f"a: &a {{b: 1}}\n{HEAD}    <<: *a\n", "by an alias"),
     "many maps in each other": (f"{HEAD}    {'{a: ' * 9000}1{'}' * 9000}\n", "nested more than"),
-    "many lists in each other": (
-        f"{HEAD}    seed: {'[' * 9000}{']' * 9000}\n",
-        "nested more than",
-    ),
+    "many lists in each other": (f"{HEAD}    seed: {'[' * 9000}{']' * 9000}\n", "nested more than"),
     "many entries": (HEAD + "".join(f"    k{i}: 1\n" for i in range(30_000)), "50000 entries"),
     "a long value": (f"{HEAD}    problem: {'p' * 20_000}\n", "more than 10000 characters"),
     "digits in base 60": (f"{HEAD}    seed: {':'.join(['1'] * 90_000)}\n", "10000 characters"),

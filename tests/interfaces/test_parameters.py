@@ -38,11 +38,7 @@ SPECS = {spec.name: spec for spec in table()}
         ("length", 0.0, "'length' is 0.0; expected a number above 0"),
         ("length", float("nan"), "'length' is nan; expected a number above 0"),
         ("sample_time", "fast", "'sample_time' is 'fast'; expected a number above 0"),
-        (
-            "length",
-            "1.0e12",
-            "(m); in YAML a number with an exponent needs",
-        ),
+        ("length", "1.0e12", "(m); in YAML a number with an exponent needs"),
         ("actuator_width", 1.5, "'actuator_width' is 1.5; expected a number above 0, at most 1"),
         ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("seed", -1, "'seed' is -1; expected a whole number from 0"),

@@ -30,11 +30,7 @@ from pde_sim_node.equations import (
     configured_equation,
     load_equation,
 )
-from pde_sim_node.equations.random_modes import (
-    AllenCahnModes,
-    BurgersModes,
-    KortewegDeVriesModes,
-)
+from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.problem import load_parameters
 
 ALL = pytest.mark.parametrize("kind", EQUATIONS.values(), ids=EQUATIONS.keys())

@@ -10,14 +10,7 @@ import pytest
 
 from pdeloop.messages.frames import Frame, FrameError
 from pdeloop.messages.topics import COMPLETED, COST, STATE, VOID, CostColumn
-from tests.support.lockstep import (
-    PLANT,
-    RUN,
-    answer,
-    plant_protocol,
-    run_episode,
-    start,
-)
+from tests.support.lockstep import PLANT, RUN, answer, plant_protocol, run_episode, start
 
 
 def test_an_episode_has_all_states_and_ends_with_its_cost():

@@ -11,15 +11,7 @@ from pde_sim_node.real_time import Timing
 from pde_sim_node.run_record import RunRecord, forget
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import COST, PAUSED, STATE
-from tests.support.lockstep import (
-    RUN,
-    answer,
-    kept,
-    outcome,
-    plant_protocol,
-    run_episode,
-    start,
-)
+from tests.support.lockstep import RUN, answer, kept, outcome, plant_protocol, run_episode, start
 
 
 def test_a_paused_plant_holds_the_next_state_back_and_times_nothing_out():

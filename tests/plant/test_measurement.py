@@ -13,11 +13,7 @@ import pdeloop
 from controller_node.policy import ProjectedLaw, excitation
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import Equation
-from pde_sim_node.instruments import (
-    InstrumentedPlant,
-    Noise,
-    standard_normal,
-)
+from pde_sim_node.instruments import InstrumentedPlant, Noise, standard_normal
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Instruments, Plant
 from pde_sim_node.plants import SpectralPlant

@@ -133,12 +133,7 @@ def test_a_law_with_a_feedforward_holds_a_plant_that_moves_by_itself() -> None:
 
 def test_a_training_designs_and_adapts_for_it() -> None:
     run = pdeloop.train(
-        plant=Servo(),
-        law="affine",
-        rollouts=9,
-        evaluation_fields=2,
-        reduced_order=N_Z,
-        **FEW_FITS,
+        plant=Servo(), law="affine", rollouts=9, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS
     )
     plant, U = DynamicsPlant(Servo()), run.models[0].U
     z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target

@@ -60,8 +60,7 @@ def test_a_paced_plant_sends_each_state_at_its_instant_and_steps_before_it() -> 
     values = parameters()
     plant = build_plant(values)
     lockstep = Lockstep(
-        plant,
-        Timing(action_timeout=0.05, max_repeats=3, run_hold=10.0, real_time_factor=0.5),
+        plant, Timing(action_timeout=0.05, max_repeats=3, run_hold=10.0, real_time_factor=0.5)
     )
     rows = np.array([[3.0, -1.0, 0.0, 0.0]])
     (first,) = lockstep.start(Frame(5, 1, 0, 0.0, rows), 1.0)

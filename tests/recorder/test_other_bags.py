@@ -25,10 +25,7 @@ from tests.support.written_bag import written
 
 
 def test_what_is_no_bag_is_a_clear_error(tmp_path):
-    for path, words in (
-        (tmp_path / "none", "no bag at"),
-        (tmp_path, "there is no .mcap file"),
-    ):
+    for path, words in ((tmp_path / "none", "no bag at"), (tmp_path, "there is no .mcap file")):
         with pytest.raises(BagError, match=words):
             Bag(path)
     run = tmp_path / "run"

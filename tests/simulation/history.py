@@ -180,8 +180,7 @@ class History:
             if kind == "step plant":
                 for _ in range(3):
                     self._agenda.at(
-                        self.time + duration * self.rng.random(),
-                        lambda: self._call(who, "step"),
+                        self.time + duration * self.rng.random(), lambda: self._call(who, "step")
                     )
             self._agenda.at(end, lambda: self._call(who, "resume", until_done=True))
         elif kind == "pause tuner":

@@ -26,10 +26,7 @@ def fork_nodes(folder: Path) -> None:
     """From now on the supervisors of this process fork their nodes. folder: of the test."""
 
     def start(
-        command: Sequence[str],
-        *,
-        env: Mapping[str, str],
-        **how: Any,
+        command: Sequence[str], *, env: Mapping[str, str], **how: Any
     ) -> subprocess.Popen[bytes]:
         start_of_command = [sys.executable, "-m", supervisor.START]
         assert list(command[:3]) == start_of_command, command

@@ -18,14 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.processes import (
-    Bench,
-    BenchError,
-    BenchProcess,
-    bench,
-    ended_well,
-    progress,
-)
+from benchmarks.processes import Bench, BenchError, BenchProcess, bench, ended_well, progress
 from pdeloop.messages.parameter_file import yaml_text
 from pdeloop.pairs import namespaces
 from tests.support.hosts import environment, hosts, on

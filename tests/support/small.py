@@ -23,10 +23,7 @@ REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "8")
 """What a small reproduction is asked for."""
 RECORDED = {"iterations": "6", "seeds": "2"}
 """What the small recorded run is asked for."""
-FEW_FITS = {
-    "field_model_settings.folds": 2,
-    "field_model_settings.largest_degree": 2,
-}
+FEW_FITS = {"field_model_settings.folds": 2, "field_model_settings.largest_degree": 2}
 """For trainings whose model does not matter: fits of all kinds would be most of their time."""
 FEW_STEPS = {"optimizer_settings.iterations": 3, "optimizer_settings.mixtures": 2, **FEW_FITS}
 """For trainings by `model_based` whose law does not matter either."""

@@ -207,10 +207,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: gradients.of_policy(basis.T, np.zeros((n_a, 4)), [0]), "U must have shape .*n_s"),
         (lambda: gradients.of_policy(basis, np.zeros((n_a, 5)), [0]), "policy must have shape"),
         (lambda: pdeloop.Gradients(pdeloop.problem(sensors=4).plant()), "without noise, limits"),
-        (
-            lambda: pdeloop.train(small, optimizer="adam"),
-            "unknown optimizer 'adam'",
-        ),
+        (lambda: pdeloop.train(small, optimizer="adam"), "unknown optimizer 'adam'"),
         (lambda: pdeloop.train(small, over_topics=True), "needs a folder .* give out"),
         (lambda: pdeloop.load_run("/nowhere"), "no run in /nowhere"),
         (lambda: pdeloop.identify(states, actions, n_s=2), "each a tuple .states, actions."),

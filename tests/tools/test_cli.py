@@ -82,11 +82,7 @@ def test_what_is_set_is_checked_like_everything_else(tmp_path, capsys, more, wor
         ("reduced_order: 4", "reduced_order: 400", "needs at least"),
         ("horizon: 30", "horizon: 0", "'horizon' is 0; expected"),
         ("n_a: 4", "n_aa: 4", "did you mean 'n_a'"),
-        (
-            "n_a: 4",
-            "n_a: 4\n    actuator_positions: [0.1, 0.5]",
-            "the n_a = 4 actuators, got 2",
-        ),
+        ("n_a: 4", "n_a: 4\n    actuator_positions: [0.1, 0.5]", "the n_a = 4 actuators, got 2"),
         (
             "n_a: 4",
             "n_a: 1\n    actuator_positions: [1.5]",

@@ -98,10 +98,7 @@ def test_feedback_is_not_taken_for_a_late_log(
 
 @pytest.mark.parametrize(
     ("delay", "told"),
-    [
-        ("1,2,3", "one for each of the 2 inputs, got 3"),
-        ("99", "no trajectory has more steps"),
-    ],
+    [("1,2,3", "one for each of the 2 inputs, got 3"), ("99", "no trajectory has more steps")],
 )
 def test_a_wrong_delay_is_answered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], delay: str, told: str

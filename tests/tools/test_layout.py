@@ -40,9 +40,7 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     assert pairs.ros_value(pairs.namespaces(3)) == "['pair0', 'pair1', 'pair2']"
 
 
-def test_pairs_get_the_least_busy_cores(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pairs_get_the_least_busy_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6, 7})
     busy = iter([{}, {3: 10, 5: 4, 6: 0, 7: 9}])
     monkeypatch.setattr(affinity, "_busy_ticks", lambda: next(busy))

@@ -146,10 +146,7 @@ def saturated_at_a_round_number(z: np.ndarray, u: np.ndarray) -> None:
     ],
 )
 def test_rows_that_are_not_the_plants_are_told_and_left_out(
-    tmp_path: Path,
-    what: Callable[[np.ndarray, np.ndarray], None],
-    words: str,
-    left_out: int,
+    tmp_path: Path, what: Callable[[np.ndarray, np.ndarray], None], words: str, left_out: int
 ) -> None:
     path = write(tmp_path / "own.csv", *spoilt(what))
     (text,) = read_measurements(path).remarks

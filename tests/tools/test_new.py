@@ -45,10 +45,10 @@ SCALAR_KINDS: dict[str, dict[str, str]] = {
 LINEAR_KINDS: dict[str, dict[str, str]] = {
     "linear and dispersive": {LINEAR: "return -((1j * k) ** 3)"},
     "linear in two real components": {
-        LINEAR: "return _rows(k, [[0 * k, 0 * k + 1], [-(k**2), -0.1 * k**2]])",
+        LINEAR: "return _rows(k, [[0 * k, 0 * k + 1], [-(k**2), -0.1 * k**2]])"
     },
     "linear in two complex components": {
-        LINEAR: "return _rows(k, [[-1j * k, 0 * k + 2], [0 * k - 3, 1j * k**3]])",
+        LINEAR: "return _rows(k, [[-1j * k, 0 * k + 2], [0 * k - 3, 1j * k**3]])"
     },
 }
 ROWS = """

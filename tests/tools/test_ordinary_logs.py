@@ -63,8 +63,7 @@ def identified(
 
 
 @pytest.mark.parametrize(
-    ("method", "seed"),
-    [("regression", 0), ("regression", 1), ("regression", 2), ("subspace", 0)],
+    ("method", "seed"), [("regression", 0), ("regression", 1), ("regression", 2), ("subspace", 0)]
 )
 def test_a_regulated_plant_has_its_poles_in_kelvin_degrees_and_deviations(
     tmp_path: Path, method: str, seed: int

@@ -92,8 +92,7 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
         assert main(words) == 1
         said = capsys.readouterr().err.strip().splitlines()[-1]
         assert re.fullmatch(
-            r"pdeloop: a worker has numpy \S+ instead of \S+: .* --any-environment",
-            said,
+            r"pdeloop: a worker has numpy \S+ instead of \S+: .* --any-environment", said
         )
         dask.workers[1].kill()
         dask.workers[1].wait(LIMIT)
@@ -244,8 +243,7 @@ def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
 def other_processor(folder: Path) -> str:
     """Packages of a worker that has another processor."""
     return _packages(
-        folder,
-        "import llvmlite.binding\nllvmlite.binding.get_host_cpu_name = lambda: 'nocona'\n",
+        folder, "import llvmlite.binding\nllvmlite.binding.get_host_cpu_name = lambda: 'nocona'\n"
     )
 
 

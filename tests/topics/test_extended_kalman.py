@@ -28,7 +28,7 @@ PARAMETERS = {
     "evaluation_fields": 2,
 }
 SETTINGS = {
-    "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1},
+    "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1}
 }
 
 

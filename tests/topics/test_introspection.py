@@ -74,13 +74,7 @@ VALUES = {
         "paused plants",
         "waiting for",
     },
-    "recorder_node": {
-        "run",
-        "bag",
-        "matched",
-        "messages",
-        "messages/s",
-    },
+    "recorder_node": {"run", "bag", "matched", "messages", "messages/s"},
 }
 
 

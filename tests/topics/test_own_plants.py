@@ -57,11 +57,7 @@ def plant_of(folder: Path) -> object:
     ],
 )
 def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorded(
-    loop: Processes,
-    tmp_path: Path,
-    name: str,
-    given: dict[str, Any],
-    optimizer: str,
+    loop: Processes, tmp_path: Path, name: str, given: dict[str, Any], optimizer: str
 ) -> None:
     if "exponax" in name:  # JAX has threads, which do not survive a fork
         loop.forks = False

@@ -15,17 +15,8 @@ from tests.tools.test_own_law import policies
 
 pytestmark = pytest.mark.topics
 
-PARAMETERS = {
-    "n_z": 32,
-    "horizon": 40,
-    "reduced_order": 8,
-    "rollouts": 15,
-    "evaluation_fields": 2,
-}
-LAWS = {
-    "auto": {"first_iterations": 20, "starts": 2},
-    "neural": {"neurons": 16, "iterations": 150},
-}
+PARAMETERS = {"n_z": 32, "horizon": 40, "reduced_order": 8, "rollouts": 15, "evaluation_fields": 2}
+LAWS = {"auto": {"first_iterations": 20, "starts": 2}, "neural": {"neurons": 16, "iterations": 150}}
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -25,13 +25,7 @@ from tuner_node.training import Training
 
 NOISE = {"measurement_noise": 0.05, "process_noise": 0.02}
 BUDGETS: list[dict[str, Any]] = [
-    {
-        "optimizer": CHECKED,
-        "rollouts": 12,
-        "horizon": 10,
-        **FEW_STEPS,
-        **NOISE,
-    },
+    {"optimizer": CHECKED, "rollouts": 12, "horizon": 10, **FEW_STEPS, **NOISE},
     {"optimizer": "two_point", "rollouts": 16},
     {"optimizer": "two_point", "iterations": 3},
 ]

@@ -42,10 +42,7 @@ def served() -> Iterator[tuple[Server, Page]]:
 
 async def ask(server: Server, path: str, **headers: str) -> tuple[int, str]:
     url = f"http://127.0.0.1:{server.port}{path}"
-    async with (
-        aiohttp.ClientSession() as session,
-        session.get(url, headers=headers) as answer,
-    ):
+    async with aiohttp.ClientSession() as session, session.get(url, headers=headers) as answer:
         return answer.status, await answer.text()
 
 
@@ -226,10 +223,7 @@ def test_an_error_of_the_server_is_one_line(capfd, monkeypatch):
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
     async def headers(server: Server) -> Any:
-        async with (
-            aiohttp.ClientSession() as session,
-            session.get(server.url) as answer,
-        ):
+        async with aiohttp.ClientSession() as session, session.get(server.url) as answer:
             return answer.headers
 
     with served() as (server, _):

@@ -11,12 +11,7 @@ from launch import LaunchContext, shut_down
 
 class DeclareLaunchArgument:
     def __init__(
-        self,
-        name: str,
-        *,
-        default_value: str,
-        description: str,
-        choices: list[str] | None = None,
+        self, name: str, *, default_value: str, description: str, choices: list[str] | None = None
     ) -> None:
         self.name, self.default_value = name, default_value
         self.description, self.choices = description, choices
