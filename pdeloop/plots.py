@@ -15,7 +15,7 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.method.laws import Affine
-from pdeloop.report import figures, learning, places, planes
+from pdeloop.report import figures, places, planes
 from pdeloop.report.data import ProblemData, of_run
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
@@ -111,7 +111,7 @@ def plot_costs(run: FinishedRun) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    return _drawn(lambda data: learning.bars([data]), run)
+    return _drawn(lambda data: figures.bars([data]), run)
 
 
 def plot_training(run: FinishedRun) -> Figure:
@@ -126,7 +126,7 @@ def plot_training(run: FinishedRun) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    return _drawn(lambda data: learning.training_curves([data]), run)
+    return _drawn(lambda data: figures.training_curves([data]), run)
 
 
 def plot_behaviour(run: FinishedRun) -> Figure:

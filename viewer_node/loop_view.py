@@ -21,8 +21,7 @@ from pdeloop.messages.grid import Grid
 from pdeloop.messages.topics import VOID, CostColumn
 from viewer_node.episode_samples import EpisodeSamples, Key, key_of
 from viewer_node.learning_curve import LearningCurve
-from viewer_node.loop_nodes import LoopNodes
-from viewer_node.operation import Operation
+from viewer_node.loop_nodes import LoopNodes, Operation
 from viewer_node.rollout_costs import RolloutCosts, remember
 
 SLOW = 1.0

@@ -15,8 +15,7 @@ from typing import Any
 
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import CONVERTED, Message, files, in_time, text_of
-from pdeloop.bags.metadata import Findings, check, read_metadata, repeated
-from pdeloop.bags.survey import Survey, by_run, survey
+from pdeloop.bags.survey import Findings, Survey, by_run, check, read_metadata, repeated, survey
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.files import read_json

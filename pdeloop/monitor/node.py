@@ -34,10 +34,9 @@ from pdeloop.ros.observer import Observer
 from pdeloop.ros.peers import Peers
 from viewer_node.episode_samples import EpisodeSamples
 from viewer_node.learning_curve import LearningCurve
-from viewer_node.loop_nodes import ROLES, Endpoint
+from viewer_node.loop_nodes import ROLES, VERBS, Call, Endpoint, Operation
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
-from viewer_node.operation import VERBS, Call, Operation
 from viewer_node.web.page import Page, ShowLoop
 
 CONNECTION = 5.0

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from pdeloop.animation import pictures, write
 from pdeloop.finished_run import field_means
 from pdeloop.messages.files import make_own_folder, write_atomically
-from pdeloop.report import figures, learning
+from pdeloop.report import figures
 from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import NAMES, STYLE, darken
 from pdeloop.reproduction import PAPER, beside_the_paper
@@ -142,14 +142,14 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
             "Cost while learning",
             f"{what} Exploration and check of the first law come before these rollouts.{over} Lower is "
             "better.",
-            learning.training_curves(learned),
+            figures.training_curves(learned),
         )
     yield (
         "costs",
         "Cost of each controller",
         "Mean stage cost after the adaptation, over the sampled initial fields and the seeds, with "
         "the standard deviation.",
-        learning.bars(problems),
+        figures.bars(problems),
     )
 
 

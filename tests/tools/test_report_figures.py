@@ -19,7 +19,7 @@ from pdeloop.messages.colour_scale import DARK
 from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.method.reduce.regression import study_orders
 from pdeloop.report.data import gather, of_run
-from pdeloop.report.learning import bars
+from pdeloop.report.figures import bars
 from pdeloop.report.style import BACK, FIELD_MAP, INK, STYLE, darken
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from tests.support.viewed import cost, frame, start, state
-from viewer_node.loop_nodes import Endpoint, LoopNodes
+from viewer_node.loop_nodes import FAILURE, Call, Endpoint, LoopNodes
 from viewer_node.loop_view import SILENT, SLOW, LoopView
-from viewer_node.operation import FAILURE, Call
 
 
 def test_another_environment_is_shown_from_its_next_state_on():

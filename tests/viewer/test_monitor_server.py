@@ -21,9 +21,8 @@ from pdeloop.messages.colour_scale import DARK, LIGHT, colours
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
 from tests.support.browser import browser
-from viewer_node.loop_nodes import Endpoint
+from viewer_node.loop_nodes import Call, Endpoint
 from viewer_node.loop_view import LoopView
-from viewer_node.operation import Call
 from viewer_node.web.page import Page, ShowLoop
 from viewer_node.web.server import FILES, STATIC, Server
 

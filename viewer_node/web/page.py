@@ -30,8 +30,8 @@ from pdeloop.messages.actuators import parse
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.grid import Axis, Grid
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples
+from viewer_node.loop_nodes import Call
 from viewer_node.loop_view import SILENT, LoopView, path_of
-from viewer_node.operation import Call
 
 RATE_WINDOW = 3.0
 """Seconds over which rates are taken."""

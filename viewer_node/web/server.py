@@ -34,7 +34,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.text import printable
-from viewer_node.operation import VERBS
+from viewer_node.loop_nodes import VERBS
 from viewer_node.web.page import Page
 
 FRAMES = 20.0
