@@ -40,10 +40,9 @@ from tuner_node.diagnostics import TunerDiagnostics
 from tuner_node.narration import Narration
 from tuner_node.optimizer_parameters import setting_specs, with_settings
 from tuner_node.pair import PairPublication
-from tuner_node.participants import Participants, Publishers
 from tuner_node.results import summarise
 from tuner_node.run_store import open_run
-from tuner_node.session import Session
+from tuner_node.session import Participants, Publishers, Session
 
 SETTLE = 0.3
 """Grace period (s) for contradictions after the last episode."""

@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
 from pdeloop.environments.keywords import Source, Specified
-from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
-from pdeloop.environments.signals import field_seed, first_fields, one, spaces, told
+from pdeloop.environments.signals import (
+    FRAMES_PER_SECOND,
+    Picture,
+    field_seed,
+    first_fields,
+    one,
+    spaces,
+    told,
+)
 from pdeloop.messages.arrays import Array
 
 

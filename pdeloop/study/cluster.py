@@ -20,9 +20,8 @@ from uuid import uuid4
 
 from pdeloop.process.module_path import SAFE_PATH
 from pdeloop.study import training
-from pdeloop.study.deaths import LINES
 from pdeloop.study.description import StudyError
-from pdeloop.study.executors import AHEAD, Death, LostWorkerError, Workers, lost
+from pdeloop.study.executors import AHEAD, LINES, Death, LostWorkerError, Workers, lost
 from pdeloop.study.results import Ended
 
 CONNECTING = 10.0

@@ -23,9 +23,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pde_sim_node.build import fingerprint
-from pdeloop.study.deaths import LINES, MOST_DEATHS, Deaths
 from pdeloop.study.description import Study, StudyError
-from pdeloop.study.executors import Death, LostWorkerError, Processes, Workers
+from pdeloop.study.executors import (
+    LINES,
+    MOST_DEATHS,
+    Death,
+    Deaths,
+    LostWorkerError,
+    Processes,
+    Workers,
+)
 from pdeloop.study.results import STUDY_FILE, UNFINISHED, Ended, Results, made_with, writing
 from pdeloop.study.training import CURVE, FILES, Place, code_of, differences, train_one
 from pdeloop.training_run import load_compiled

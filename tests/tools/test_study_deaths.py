@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from pdeloop.study import Study, StudyError, run, training
-from pdeloop.study.deaths import Deaths
-from pdeloop.study.executors import local_workers
+from pdeloop.study.executors import Deaths, local_workers
 from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.table import status
 from pdeloop.study.training import Place, listening, train_one

@@ -15,7 +15,7 @@ from pdeloop.messages.topics import POLICY, START
 from tests.support.small import dispatcher_of
 from tuner_node.batch import Batch, DispatchError
 from tuner_node.dispatch import PAUSE_LEASE
-from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
+from tuner_node.session import SECOND_TUNER_GRACE, Participants, Publishers
 
 
 def participants(recorder: str = "none", *, pairs: int = 1, established: bool = False) -> Any:
