@@ -33,8 +33,15 @@ from pdeloop.ros.parameters import declare, given_parameters
 from pdeloop.ros.peers import Peers
 from pdeloop.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from recorder_node.bag import BagError
-from recorder_node.recording import Recording, large_bag
-from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
+from recorder_node.recording import (
+    CLOCK,
+    DIAGNOSTICS,
+    ROSOUT,
+    Recording,
+    Source,
+    large_bag,
+    sources,
+)
 
 PATIENCE = 10.0
 """Seconds in which the graph is expected to show a node's name and its parameter services."""

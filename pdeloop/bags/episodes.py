@@ -30,7 +30,7 @@ from pdeloop.messages.topics import (
     episode_name,
     start_rows,
 )
-from recorder_node.sources import Source
+from recorder_node.recording import Source
 
 SETTLING, MODEL_SETTLING = 0.3, 10.0
 """Seconds after an episode's last message in which further ones may still come; the longer ones for an

@@ -20,8 +20,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.files import read_json
 from recorder_node.bag import METADATA, BagError
-from recorder_node.recording import EVERY, PARAMETERS
-from recorder_node.sources import source_of
+from recorder_node.recording import EVERY, PARAMETERS, source_of
 from tuner_node.run_folder import RunFolder
 
 RUN_FILE = "run.json"

@@ -21,7 +21,7 @@ from pdeloop.messages.files import FileError, read_bounded
 from pdeloop.messages.text import shown
 from pdeloop.messages.topics import TARGET
 from recorder_node.bag import METADATA, BagError
-from recorder_node.sources import CLOCK, PARAMETERS_TOPIC, source_of
+from recorder_node.recording import CLOCK, PARAMETERS_TOPIC, source_of
 
 MAX_PARAMETERS = 10_000_000
 """Bytes of a message with parameters."""

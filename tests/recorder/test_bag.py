@@ -23,8 +23,7 @@ from pdeloop.identification import identify_bag
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import START, STATE, episode_name, episode_number
 from recorder_node.bag import BagError, definition
-from recorder_node.recording import Recording
-from recorder_node.sources import DIAGNOSTICS, ROSOUT, Source, sources
+from recorder_node.recording import DIAGNOSTICS, ROSOUT, Recording, Source, sources
 from tests.support.interpreter import python
 from tests.support.written_bag import (
     BY_TOPIC,
@@ -241,7 +240,7 @@ def test_a_bag_is_written_without_ros(tmp_path):
         "import sys\n"
         "for name in ('rclpy', 'std_msgs', 'rosgraph_msgs'): sys.modules[name] = None\n"
         "from recorder_node.recording import Recording\n"
-        "from recorder_node.sources import sources\n"
+        "from recorder_node.recording import sources\n"
         "from pathlib import Path\n"
         f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/')).close()\n"
     )

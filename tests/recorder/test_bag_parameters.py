@@ -19,7 +19,7 @@ from pdeloop.identification import identify_bag
 from pdeloop.messages.parameters import PLANT
 from pdeloop.messages.topics import TARGET
 from recorder_node.bag import BagError
-from recorder_node.sources import PARAMETERS_TOPIC
+from recorder_node.recording import PARAMETERS_TOPIC
 from tests.support.converted import convert
 from tests.support.recorded_here import change_metadata, messages_of, write
 from tests.support.verified_bag import by_episodes, verified

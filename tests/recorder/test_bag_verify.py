@@ -16,7 +16,7 @@ from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from pdeloop.messages.samples import clock_message
-from recorder_node.sources import PARAMETERS_TOPIC, source_of
+from recorder_node.recording import PARAMETERS_TOPIC, source_of
 from tests.support.recorded_here import PART, change_metadata, episode_of, record_run, write
 from tests.support.verified_bag import EPISODES, by_episodes, verified, words_of
 

@@ -18,8 +18,7 @@ from std_msgs.msg import Float64MultiArray
 from pdeloop.bags.reader import Bag
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import ACTION, COST, START, STATE
-from recorder_node.recording import Recording
-from recorder_node.sources import ARRAY_TYPE, CLOCK, sources
+from recorder_node.recording import ARRAY_TYPE, CLOCK, Recording, sources
 from tests.support.converted import convert
 from tests.support.written_bag import RUN, SECOND, encode, frame
 

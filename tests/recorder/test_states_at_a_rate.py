@@ -16,8 +16,14 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import STATE
 from pdeloop.pairs import Transport
 from recorder_node.bag import BagError
-from recorder_node.recording import Recording, large_bag
-from recorder_node.sources import CLOCK, PARAMETERS_TOPIC, source_of, sources
+from recorder_node.recording import (
+    CLOCK,
+    PARAMETERS_TOPIC,
+    Recording,
+    large_bag,
+    source_of,
+    sources,
+)
 from tests.support.recorded_here import messages_of, record_run
 
 EVERY = 4

@@ -36,8 +36,7 @@ from pdeloop.messages.topics import (
     Topic,
 )
 from recorder_node.bag import FILE, METADATA, BagWriter, Channel
-from recorder_node.recording import Recording
-from recorder_node.sources import CLOCK, source_of, sources
+from recorder_node.recording import CLOCK, Recording, source_of, sources
 from tests.support.small import parameters
 from tuner_node.batch import Batch
 from tuner_node.build import build_training

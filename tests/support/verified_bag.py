@@ -8,7 +8,7 @@ from pathlib import Path
 from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.report import Report
 from pdeloop.cli import main
-from recorder_node.sources import CLOCK
+from recorder_node.recording import CLOCK
 from tests.support.recorded_here import PART, episode_of
 
 EPISODES = 1 + 1 + 3 + 4

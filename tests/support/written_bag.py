@@ -13,8 +13,7 @@ import numpy as np
 
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.topics import ACTION, COST, START, STATE
-from recorder_node.recording import Recording
-from recorder_node.sources import CLOCK, sources
+from recorder_node.recording import CLOCK, Recording, sources
 
 RUN = 2**52 + 1
 SECOND = 10**9

@@ -19,7 +19,7 @@ from pdeloop.identification import identify_bag
 from pdeloop.messages.frames import Frame
 from pdeloop.messages.model_rows import pack
 from recorder_node.bag import BagWriter, Channel
-from recorder_node.sources import PARAMETERS_TOPIC
+from recorder_node.recording import PARAMETERS_TOPIC
 from tests.support.loop_harness import until
 from tests.support.operator_harness import operator
 from tests.support.recorded_here import messages_of, write
