@@ -27,7 +27,21 @@ from pdeloop.method.reduce.channels import Channels, listed
 
 SEPARATORS = (",", ";", "\t", "|")
 """Tried in this order; without any of them columns are separated by spaces."""
-MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
+MISSING = (
+    "",
+    "nan",
+    "na",
+    "n/a",
+    "#n/a",
+    "null",
+    "none",
+    "-",
+    "--",
+    "bad",
+    "bad input",
+    "no data",
+    "i/o timeout",
+)
 """Lower-case texts that stand for a missing value."""
 TIME = re.compile(r"(t|[Tt]ime)(_[a-zµμ]+|\s*[\[(][^\])]*[\])])?")
 """The column of times where none is named: t or time, also with its unit, as t_ms or Time [ms]."""

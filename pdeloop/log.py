@@ -267,6 +267,11 @@ def _missing_text(
     name = [*channels.states, *channels.inputs][int(np.argmin(np.isfinite(values[k])))]
     more = int(spoilt.sum()) - 1
     others = f" (and {more} more with gaps)" if more else ""
+    if spoilt.mean() > 0.5:  # as of a logger that writes changes alone
+        return (
+            f"{name} is missing in row {rows[k]}{others}, as where changes alone are written: write in "
+            "every row the last value before it, or one row for each step in which all are known"
+        )
     return (
         f"{name} is missing in row {rows[k]}{others}: fill the gap, or cut the file in two there, as "
         "several files can be given; --cut does so"

@@ -35,6 +35,10 @@ SATURATED = 10
 SATURATED_SHARE = 0.02
 SPIKE = 5.0
 """Size of a jump and of the one back, relative to the 98th percentile of all."""
+WRAPPED, SLOW = 0.8, 0.2
+"""Parts of the range of a channel that a wrap exceeds, and that all other steps fall below."""
+TURNS = (360.0, 2.0 * np.pi)
+"""Ranges of an angle."""
 EXPLAINED = 0.02
 """Part of usual steps that a regression misses of them at least."""
 DRIFT = 50.0
@@ -189,7 +193,7 @@ def findings(
         period = _slow(runs)
         if period:
             slow.setdefault(period, []).append(i)
-        kinds = {"spike": _spikes(x, inputs, first)}
+        kinds = {"spike": _spikes(x, inputs, first), "wrap": _wraps(x, first)}
         if not period:
             kinds |= {"saturated": _saturated(x, runs), "frozen": _frozen(x, runs, held)}
             kinds["frozen"] &= ~kinds["saturated"]
@@ -247,6 +251,12 @@ def _sentence(
             f"{names} {'jumps' if len(own) == 1 else 'jump'} to {value:.6g} for one row, row "
             f"{rows[k]}{more}: leave it out with --cut"
         )
+    if kind == "wrap":
+        return (
+            f"{names} {'jumps' if len(own) == 1 else 'jump'} from one end of the range to the other in "
+            f"row {rows[k]}{more}, as an angle or a counter that begins anew: log it without that (as "
+            "numpy.unwrap makes it), or begin a trajectory there with --cut"
+        )
     if kind == "jump":
         return (
             f"the states jump in row {rows[k]}{more}, and not by an input, as where another experiment "
@@ -290,6 +300,21 @@ def _spikes(x: Array, inputs: Array, first: Flags) -> Flags:
     pulse[1:-1] = (moved[:-1] * moved[1:] < 0.0).any(axis=1)
     pulse[1:] |= pulse[:-1].copy()
     return found & ~pulse
+
+
+def _wraps(x: Array, first: Flags) -> Flags:
+    """Rows to which a channel jumps from one end of its range to the other, which it reaches slowly."""
+    change = np.diff(x)
+    change[first[1:] | ~np.isfinite(change)] = 0.0
+    ends, size = float(np.ptp(x[np.isfinite(x)])), np.abs(change)
+    jumps = size > WRAPPED * ends
+    slow = np.where(jumps, 0.0, change)
+    found = np.zeros(len(x), dtype=bool)
+    turned = any(WRAPPED * turn < ends <= turn * (1.0 + 1e-3) for turn in TURNS)
+    wound = jumps.sum() > 1 and np.ptp(np.cumsum(slow)) > WRAPPED * ends
+    if size[~jumps].max(initial=0.0) < SLOW * ends and (turned or wound):
+        found[1:] = jumps
+    return found
 
 
 def _jumps(states: Array, inputs: Array, first: Flags) -> Flags:

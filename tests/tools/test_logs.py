@@ -157,6 +157,27 @@ def test_rows_that_are_not_the_plants_are_told_and_left_out(
     np.testing.assert_allclose(poles(found), TRUE, atol=0.02)
 
 
+@pytest.mark.parametrize(("turn", "swing"), [(360.0, 9.0), (65536.0, 3000.0), (2 * np.pi, 0.02)])
+def test_an_angle_that_wraps_is_told_and_cut_at_that(
+    tmp_path: Path, turn: float, swing: float
+) -> None:
+    """An angle and its speed; the last one stays about 0, where every turn is a jump."""
+    rng, x, z = np.random.default_rng(0), np.zeros(2), np.zeros((ROWS, 3))
+    u = np.repeat(rng.uniform(-1.0, 1.0, (ROWS // 5, 2)), 5, 0) * swing
+    for k in range(ROWS):
+        z[k, :2] = x[0] % turn, x[1]
+        u[k, 0] -= 0.2 * x[0] * (swing < 1.0)
+        x = np.array([x[0] + x[1], 0.5 * x[1] + u[k, 0] + swing * (swing > 1.0)])
+    z[:, 2] = np.cos(T)
+    path = write(tmp_path / "own.csv", z, u)
+    told = [text for text in read_measurements(path).remarks if "as an angle or a counter" in text]
+    assert len(told) == 1 and told[0].startswith("z1 jumps from one end of the range to the other")
+    found = read_measurements(path, states="z1,z2", inputs="a1", time="t", cut=True)
+    model = pdeloop.identify(*found.trajectories, n_s=2)
+    A = model.U @ model.A @ model.U.T
+    np.testing.assert_allclose(A, [[1.0, 1.0], [0.0, 0.5]], atol=1e-5)
+
+
 def test_a_sensor_slower_than_the_log_is_told_with_its_period(tmp_path: Path) -> None:
     z = np.repeat(Z[::5], 5, 0)
     path = write(tmp_path / "own.csv", z, t=0.1 * T)
@@ -226,6 +247,15 @@ def test_rows_that_are_there_twice_are_told(tmp_path: Path) -> None:
     assert len(found.trajectories) == 15
     told = "t is the same in rows 22 and 23, and 13 times more: each begins another trajectory"
     assert found.remarks[0].startswith(told)
+
+
+def test_a_log_of_changes_alone_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    path = write(tmp_path / "own.csv")
+    lines = path.read_text().splitlines()
+    lines[5:] = [f"{line.rpartition(',')[0]}," for line in lines[5:]]
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"a2 is missing in row 6 \(.* the last value before it"):
+        read_measurements(path)
 
 
 def test_missing_rows_are_cut_at_and_never_interpolated_over(tmp_path: Path) -> None:
