@@ -102,6 +102,21 @@ def test_data_about_an_operating_point_give_the_model_of_the_deviations(offset: 
     assert bool(model.d.any()) is bool(offset)
 
 
+def test_a_mode_of_an_offset_alone_has_no_dynamics_but_rounding() -> None:
+    """Ten sensors of three states, each with its own zero: four modes, of which one never moves."""
+    rng = np.random.default_rng(0)
+    A, B, C = np.diag([0.97, 0.9, 0.7]), rng.normal(size=(3, 2)), rng.normal(size=(10, 3))
+    x, a = np.zeros((201, 3)), rng.normal(size=(200, 2))
+    for k in range(200):
+        x[k + 1] = A @ x[k] + B @ a[k] + 0.01 * rng.normal(size=3)
+    z = np.round(np.linspace(20.0, 40.0, 10) + x @ C.T, 8)
+    model = exact_regression([(z, a)], n_s=4, constant=True)
+    assert np.abs(model.A).max() < 1.0
+    expected = np.linspace(20.0, 40.0, 10) + C @ A @ [1.0, 2.0, 3.0]
+    s = model.U.T @ (np.linspace(20.0, 40.0, 10) + C @ [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(model.U @ (model.A @ s + model.d), expected, atol=0.02)
+
+
 def test_white_noise_needs_no_constant_term() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     noisy = states + 0.05 * np.random.default_rng(2).standard_normal(states.shape)

@@ -75,6 +75,8 @@ ROUNDED = 1e-24
 """Squared error, relative to the squared states, that is rounding."""
 NEGLIGIBLE = 1e-20
 """Squared constant term, relative to the mean square of the states, that is rounding."""
+STILL = 1e-8
+"""Variation of a mode, relative to its size, that is rounding."""
 LOWER = 0.995
 """Squared error with a constant term, relative to that without, below which it is needed."""
 
@@ -168,14 +170,17 @@ def residuals(model: ReducedModel | ModelRows, data: Steps) -> Array:
 
 def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
     """`exact_regression` on given modes U (n_z, n_s), unchecked. Call it with one LAPACK thread."""
-    s, y = data.before @ U, data.inputs
-    n_s = s.shape[1]
+    s, y, n_s = data.before @ U, data.inputs, U.shape[1]
     if constant:
         # About the means, which is the same and loses no digits to a large offset.
-        means = data.before.mean(axis=0), data.after.mean(axis=0), y.mean(axis=0)
-        own = (part - mean for part, mean in zip((data.before, data.after, y), means, strict=True))
-        centred = fit(Steps(*own), U)
-        d = means[1] @ U - centred.A @ (means[0] @ U) - centred.B @ means[2]
+        means = data.before.mean(axis=0) @ U, data.after.mean(axis=0) @ U, y.mean(axis=0)
+        own = (data.before - data.before.mean(axis=0)) @ U
+        _, sizes, modes = linalg.svd(own, full_matrices=False)
+        modes = modes[sizes > STILL * linalg.norm(s @ modes.T, axis=0)]
+        own = own if len(modes) == n_s else own @ modes.T @ modes  # the rest is the constant
+        steps = Steps(own, (data.after - data.after.mean(axis=0)) @ U, y - means[2])
+        centred = fit(steps, np.eye(n_s))
+        d = means[1] - centred.A @ means[0] - centred.B @ means[2]
         return ReducedModel(centred.A, centred.B, U, d)
     # The modes keep their proportions, in which small ones are small; inputs have none to each other.
     units = np.concatenate([np.full(n_s, float(linalg.norm(s))), scaled(y)[1]])
