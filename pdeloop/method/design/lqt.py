@@ -372,7 +372,7 @@ def _doubled(whole: Array, G: Array, P: Array, horizon: int) -> Array:
     """P after the horizon, from that of one step."""
     n, power, eye = len(whole) - 1, whole, np.eye(len(whole))
     for _ in range(int(np.ceil(np.log2(max(horizon, 1))))):
-        solved = linalg.solve(eye + G @ P, np.hstack([power, G]))
+        solved = np.linalg.solve(eye + G @ P, np.hstack([power, G]))  # without warnings
         own, reach = solved[:, : n + 1], solved[:, n + 1 :]
         G, P = G + power @ reach @ power.T, P + power.T @ P @ own
         power = power @ own
