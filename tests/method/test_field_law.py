@@ -343,3 +343,19 @@ def test_where_nothing_was_measured_only_an_exact_model_is_linearised(
     nearest = states[np.argmin(np.linalg.norm((states - target) / states.std(axis=0), axis=1))]
     assert np.array_equal(point, target if there else nearest)
     assert ("measured" in told) is (distance > 3.0)
+
+
+def test_a_model_is_linearised_at_actions_that_were_applied() -> None:
+    """z+ = 0.9 z + 0.001 a^2 of a valve between 10 and 60: no effect at 0, and 0.07 at its mean."""
+    rng = np.random.default_rng(0)
+    a, z = rng.uniform(10.0, 60.0, (200, 1)), np.full((201, 1), 15.0)
+    for k in range(200):
+        z[k + 1] = 0.9 * z[k] + 0.001 * a[k] ** 2
+    for sign in (1.0, -1.0):
+        own = DesignSettings(1, 1, 1.0, 1e-6, identification="field")
+        found = designed([(z, sign * a)], np.array([16.0]), own).field
+        assert found is not None and found.rows is not None and found.fitted is not None
+        assert found.fitted.model.kind == "polynomial"
+        assert (found.rows.U @ found.rows.B).item() == pytest.approx(
+            0.002 * sign * a.mean(), abs=1e-4
+        )

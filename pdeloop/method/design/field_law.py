@@ -4,9 +4,10 @@
 POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
 those that it senses, also for other fields. A model of the whole field (`pdeloop.method.models`) that
 predicts the episodes is linearised at the target, with e = z - z_r (if that is far outside of the data
-and the model not exact, at the measured state nearest to it),
+and the model not exact, at the measured state nearest to it) and at the action 0, or the mean one of an
+input whose actions were all above, or all below it,
 
-    e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
+    e_{k+1} = A e_k + B a_k + d,        d = f(z_r, a) - B a - z_r,
 
 and the law a = K e + b that minimises the cost over the horizon senses only the n_a rows of K. They
 are the first columns of U; the others are POD modes of the remainder of simulated states, with that law
@@ -60,6 +61,7 @@ from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
     leading_modes,
+    usual_inputs,
 )
 from pdeloop.method.reduce.regression import fit
 from pdeloop.process.one_thread import one_thread
@@ -92,7 +94,8 @@ class FieldLaw:
     the worst mean stage costs that accepted models predict from the initial fields of the trajectories,
     of its law and of the law to compare with; infinite where there is none, or it diverges. regression:
     its accuracy, to compare with `fitted.own`. judges: the models that were accepted. remark: where the
-    model is linearised, if the target is far outside of the data.
+    model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
+    where those are the first ones of trajectories alone; 0: all.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
     declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
@@ -107,6 +110,7 @@ class FieldLaw:
     regression: Accuracy = UNKNOWN
     judges: tuple[str, ...] = ()
     remark: str = ""
+    part: int = 0
 
     @property
     def better(self) -> bool:
@@ -138,8 +142,9 @@ class FieldLaw:
         fitted = self.fitted
         if fitted is None:
             return ["no model of the whole field can be fitted: the law of the regression is used"]
+        of = f" of {self.part} steps near the target" if self.part else ""
         lines = [
-            f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} in "
+            f"model of the whole field: {fitted.model.kind}{of}, error {fitted.error:.2g} in "
             "predicting the data",
             f"  relative to what the data do, on parts held out: {fitted.own.simulated:.2g}, "
             f"regression {self.regression.simulated:.2g}; of single steps {fitted.own.one_step:.2g} "
@@ -258,26 +263,31 @@ def field_law(
         return FieldLaw(fitted, noise=fitted.noise if fitted else 0.0)
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])
     limits = [limited(rollout, action_set) for rollout in fitted.rollouts]
+    total = sum(len(actions) for _, actions in trajectories)
+    steps = sum(len(rollout.actions) for rollout in fitted.rollouts)
+    part = steps if steps < min(total, _FIELD_STEPS) else 0
+    kind = regression_kind(n_s, constant=other.d is not None)
+    if part:  # what is fitted to a part of the data has to be better there than what all of them gave
+        kind = replace(kind, fit=lambda *_: _whole(other))
     with one_thread():
-        kind = regression_kind(n_s, constant=other.d is not None)
         held = selection.judged(kind, limits, np.inf, models, scale)
     regression = held[1] if held else UNKNOWN
-    known = [(fitted.model, fitted.own), (_whole(other), regression)]
-    accepted = _accepted(known, fitted.most)
-    model = fitted.model
-    own = fitted.own
+    model, own = fitted.model, fitted.own
+    accepted = _accepted([(model, own), (_whole(other), regression)], fitted.most)
     predicts = own.simulated < min(1.0, regression.simulated) and own.one_step < regression.one_step
     if not accepted and predicts:  # more than nothing, and all of it better than the other one does
         accepted = [model]
-    elif fitted.error > fitted.most:
+    elif fitted.error > fitted.most or (part and not predicts):
         accepted = [judge for judge in accepted if judge is not model]
-    report = FieldLaw(fitted, regression=regression, judges=tuple(judge.kind for judge in accepted))
+    judges = tuple(judge.kind for judge in accepted)
+    report = FieldLaw(fitted, regression=regression, judges=judges, part=part)
     if not any(judge is model for judge in accepted):
         return report
     aim = target if weights is None else aim_of(scale.reference, target, weights)
     point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
-    A, B = model.linearise(point, np.zeros(model.n_a))
-    drift = model.step(point[None], np.zeros((1, model.n_a)))[0] - point
+    action = usual_inputs(trajectories)
+    A, B = model.linearise(point, action)
+    drift = model.step(point[None], action[None])[0] - B @ action - point
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
         return report
     horizon = max(len(actions) for _, actions in trajectories)

@@ -566,7 +566,8 @@ class Selection:
         regions: dict[int, float] = {}
         for near in (np.inf, *NEAR):  # of several in which the same is measured the largest
             parts = beginnings(rollouts, self.target, near, self.weights)
-            regions.setdefault(sum(len(own.actions) for own in parts), near)
+            if _moved(parts) == _moved(rollouts):  # what stood still there shows no effect
+                regions.setdefault(sum(len(own.actions) for own in parts), near)
         found = []
         for near in regions.values():
             if near < np.inf:
@@ -578,6 +579,12 @@ class Selection:
                 found.append(fitted)
         good = [own for own in found if own and own.predicts and self._one_step(own) <= ONE_STEP]
         return min(good, key=lambda own: own.judged, default=None)
+
+
+def _moved(rollouts: Sequence[Measured]) -> list[bool]:
+    """Which inputs moved."""
+    every = zip(*(own.actions.T for own in rollouts), strict=True)
+    return [bool(np.ptp(np.concatenate(own)) > 0.0) for own in every]
 
 
 def innovations(

@@ -364,6 +364,12 @@ class Steps:
     inputs: Array
 
 
+def usual_inputs(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Array:
+    """0, or the mean of an input that was always above or always below it, (n_a,)."""
+    a = np.concatenate([np.asarray(a, np.float64) for _, a in trajectories])
+    return np.where((a.min(axis=0) <= 0.0) & (a.max(axis=0) >= 0.0), 0.0, a.mean(axis=0))
+
+
 def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     """The steps of trajectories of one plant; a duplicated one counts once.
 
