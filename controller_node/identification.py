@@ -31,7 +31,12 @@ from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, Channels
 from pdeloop.method.reduce.identifiability import Identifiability, examine
 from pdeloop.method.reduce.input_delay import shifted, study_delays
-from pdeloop.method.reduce.reduced_model import DEFAULTS, IdentificationSettings, ReducedModel
+from pdeloop.method.reduce.reduced_model import (
+    DEFAULTS,
+    IdentificationSettings,
+    ReducedModel,
+    usual_inputs,
+)
 from pdeloop.method.reduce.regression import study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 from pdeloop.method.settings import settings_from
@@ -223,7 +228,8 @@ def designed(
                 "a plant with dead time needs a law that remembers its actions, as 'observer' "
                 f"does, but the law is '{settings.law}'"
             )
-        rows = with_dead_time(inner.rows, delays, cost, or_no_control=or_no_control)
+        before = usual_inputs(trajectories)
+        rows = with_dead_time(inner.rows, delays, cost, before, or_no_control=or_no_control)
         return replace(inner, rows=rows)
     n_a = settings.n_a
     free = settings.action_set.free(n_a)  # of mean zero, only differences show an effect

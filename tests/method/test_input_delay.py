@@ -144,6 +144,17 @@ def test_the_law_of_a_dead_time_is_that_of_the_predicted_state(n: int) -> None:
     np.testing.assert_allclose(last, rest, atol=1e-9)
 
 
+def test_the_law_of_a_dead_time_begins_with_the_inputs_of_the_rest() -> None:
+    """At rest under 50 and 60 per cent, which is the target: nothing is to be done."""
+    held, none, weights = np.array([50.0, 60.0]), np.zeros((2, 4)), {"state_weight": 1.0}
+    rest = np.linalg.solve(np.eye(4) - A, B @ held)
+    cost = Cost(4, 2, 1, **weights, action_weight=1e-9, target=rest)
+    rows = ModelRows(A, B, np.eye(4), none, none, rest)
+    law = Observer(with_dead_time(rows, (3, 0), cost, held), 1)
+    first = law.action(law.parts(law.theta_start), rest, law.memory_start(), 0)
+    np.testing.assert_allclose(first, held, rtol=1e-4)
+
+
 def cost_with_delay(model: ModelRows, n: int, z: np.ndarray) -> tuple[float, np.ndarray]:
     """The law `observer` on the plant whose actions act n steps late: cost, last state."""
     law = Observer(model, 600)

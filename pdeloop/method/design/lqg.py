@@ -183,33 +183,41 @@ def law_of_innovations(
 
 
 def with_dead_time(
-    rows: ModelRows, delays: Delays, cost: Cost, *, or_no_control: bool = False
+    rows: ModelRows,
+    delays: Delays,
+    cost: Cost,
+    before: ArrayLike = 0.0,
+    *,
+    or_no_control: bool = False,
 ) -> ModelRows:
     """A model with the last inputs in its state, its law, and the filter that it had, or L = I.
 
-    rows: the model without delays, z_{k+1} by a_{k-n}; delays: n of each input, 0 at least. DesignError
-    where there are no stabilising gains; or_no_control: they are 0 then.
+    rows: the model without delays, z_{k+1} by a_{k-n}; delays: n of each input, 0 at least; before: the
+    inputs before the first step, relative to which the state has them. DesignError where there are no
+    stabilising gains; or_no_control: they are 0 then.
     """
-    late = [max(n, 0) for n in delays]
+    late, before = [max(n, 0) for n in delays], np.broadcast_to(before, len(delays))
     n_s, n_a, memory = len(rows.A), len(late), sum(late)
     newest = n_s + np.cumsum([0, *late[:-1]])
     A, B = np.zeros((n_s + memory, n_s + memory)), np.zeros((n_s + memory, n_a))
-    A[:n_s, :n_s] = rows.A
+    A[:n_s, :n_s], d = rows.A, np.zeros(n_s + memory)
+    d[:n_s] = 0.0 if rows.d is None else rows.d
     for j, n in enumerate(late):
         if not n:
             B[:n_s, j] = rows.B[:, j]
             continue
         first = newest[j]
-        B[first, j] = 1.0
+        B[first, j], d[first] = 1.0, -before[j]
+        d[:n_s] += rows.B[:, j] * before[j]
         A[first + 1 : first + n, first : first + n - 1] = np.eye(n - 1)
         A[:n_s, first + n - 1] = rows.B[:, j]
-    none = np.zeros(memory)
-    d = None if rows.d is None else np.concatenate([rows.d, none])
     seen = np.hstack([rows.measurement, np.zeros((len(rows.U), memory))])
     K_a, b = output_law(A, B, seen, cost, d, or_no_control=or_no_control)
-    s_r = np.concatenate([rows.s_r, none])
+    s_r = np.concatenate([rows.s_r, np.zeros(memory)])
     K_b, left = target_gain(b, s_r)
     with one_thread():
         L = linalg.block_diag(np.eye(n_s) if rows.L is None else rows.L, np.zeros((memory, memory)))
     U = np.hstack([rows.U, np.zeros((len(rows.U), memory))])
-    return replace(rows, A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=L, d=d, b=left)
+    return replace(
+        rows, A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, L=L, d=d if d.any() else None, b=left
+    )
