@@ -40,7 +40,14 @@ from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
 from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
 from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
-from pdeloop.model_checks import Residuals, fit_percent, largest_pole, residuals, stability
+from pdeloop.model_checks import (
+    Residuals,
+    fit_percent,
+    largest_pole,
+    residuals,
+    stability,
+    without_chance,
+)
 from pdeloop.process.one_thread import one_thread
 
 if TYPE_CHECKING:
@@ -127,6 +134,13 @@ class Identified:
                 f"{small} varies by {spread[least]:.3g} and {large} by {spread[most]:.3g}, so {small} "
                 "has no say in a cost with one weight for all: give states in units in which they vary "
                 "alike"
+            )
+        field = self.field
+        if field and field.rows and not min(field.cost, field.other_cost) < np.inf:
+            found.append(
+                f"of the models that predict held-out data one ({' or '.join(field.judges)}) says that "
+                "every law diverges, as where a law leaves the data (an input beyond its bounds, a "
+                "nonlinear plant): give a higher --action-weight or a nearer target"
             )
         law = self.model if isinstance(self.model, ModelRows) else None
         if law is not None and d is not None and law.b is None and not law.s_r.any():
@@ -381,12 +395,14 @@ def _or_subspace(
     score, better = (np.prod(one, axis=1) for one in errors)
     if not (better < score).all() or better[-1] > BETTER * score[-1]:
         return first
-    field = first.field and first.field.rows and first.field.fitted
-    if field and field.own.simulated <= found[1] ** 2:
+    field = first.field
+    whole = field and field.rows and not field.part and field.fitted
+    if whole and whole.own.simulated <= found[1] ** 2:
         return first
     told = (
-        f"its simulations of parts that were held out miss {100 * known[1]:.2g} % of the variation, "
-        f"those of a model in innovation form {100 * found[1]:.2g} %"
+        f"of parts that were held out it misses {100 * known[0]:.3g} % of the changes in a step and "
+        f"{100 * known[1]:.3g} % of the variation in simulations, a model in innovation form "
+        f"{100 * found[0]:.3g} and {100 * found[1]:.3g} %"
     )
     if "identification" in given:
         name = given["identification"]
@@ -522,6 +538,7 @@ def _identified(
             constant=bool(constant),
             simulations=True,
         )
+        innovations = without_chance(innovations, trajectories)
     if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
         found = designed(

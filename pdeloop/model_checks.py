@@ -22,7 +22,7 @@ Quenouille, Biometrika 43, 1956, and Kuensch, Annals of Statistics 17(3), 1989 (
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.channels import Channels, listed
 from pdeloop.method.reduce.reduced_model import ReducedModel, Trajectory
+from pdeloop.method.reduce.subspace import InnovationModel, driven
 from pdeloop.process.one_thread import one_thread
 
 PARTS = 10
@@ -46,6 +47,10 @@ ROUNDED = 1e-6
 """Residuals of this size relative to the variation of the data are rounding."""
 LEAST = 4
 """Residuals for each correlation, at least."""
+SLOW = 10.0
+"""Time constants of a slow mode that the longest trajectory has, at most."""
+EVIDENCE = 20.0
+"""Log-likelihood of the effects on such a mode from which on they count."""
 FIRST = 8
 """Measurements from which a filter finds the state."""
 
@@ -121,6 +126,47 @@ def largest_pole(
     error = np.sqrt((PARTS - 1) * np.var(found))
     reach = float(special.stdtrit(PARTS - 1, 0.5 + CONFIDENCE / 2) * error)
     return size, size - reach, size + reach
+
+
+def without_chance(model: InnovationModel, trajectories: Sequence[Trajectory]) -> InnovationModel:
+    """The same, but for effects of inputs on slow modes that chance explains.
+
+    A disturbance that is not in the log is a mode that hardly decays in it. Chance in the effect w^T B
+    on that mode is 1 / (1 - lambda) times as large in the gain, by which a law counts on moving it.
+    Of all B with w^T B = 0 the likeliest is tried, for white inputs that with the least tr dB^T W dB,
+    where W is the information of the filter's innovations on x_0.
+    """
+    A, C, S = model.A, model.C, model.innovations
+    poles, left, right = linalg.eig(A, left=True, right=True)
+    longest = max(len(a) for _, a in trajectories)
+    slow = np.flatnonzero((np.abs(poles - 1.0) < SLOW / longest) & (poles.imag == 0.0))
+    if not slow.size:
+        return model
+    mean = np.concatenate([a for _, a in trajectories]).mean(axis=0)
+    middle = linalg.pinv(C) @ (np.concatenate([z for z, _ in trajectories]) @ model.U).mean(axis=0)
+    seen = linalg.solve_discrete_lyapunov((A - model.G @ C).T, C.T @ linalg.solve(S, C))
+    known = _unlikeliness(model, trajectories)
+    for w, v, pole in zip(left.T.real[slow], right.T.real[slow], poles.real[slow], strict=True):
+        way = linalg.lstsq(seen, w)[0]
+        change = np.outer(way / (w @ way), w @ model.B)
+        grown = max(pole - 1.0 + 0.1 / longest, 0.0)  # what no input moves has to decay
+        lost = grown * np.outer(v, w) / (w @ v)
+        d = model.drift + change @ mean + lost @ middle
+        other = replace(model, A=model.A - lost, B=model.B - change, d=d)
+        if _unlikeliness(other, trajectories) < known + EVIDENCE:
+            model = other
+    return model
+
+
+def _unlikeliness(model: InnovationModel, trajectories: Sequence[Trajectory]) -> float:
+    """Minus the log-likelihood of the innovations, but for a constant."""
+    A, B, C, G, total = model.A, model.B, model.C, model.G, 0.0
+    for z, a in trajectories:
+        v = z[:-1] @ model.U
+        x = driven(A - G @ C, a @ B.T + model.drift + v @ G.T, linalg.pinv(C) @ v[0][:, None])
+        e = (v - x[:-1, :, 0] @ C.T)[FIRST:]
+        total += 0.5 * float(np.sum(e * linalg.solve(model.innovations, e.T).T))
+    return total
 
 
 def stability(low: float, high: float) -> str:
@@ -211,13 +257,10 @@ def simulated(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array:
     """
     taken = min(_beginning(model), len(a) // 4)
     s = _estimates(model, z, a, taken + 1)
-    found, x = [*s], s[-1]
     d = 0.0 if model.d is None else model.d
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(taken, len(a)):
-            x = model.A @ x + model.B @ a[k] + d
-            found.append(x)
-        return np.asarray(np.array(found) @ _seen(model).T)
+        x = driven(model.A, a[taken:] @ model.B.T + d, s[-1:].T)[1:, :, 0]
+        return np.asarray(np.vstack([s, x]) @ _seen(model).T)
 
 
 def _estimates(model: ReducedModel | ModelRows, z: Array, a: Array, count: int) -> Array:
@@ -226,12 +269,9 @@ def _estimates(model: ReducedModel | ModelRows, z: Array, a: Array, count: int) 
     L = getattr(model, "L", None)
     if L is None:
         return np.asarray(s)
-    x = np.empty_like(s)
-    p = s[0]
-    for k in range(count):
-        x[k] = p + L @ (s[k] - p)
-        p = model.A @ x[k] + (model.B @ a[k] if k < len(a) else 0.0) + d
-    return x
+    steps = s[: len(a)] @ (model.A @ L).T + a[:count] @ model.B.T + d
+    p = driven(model.A - model.A @ L, steps, s[:1].T)[:count, :, 0]
+    return np.asarray(p + (s - p) @ L.T)
 
 
 def _beginning(model: ReducedModel | ModelRows) -> int:

@@ -45,7 +45,7 @@ def test_noise_does_not_draw_the_poles_of_short_steps_to_0(order: int) -> None:
     A, data = log(order, 20.0, 0.1, hold=20)
     found, slowest = identify_data(data, {}), np.abs(np.linalg.eigvals(A)).max()
     assert found.pole[0] == pytest.approx(slowest, abs=0.004)
-    assert told(found, "those of a model in innovation form ")
+    assert told(found, ", a model in innovation form ")
     given: dict[str, Any] = {"identification": "regression"}
     asked = identify_data(data, given)
     assert abs(asked.pole[0] - slowest) > 0.008

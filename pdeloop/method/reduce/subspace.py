@@ -124,7 +124,7 @@ class InnovationModel:
         first: Array = linalg.lstsq(np.vstack(rows), np.concatenate(wanted))[0]
         known = actions[: len(v) - 1] @ self.B.T + v[:-1] @ self.G.T + d
         with np.errstate(over="ignore", invalid="ignore"):
-            x = _driven(self.A - self.G @ self.C, known, first[:, None])[:, :, 0]
+            x = driven(self.A - self.G @ self.C, known, first[:, None])[:, :, 0]
             return first, v - x @ self.C.T
 
 
@@ -319,7 +319,7 @@ def _from_any_start(A: Array, C: Array, inputs: Array, y: Array) -> float:
     """The least sum |y_k - C x_k|^2 over x_0, of x_{k+1} = A x_k + inputs_k."""
     n, size = len(A), y.size
     with np.errstate(over="ignore", invalid="ignore"):
-        seen = C @ _driven(A, inputs, np.eye(n, n + 1))
+        seen = C @ driven(A, inputs, np.eye(n, n + 1))
         seen[:, :, n] -= y
     if size <= n or not np.isfinite(seen).all():
         return np.inf
@@ -328,7 +328,7 @@ def _from_any_start(A: Array, C: Array, inputs: Array, y: Array) -> float:
     return float(left @ left) * size / (size - n)
 
 
-def _driven(A: Array, w: Array, x_0: Array) -> Array:
+def driven(A: Array, w: Array, x_0: Array) -> Array:
     """x_0 .. x_N of x_{k+1} = A x_k + w_k, (N + 1, n, c), where w acts on the last column of x.
 
     All blocks of about sqrt(N) steps go on at once, from 0, and then one begins where another ended.
