@@ -267,7 +267,9 @@ def field_law(
     steps = sum(len(rollout.actions) for rollout in fitted.rollouts)
     part = steps if steps < min(total, _FIELD_STEPS) else 0
     kind = regression_kind(n_s, constant=other.d is not None)
-    if part:  # what is fitted to a part of the data has to be better there than what all of them gave
+    if (
+        part
+    ):  # what is fitted to a part of the data has to be better there than what all of them gave
         kind = replace(kind, fit=lambda *_: _whole(other))
     with one_thread():
         held = selection.judged(kind, limits, np.inf, models, scale)
