@@ -17,7 +17,7 @@ from pdeloop.method.design.lqt import DesignError, track_outputs
 from pdeloop.method.laws import Observer
 from pdeloop.method.reduce.channels import Channels
 from pdeloop.method.reduce.identifiability import NotIdentifiableError
-from pdeloop.method.reduce.subspace import InnovationModel, _driven, _triangle, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, _triangle, driven, subspace_model
 
 N, N_A, N_Y = 4, 2, 3
 RNG = np.random.default_rng(2)
@@ -194,7 +194,7 @@ def test_a_stable_machine_at_ambient_temperature_is_stable() -> None:
 def test_steps_in_blocks_are_those_one_after_the_other(count: int) -> None:
     rng = np.random.default_rng(count)
     w, x_0 = rng.standard_normal((count, N)), rng.standard_normal((N, 3))
-    x, found = x_0.copy(), _driven(A, w, x_0)
+    x, found = x_0.copy(), driven(A, w, x_0)
     assert found.shape == (count + 1, N, 3)
     for k in range(count + 1):
         np.testing.assert_allclose(found[k], x, rtol=1e-12, atol=1e-12)
