@@ -112,8 +112,8 @@ def test_a_row_of_units_stands_above_dates_too(tmp_path: Path) -> None:
 
 
 def test_words_in_the_first_row_of_numbers_are_no_units(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected a number, got 'Bad' in row 2"):
-        read_measurements(table(tmp_path, ["0", "1"], "0;Bad;Bad"))
+    with pytest.raises(ValueError, match="expected a number, got 'Off' in row 2"):
+        read_measurements(table(tmp_path, ["0", "1"], "0;Off;Off"))
 
 
 def test_a_clock_that_shows_no_seconds_is_refused(tmp_path: Path) -> None:
