@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from gymnasium.error import DependencyNotInstalled
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
@@ -118,35 +117,3 @@ def first_fields(options: Mapping[str, Any] | None, shape: tuple[int, ...]) -> A
     if field.shape != shape:
         raise ValueError(f"options['field'] must have shape {shape}, got {field.shape}")
     return field
-
-
-if TYPE_CHECKING:
-    from pdeloop.frames import Frames
-
-FRAMES_PER_SECOND = 20
-
-
-class Picture:
-    """The frames of one environment, drawn on one canvas; the axes grow with the data.
-
-    A copy, or what a pickle gives, begins with a new canvas.
-    """
-
-    def __init__(self) -> None:
-        self._frames: Frames | None = None
-
-    def __reduce__(self) -> tuple[type[Picture], tuple[()]]:
-        return Picture, ()
-
-    def frame(self, plant: Plant, environment: int) -> NDArray[np.uint8]:
-        """A picture of the plant's environment m, (height, width, 3)."""
-        if self._frames is None:
-            try:
-                from pdeloop.frames import Frames
-            except ModuleNotFoundError as error:
-                raise DependencyNotInstalled(
-                    "drawing needs Matplotlib: pip install 'pdeloop[report]'"
-                ) from error
-            self._frames = Frames(plant)
-        own = slice(environment, environment + 1)
-        return self._frames.draw(plant.states[own], plant.actions[own], plant.step_index)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments import keywords
 from pdeloop.environments.keywords import Source, Specified
+from pdeloop.environments.picture import FRAMES_PER_SECOND, Picture
 from pdeloop.environments.signals import (
-    FRAMES_PER_SECOND,
-    Picture,
     field_seed,
     first_fields,
     one,

@@ -21,55 +21,23 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.domain import Live
 from pdeloop.messages.grid import Grid
 from pdeloop.monitor.finder import Finder, run_id
+from pdeloop.monitor.service_call import ServiceCall
 from pdeloop.process.isolation import keep_on_this_machine
 from pdeloop.ros.node_main import ros_node
 from pdeloop.ros.observer import Observer
 from pdeloop.ros.peers import Peers
 from viewer_node.episode_samples import EpisodeSamples
 from viewer_node.learning_curve import LearningCurve
-from viewer_node.loop_nodes import ROLES, VERBS, Call, Endpoint, Operation
+from viewer_node.loop_nodes import ROLES, VERBS, Call, Endpoint
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, ShowLoop
-
-CONNECTION = 5.0
-"""Seconds within which the service must be there."""
-ANSWER = 300.0
-"""Seconds within which it must answer: a node that computes answers when it is done."""
-
-
-class ServiceCall:
-    """A call of a service that is under way."""
-
-    def __init__(self, node: Node, call: Call) -> None:
-        self._node, self._call = node, call
-        self._since = time.monotonic()
-        self._client = node.create_client(Trigger, f"{call.node}/{call.verb}")
-        self._future: Any = None
-
-    def poll(self, operation: Operation) -> bool:
-        """Proceed; True when the call is over and its result is stored."""
-        now = time.monotonic()
-        if self._future is None and self._client.service_is_ready():
-            self._future = self._client.call_async(Trigger.Request())
-        if self._future is not None and self._future.done():
-            answer = self._future.result()
-            operation.answered(self._call, now, None if answer.success else str(answer.message))
-        elif now - self._since > (CONNECTION if self._future is None else ANSWER):
-            waited = f"did not answer within {now - self._since:.0f} s"
-            operation.answered(self._call, now, waited)
-        else:
-            return False
-        self._node.destroy_client(self._client)
-        return True
-
 
 REQUEST_PERIOD = 0.1
 """Period (s) of serving the page's requests and of polling the answers of nodes."""

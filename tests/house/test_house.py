@@ -37,6 +37,7 @@ WITH_ROS = {
     "node_main.py",
     "endpoints.py",
     "introspection.py",
+    "service_call.py",
     "parameters.py",
 }
 """Files that may import rclpy or messages."""

@@ -20,7 +20,7 @@ from gymnasium.wrappers.vector import RecordVideo as RecordVideos
 import pdeloop
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.environments import environment_id
-from pdeloop.environments.signals import Picture
+from pdeloop.environments.picture import Picture
 from pdeloop.frames import Frames
 from pdeloop.messages.grid import Axis, Grid
 from pdeloop.messages.problem import shipped_problems

@@ -221,7 +221,7 @@ import rclpy, rclpy.executors
 from std_msgs.msg import String
 from pdeloop.ros import parameters
 from pdeloop.ros.peers import Peers
-from recorder_node.node import PATIENCE, Matching
+from recorder_node.matching import PATIENCE, Matching
 
 rclpy.init()
 parameters.UNANSWERED = 0.0  # every answer comes later than that
