@@ -35,7 +35,7 @@ from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
     IdentificationSettings,
     ReducedModel,
-    usual_inputs,
+    operating_inputs,
 )
 from pdeloop.method.reduce.regression import study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
@@ -228,7 +228,7 @@ def designed(
                 "a plant with dead time needs a law that remembers its actions, as 'observer' "
                 f"does, but the law is '{settings.law}'"
             )
-        before = usual_inputs(trajectories)
+        before = operating_inputs(trajectories)
         rows = with_dead_time(inner.rows, delays, cost, before, or_no_control=or_no_control)
         return replace(inner, rows=rows)
     n_a = settings.n_a

@@ -46,7 +46,7 @@ from pdeloop.model_checks import (
     largest_pole,
     residuals,
     stability,
-    without_chance,
+    without_insignificant_effects,
 )
 from pdeloop.process.one_thread import one_thread
 
@@ -538,7 +538,7 @@ def _identified(
             constant=bool(constant),
             simulations=True,
         )
-        innovations = without_chance(innovations, trajectories)
+        innovations = without_insignificant_effects(innovations, trajectories)
     if target is not None or of_past or dead:
         rest = np.mean([states.mean(axis=0) for states, _ in trajectories], axis=0)
         found = designed(

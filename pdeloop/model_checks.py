@@ -128,13 +128,16 @@ def largest_pole(
     return size, size - reach, size + reach
 
 
-def without_chance(model: InnovationModel, trajectories: Sequence[Trajectory]) -> InnovationModel:
-    """The same, but for effects of inputs on slow modes that chance explains.
+def without_insignificant_effects(
+    model: InnovationModel, trajectories: Sequence[Trajectory]
+) -> InnovationModel:
+    """The same, without effects of inputs on slow modes that are not significant: likelihood ratio.
 
     A disturbance that is not in the log is a mode that hardly decays in it. Chance in the effect w^T B
     on that mode is 1 / (1 - lambda) times as large in the gain, by which a law counts on moving it.
     Of all B with w^T B = 0 the likeliest is tried, for white inputs that with the least tr dB^T W dB,
-    where W is the information of the filter's innovations on x_0.
+    where W is the information of the filter's innovations on x_0. Source: Ljung, *System
+    Identification*, 2nd ed., 1999, chapter 16.
     """
     A, C, S = model.A, model.C, model.innovations
     poles, left, right = linalg.eig(A, left=True, right=True)
@@ -145,7 +148,7 @@ def without_chance(model: InnovationModel, trajectories: Sequence[Trajectory]) -
     mean = np.concatenate([a for _, a in trajectories]).mean(axis=0)
     middle = linalg.pinv(C) @ (np.concatenate([z for z, _ in trajectories]) @ model.U).mean(axis=0)
     seen = linalg.solve_discrete_lyapunov((A - model.G @ C).T, C.T @ linalg.solve(S, C))
-    known = _unlikeliness(model, trajectories)
+    known = _negative_log_likelihood(model, trajectories)
     for w, v, pole in zip(left.T.real[slow], right.T.real[slow], poles.real[slow], strict=True):
         way = linalg.lstsq(seen, w)[0]
         change = np.outer(way / (w @ way), w @ model.B)
@@ -153,12 +156,12 @@ def without_chance(model: InnovationModel, trajectories: Sequence[Trajectory]) -
         lost = grown * np.outer(v, w) / (w @ v)
         d = model.drift + change @ mean + lost @ middle
         other = replace(model, A=model.A - lost, B=model.B - change, d=d)
-        if _unlikeliness(other, trajectories) < known + EVIDENCE:
+        if _negative_log_likelihood(other, trajectories) < known + EVIDENCE:
             model = other
     return model
 
 
-def _unlikeliness(model: InnovationModel, trajectories: Sequence[Trajectory]) -> float:
+def _negative_log_likelihood(model: InnovationModel, trajectories: Sequence[Trajectory]) -> float:
     """Minus the log-likelihood of the innovations, but for a constant."""
     A, B, C, G, total = model.A, model.B, model.C, model.G, 0.0
     for z, a in trajectories:

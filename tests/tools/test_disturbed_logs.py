@@ -8,7 +8,7 @@ import pytest
 
 from controller_node.identification import DesignSettings, designed
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
-from pdeloop.model_checks import without_chance
+from pdeloop.model_checks import without_insignificant_effects
 
 A = np.array([[0.92, 0.019], [0.014, 0.946]])
 B = np.array([[0.096, 0.02], [0.015, 0.073]])
@@ -46,7 +46,8 @@ def test_chance_does_not_move_a_disturbance(kind: str) -> None:
     z, u = log(1, v)
     found = subspace_model([(z, u)], order=3, past=4, constant=True)
     wrong, right = (
-        np.abs(gain(model) - GAIN).max() for model in (found, without_chance(found, [(z, u)]))
+        np.abs(gain(model) - GAIN).max()
+        for model in (found, without_insignificant_effects(found, [(z, u)]))
     )
     assert right < 0.3 and right < 0.2 * wrong
 
@@ -60,7 +61,7 @@ def test_a_slow_mode_that_inputs_move_keeps_their_effect() -> None:
         x = np.array([[0.999, 0.0], [0.0, 0.8]]) @ x + np.array([[0.01, -0.01], [0.1, 0.0]]) @ u[k]
         z[k + 1] = x + 0.005 * rng.standard_normal(2)
     found = subspace_model([(z, u)], order=2, past=8, constant=True)
-    assert without_chance(found, [(z, u)]) is found
+    assert without_insignificant_effects(found, [(z, u)]) is found
 
 
 def test_a_part_of_a_log_in_which_inputs_stood_still_gives_no_law() -> None:

@@ -36,7 +36,14 @@ State = dict[str, NDArray[np.generic]]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode: states z_0 .. z_{T-1}, and z_T if it is known, and actions a_k from z_k to z_{k+1}.
+    """One episode of one environment.
+
+    Attributes
+    ----------
+    states : (T, n_z) or (T + 1, n_z) array
+        z_0 .. z_{T-1}, and z_T if it is known.
+    actions : (T, n_a) array
+        a_k, held from z_k to z_{k+1}.
 
     A diverged episode may be shorter, or end in values that are not finite.
     """
@@ -128,14 +135,45 @@ def by_law(records: Sequence[Record]) -> list[list[Record]]:
 class Context:
     """The problem as a model-based optimiser knows it.
 
-    U (n_z, n_s) is the basis of the projected state, target (n_z,) z_r, Q = state_weight I, R =
-    action_weight I and horizon T; cost: the whole one where these do not say it. exploration: that of
-    the reduced model; further: from other initial fields; measured: rollouts that checked the first
-    law, and no control. noise: standard deviation on every number of the states, 0 for none, or
-    unknown. sensors: n_y, at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
-    consist; 0: they are whole. actuator_positions, actuator_widths: shares of the domain, or none:
-    equally spaced, and not declared. periodic, line: whether states are fields on one periodic axis; on
-    one axis, or plain vectors; shape: points of each of several axes. law: whose parameters theta is.
+    Attributes
+    ----------
+    U : (n_z, n_s) array
+        Basis of the projected state.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        Q = state_weight I, R = action_weight I.
+    horizon : int
+        T, the steps of an episode.
+    exploration : Trajectory
+        The exploratory trajectory that the reduced model was identified from.
+    measured : sequence of Record
+        Rollouts from before the optimisation: those that checked the first law, and no control.
+    action_set : ActionSet
+        Admissible actions, the nearest of which is applied.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown.
+    sensors : int
+        n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
+        consist; 0: the states are whole.
+    actuator_positions : sequence of float
+        Centres of the actuators as shares of the domain; none: equally spaced.
+    actuator_widths : sequence of float
+        Width of each as a share of the domain; none: not declared.
+    periodic : bool
+        Whether the states are fields on one periodic axis, which models of the whole field assume.
+    line : bool
+        Whether they are fields on one axis, or plain vectors.
+    shape : tuple of int
+        Points of each axis, where they are fields on several; none: they are not.
+    further : sequence of Trajectory
+        Other explorations, from other initial fields.
+    cost : Cost or None
+        The whole cost, where the weights and the target do not say it.
+    law : Law, optional
+        The law whose parameters theta is, with its derivatives if it has any.
+    field_models : FieldModelSettings
+        How models of the whole field are fitted and one is chosen.
     """
 
     U: Array

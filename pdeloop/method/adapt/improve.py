@@ -163,6 +163,7 @@ def index_of_cheapest(costs: Array, weights: Array) -> int:
 def curvature_of(loop: ClosedLoop) -> Array:
     """R + B^T P B of the model linearised at the target; R where there is none."""
     n_z, n_a, q, r = loop.model.n_z, loop.model.n_a, loop.state_weight, loop.action_weight
+    # Not the stage cost of the loop: a model of the field has a target of readings.
     cost = loop.cost or Cost(n_z, n_a, loop.horizon, state_weight=q, action_weight=r)
     if n_z <= LARGEST:
         A, B = loop.model.linearise(loop.target, cost.action_target)

@@ -263,9 +263,9 @@ class ModelBasedSensed(ModelBasedReadings):
         """As on a model of the whole field, where there is one, if pairs of rollouts agree."""
         base = super()._decide(row, laws)
         pair, known = {base: laws[base], ADAPTED: laws[ADAPTED]}, self._records.all()
-        common = set[int].intersection(*(set(costs_by_field(known, law)) for law in pair.values()))
-        same = np.array_equal(pair[base], pair[ADAPTED]) or row["chosen"] not in pair
-        if self._sensed is None or same or len(common) < FEWEST:
+        of_base, of_final = (costs_by_field(known, law).keys() for law in pair.values())
+        decided = row["chosen"] not in pair or np.array_equal(pair[base], pair[ADAPTED])
+        if self._sensed is None or decided or len(of_base & of_final) < FEWEST:
             return base
         evidence = verdict.evidence_of_rollouts(pair, base, known)
         evidence[ADAPTED] = replace(evidence[ADAPTED], also=[self._progress.change])

@@ -61,7 +61,7 @@ from pdeloop.method.reduce.reduced_model import (
     Steps,
     Trajectory,
     leading_modes,
-    usual_inputs,
+    operating_inputs,
 )
 from pdeloop.method.reduce.regression import fit
 from pdeloop.process.one_thread import one_thread
@@ -267,9 +267,7 @@ def field_law(
     steps = sum(len(rollout.actions) for rollout in fitted.rollouts)
     part = steps if steps < min(total, _FIELD_STEPS) else 0
     kind = regression_kind(n_s, constant=other.d is not None)
-    if (
-        part
-    ):  # what is fitted to a part of the data has to be better there than what all of them gave
+    if part:  # there it has to be better than what all of the data gave
         kind = replace(kind, fit=lambda *_: _whole(other))
     with one_thread():
         held = selection.judged(kind, limits, np.inf, models, scale)
@@ -287,7 +285,7 @@ def field_law(
         return report
     aim = target if weights is None else aim_of(scale.reference, target, weights)
     point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
-    action = usual_inputs(trajectories)
+    action = operating_inputs(trajectories)
     A, B = model.linearise(point, action)
     drift = model.step(point[None], action[None])[0] - B @ action - point
     if not all(np.isfinite(part).all() for part in (A, B, drift)):

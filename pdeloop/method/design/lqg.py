@@ -192,7 +192,8 @@ def with_dead_time(
 ) -> ModelRows:
     """A model with the last inputs in its state, its law, and the filter that it had, or L = I.
 
-    rows: the model without delays, z_{k+1} by a_{k-n}; delays: n of each input, 0 at least; before: the
+    rows: the model without delays, z_{k+1} by a_{k-n}; delays: n of each input, where less than 0
+    counts as 0; before: the
     inputs before the first step, relative to which the state has them. DesignError where there are no
     stabilising gains; or_no_control: they are 0 then.
     """

@@ -364,8 +364,8 @@ class Steps:
     inputs: Array
 
 
-def usual_inputs(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Array:
-    """0, or the mean of an input that was always above or always below it, (n_a,)."""
+def operating_inputs(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Array:
+    """The operating point of the inputs, (n_a,): 0, or the mean of one that kept its sign."""
     a = np.concatenate([np.asarray(a, np.float64) for _, a in trajectories])
     return np.where((a.min(axis=0) <= 0.0) & (a.max(axis=0) >= 0.0), 0.0, a.mean(axis=0))
 

@@ -173,14 +173,14 @@ def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
     s, y, n_s = data.before @ U, data.inputs, U.shape[1]
     if constant:
         # About the means, which is the same and loses no digits to a large offset.
-        means = data.before.mean(axis=0) @ U, data.after.mean(axis=0) @ U, y.mean(axis=0)
-        own = (data.before - data.before.mean(axis=0)) @ U
+        before, after, inputs = (part.mean(axis=0) for part in (data.before, data.after, y))
+        own = (data.before - before) @ U
         _, sizes, modes = linalg.svd(own, full_matrices=False)
         modes = modes[sizes > STILL * linalg.norm(s @ modes.T, axis=0)]
         own = own if len(modes) == n_s else own @ modes.T @ modes  # the rest is the constant
-        steps = Steps(own, (data.after - data.after.mean(axis=0)) @ U, y - means[2])
+        steps = Steps(own, (data.after - after) @ U, y - inputs)
         centred = fit(steps, np.eye(n_s))
-        d = means[1] - centred.A @ means[0] - centred.B @ means[2]
+        d = after @ U - centred.A @ (before @ U) - centred.B @ inputs
         return ReducedModel(centred.A, centred.B, U, d)
     # The modes keep their proportions, in which small ones are small; inputs have none to each other.
     units = np.concatenate([np.full(n_s, float(linalg.norm(s))), scaled(y)[1]])
