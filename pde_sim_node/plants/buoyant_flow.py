@@ -113,7 +113,10 @@ def flow(
     ny, nx = fields.shape[1:]
     # With one cell beyond each wall.
     wide = np.zeros((3, ny + 2, nx + 2))
-    wide[:, 1:-1, 1:-1] = fields
+    for f in range(3):
+        for j in range(ny):
+            for i in range(nx):
+                wide[f, j + 1, i + 1] = fields[f, j, i]
     T, u, v = wide[0], wide[1], wide[2]
     rates, last = np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
     apart = np.empty(ny + 1)  # centres of rows
@@ -177,4 +180,7 @@ def flow(
             if j > 0:
                 for i in range(nx):
                     v[j + 1, i + 1] -= per_d[j] * (p[j, i] - p[j - 1, i])
-    fields[:] = wide[:, 1:-1, 1:-1]
+    for f in range(3):
+        for j in range(ny):
+            for i in range(nx):
+                fields[f, j, i] = wide[f, j + 1, i + 1]
