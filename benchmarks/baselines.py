@@ -291,7 +291,7 @@ def table(folder: Path, problem: str, budget: int) -> list[dict[str, Any]]:
 
 
 def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
-    """The cost of the best inputs for each field, below which no controller comes; None: unknown."""
+    """The cost of the best known inputs for each field; None: unknown."""
     # Fewer sensors or weaker actuators do not lower it.
     strong = {"sensors": 0, "sensor_delays": 1, "action_limit": 0.0}
     own = {**settings, **strong, "identification": "dmdc", "identification_attempts": 10}
