@@ -42,6 +42,7 @@ from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
     Residuals,
+    changed,
     fit_percent,
     largest_pole,
     residuals,
@@ -339,6 +340,15 @@ def identify_data(
         better = delays.text(found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     seen = shifted(found.trajectories, used)
+    if other := changed(seen):
+        i, k, ratio = other
+        place = f"step {k} of " * (k > 1) + _source_text(found.sources[i])
+        text = (
+            f"from about {place} on the states follow the inputs otherwise (one model for all of it "
+            f"misses {ratio:.3g} times the squares of two): two machines, a stuck actuator or two "
+            "operating points in one log; identify from a part where the plant is one"
+        )
+        found = replace(found, remarks=(*found.remarks, text))
     constant = regression.has_offset(seen)
 
     def by(own: Mapping[str, Any], *, simulations: bool = False) -> Identified:

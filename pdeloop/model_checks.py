@@ -53,6 +53,11 @@ EVIDENCE = 20.0
 """Log-likelihood of the effects on such a mode from which on they count."""
 FIRST = 8
 """Measurements from which a filter finds the state."""
+CHANGED = 2.0
+"""Residuals of one model relative to those of one before a row and another after it, as squares, from
+which on the plant changed there."""
+PLACES = 20
+"""Rows at which this is looked for, beside the beginnings of trajectories."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +175,45 @@ def _negative_log_likelihood(model: InnovationModel, trajectories: Sequence[Traj
         e = (v - x[:-1, :, 0] @ C.T)[FIRST:]
         total += 0.5 * float(np.sum(e * linalg.solve(model.innovations, e.T).T))
     return total
+
+
+def changed(trajectories: Sequence[Trajectory]) -> tuple[int, int, float] | None:
+    """Where the states begin to follow the inputs otherwise: trajectory, its step, ratio of squares.
+
+    Residuals of steps by regressions on two rows, of all data and of those before and after a step
+    (Chow, Econometrica 28(3), 1960), of the state for which that matters most.
+    """
+    every = [np.hstack([z[:-1], a]) for z, a in trajectories]
+    n_z, mean = trajectories[0][0].shape[1], np.concatenate(every).mean(axis=0)
+    unit = np.concatenate(every).std(axis=0)
+    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
+    width = 2 * len(mean) + 1
+    rows = np.array([(i, k) for i, x in enumerate(every) for k in range(1, len(x))])
+    if len(rows) < 4 * LEAST * width:
+        return None
+    parts = []
+    for (z, _), x in zip(trajectories, every, strict=True):
+        scaled, after = (x - mean) / unit, (z[2:] - z[1:-1]) / unit[:n_z]
+        parts.append(np.hstack([np.ones((len(after), 1)), scaled[1:], scaled[:-1], after]))
+    known = np.concatenate(parts)
+    begins = np.flatnonzero(rows[:, 1] == 1)
+    places = np.unique(np.r_[begins, np.arange(1, PLACES) * len(rows) // PLACES])[1:]
+    squares = [part.T @ part for part in np.split(known, places)]
+    before, total = np.cumsum(squares, axis=0), np.sum(squares, axis=0)
+
+    def missed(G: Array) -> Array:
+        own = linalg.lstsq(G[:width, :width], G[:width, width:], cond=1e-10)[0]
+        return np.asarray(np.diag(G)[width:] - np.sum(G[:width, width:] * own, axis=0))
+
+    least, one, best = ROUNDED * np.diag(total)[width:], missed(total), (0, 0, CHANGED)
+    for place, G in zip(places, before, strict=False):
+        if min(place, len(rows) - place) > LEAST * width:
+            two = np.maximum(missed(G) + missed(total - G), least)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = float(np.nanmax(one / two)) * (len(rows) - 2 * width) / (len(rows) - width)
+            if ratio > best[2]:
+                best = int(rows[place, 0]), int(rows[place, 1]), ratio
+    return None if best[2] == CHANGED else best
 
 
 def stability(low: float, high: float) -> str:
