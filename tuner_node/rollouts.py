@@ -157,6 +157,6 @@ def no_model(settings: TrainingSettings, steps: Sequence[int], *, paid_up: bool)
         )
     noise = ", or measurement_noise, which raises it" if settings.measurement_noise else ""
     return (
-        f"{told}lower exploration_variance{noise}, or shorten the horizon if the plant also "
-        "diverges without control"
+        f"{told}lower exploration_variance{noise}, raise divergence_bound if states beyond it are no "
+        "failure, or shorten the horizon if the plant also diverges without control"
     )
