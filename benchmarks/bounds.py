@@ -31,6 +31,7 @@ from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.cost import Cost
 from pdeloop.messages.parameters import INSTRUMENTS
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve
@@ -100,14 +101,17 @@ def closed_loop(values: Mapping[str, Any], U: Array) -> ClosedLoop:
     ideal = build_plant({**values, **{spec.name: spec.default for spec in INSTRUMENTS}})
     return ClosedLoop(
         U,
-        ideal.target,
-        ideal.state_weight,
-        ideal.action_weight,
-        ideal.horizon,
+        plain_cost(ideal, ideal.horizon),
         ActionSet.of(values),
         model=TrueModel(ideal),
         noise=values["measurement_noise"],
     )
+
+
+def plain_cost(of: Plant | Cost, horizon: int) -> Cost:
+    """A cost of numbers and a constant target over a horizon."""
+    weights = {"state_weight": of.state_weight, "action_weight": of.action_weight}
+    return Cost(of.n_z, of.n_a, horizon, **weights, target=of.target)
 
 
 def law_costs(plant: Plant, loop: ClosedLoop, theta: Array, held_out: Sequence[int]) -> Array:
@@ -139,7 +143,7 @@ def best_law(
     )
     zero = grown = np.zeros_like(first)
     for part in HORIZONS:
-        short = replace(loop, horizon=max(loop.horizon // part, 1))
+        short = replace(loop, cost=plain_cost(loop.cost, max(loop.horizon // part, 1)))
         grown = descended(short, grown, few, coarse)
     near = [descended(loop, theta, few, coarse) for theta in (first, grown)]
     even = np.full(len(fields), 1.0 / len(fields))

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 import pdeloop
 from benchmarks.families import plants
 from benchmarks.families.cases import CASES, Case
 from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array
-from pdeloop.method.design.lqt import finite_horizon
+from pdeloop.messages.cost import Cost
+from pdeloop.method.design.lqt import regulator
 from pdeloop.method.models import FittedModel, Measured, Selection, affine_law
 from pdeloop.method.models.base import Law, errors, saturated
 
@@ -112,14 +112,10 @@ class Rollouts:
 
     def law(self, fitted: FittedModel) -> Law | None:
         """The law of a model linearised at the target."""
-        none = np.zeros(self.n_a)
-        A, B = fitted.model.linearise(self.target, none)
-        drift = fitted.model.step(self.target[None], none[None])[0] - self.target
-        try:
-            K, b = finite_horizon(A, B, drift, *self.weights, self.horizon)
-        except (linalg.LinAlgError, ValueError):
-            return None
-        return saturated(affine_law(K, b - K @ self.target), self.action_set)
+        weights = dict(zip(("state_weight", "action_weight"), self.weights, strict=True))
+        cost = Cost(len(self.target), self.n_a, self.horizon, **weights, target=self.target)
+        known = regulator(fitted.model, cost)
+        return None if known is None else saturated(affine_law(known.K, known.b), self.action_set)
 
 
 def run(cases: Sequence[str] = ()) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from benchmarks.families.cases import Case
 from benchmarks.field_models import FITTED, Rollouts
@@ -21,7 +20,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.method.adapt.model_based_predictive import rests
-from pdeloop.method.design.lqt import finite_horizon
+from pdeloop.method.design.lqt import regulator
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 
@@ -66,19 +65,14 @@ def planner(model: FieldModel, rollouts: Rollouts, H: int, field: Array) -> Plan
     cost = Cost(
         n_z, n_a, max(rollouts.horizon, 2 * H), state_weight=q, action_weight=r, target=target
     )
-    none = np.zeros(n_a)
-    A, B = model.linearise(target, none)
-    drift = model.step(target[None], none[None])[0] - target
-    try:
-        K, b = finite_horizon(A, B, drift, q, r, rollouts.horizon)
-    except (linalg.LinAlgError, ValueError):
-        K, b = np.zeros((n_a, n_z)), none
+    known = regulator(model, cost)
+    K, b = (np.zeros((n_a, n_z)), np.zeros(n_a)) if known is None else (known.K, known.b)
     return Planner(
         model,
         cost,
         rollouts.action_set,
         np.ascontiguousarray(K),
-        b - K @ target,
+        b,
         around=bool(K.any()),
         steps=H,
         terminal=rests(model, cost, field[None]),

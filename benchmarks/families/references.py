@@ -32,7 +32,7 @@ from pdeloop.episode import Law, rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import cost_to_go, finite_horizon_of
+from pdeloop.method.design.lqt import cost_to_go, finite_horizon
 
 STEPS = 20
 """Of a plan."""
@@ -63,7 +63,7 @@ def linearisation(plant: Process) -> Linearisation:
 
 def clipped_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> Law:
     """The affine law of least cost over the horizon, within bounds."""
-    K, b = finite_horizon_of(model.A, model.B, model.d, cost, model.point)
+    K, b = finite_horizon(model.A, model.B, model.d, cost, model.point)
     return lambda k, states: admissible.project((states - model.point) @ K.T + b)
 
 

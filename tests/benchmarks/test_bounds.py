@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import bounds
-from benchmarks.bounds import best_inputs, inputs_cost
+from benchmarks.bounds import best_inputs, inputs_cost, plain_cost
 from benchmarks.families.cases import Case
 from benchmarks.families.plants import CoupledPendulums, RandomLinear
 from benchmarks.true_model import TrueModel
@@ -26,8 +26,8 @@ SHORTER = {"horizon": 12, "n_a": 2, "integration_time": 0.01}
 def loop_on(dynamics: Any, n_s: int, horizon: int, **settings: Any) -> ClosedLoop:
     """The closed loop of laws of the first numbers of the state."""
     plant = as_plant(dynamics)
-    numbers = plant.target, plant.state_weight, plant.action_weight, horizon
-    return ClosedLoop(np.eye(plant.n_z, n_s), *numbers, model=TrueModel(plant), **settings)
+    cost = plain_cost(plant, horizon)
+    return ClosedLoop(np.eye(plant.n_z, n_s), cost, model=TrueModel(plant), **settings)
 
 
 def test_the_best_inputs_of_a_linear_plant_are_those_of_the_riccati_recursion() -> None:

@@ -135,7 +135,8 @@ def test_its_simulation_is_what_the_law_does_on_the_model(limit: float) -> None:
             assert (np.abs(a) == limit).any() and (np.abs(a) < limit).any()
         np.testing.assert_allclose(a, expected, rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(z[1:], CUBIC.step(z[:-1], a), rtol=1e-7, atol=1e-9)
-        cost = np.mean(loop.state_weight * np.sum(z[:-1] ** 2, axis=1) + 0.1 * np.sum(a**2, axis=1))
+        q, r = loop.cost.size
+        cost = np.mean(q * np.sum(z[:-1] ** 2, axis=1) + r * np.sum(a**2, axis=1))
         assert found.costs[m] == pytest.approx(cost)
 
 

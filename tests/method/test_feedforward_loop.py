@@ -34,8 +34,7 @@ def loop(**changes: object) -> LinearLoop:
     rows = ModelRows(A=A, B=B, U=np.eye(N), K_a=gains, K_b=gains, s_r=np.zeros(N))
     law = FeedForward(rows, T)
     law.cost = COST
-    problem = (np.eye(N), COST.field_target, *COST.size, T)
-    made = LinearLoop(*problem, model=MODEL, cost=COST, law=law)
+    made = LinearLoop(np.eye(N), COST, model=MODEL, law=law)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
@@ -80,7 +79,8 @@ def test_the_descent_leads_to_the_tracking_law_of_one_initial_state() -> None:
 def test_a_replayed_rollout_costs_what_was_measured_whatever_the_model() -> None:
     """Of a plant that bends, with a linear model; the law is the one that it was measured under."""
     rng = np.random.default_rng(10)
-    closed = ClosedLoop(np.eye(N), np.ones(N), 1.0, 0.4, T, model=MODEL)
+    cost = Cost(N, N_A, T, action_weight=0.4, target=1.0)
+    closed = ClosedLoop(np.eye(N), cost, model=MODEL)
     theta = 0.2 * rng.normal(size=(N_A, N + 1))
     z, states, actions, total = rng.normal(size=N), [], [], 0.0
     for _ in range(T):

@@ -92,7 +92,8 @@ def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
         closed = A + B @ K
         # a^T (R a + B^T (P (A e + B a + d) + p)) vanishes at the optimum
         P, p = Q * np.eye(5) + A.T @ P @ closed, closed.T @ (P @ d + p)
-    own = finite_horizon(A, B, d, Q, R, 8)
+    cost = Cost(5, 2, 8, state_weight=Q, action_weight=R)
+    own = finite_horizon(A, B, d, cost, np.zeros(5))
     np.testing.assert_allclose(own[0], K, rtol=1e-8)
     np.testing.assert_allclose(own[1], b, rtol=1e-8)
 
@@ -103,7 +104,8 @@ def test_is_the_law_of_the_true_plant_linearised_at_the_target(size: float) -> N
     target = size * np.cos(2.0 * np.pi * np.arange(N_Z) / N_Z)
     A, B = true.linearise(target, np.zeros(N_A))
     drift = true.step(target[None], np.zeros((1, N_A)))[0] - target
-    K, b = finite_horizon(A, B, drift, Q, R, STEPS)
+    cost = Cost(N_Z, N_A, STEPS, state_weight=Q, action_weight=R, target=target)
+    K, b = finite_horizon(A, B, drift, cost, target)
     rows = law(true, target)
     np.testing.assert_allclose(rows.U.T @ rows.U, np.eye(6), atol=1e-12)
     assert np.linalg.norm(rows.K_a @ rows.U.T - K) < 0.01 * np.linalg.norm(K)

@@ -48,7 +48,8 @@ def bent() -> SpectralModel:
 def loop(limit: float = 0.0) -> ClosedLoop:
     rng = np.random.default_rng(1)
     U = np.linalg.qr(rng.normal(size=(N_Z, N_S)))[0]
-    return ClosedLoop(U, rng.normal(size=N_Z), 1.5, 0.4, T, ActionSet(limit=limit), model=bent())
+    cost = Cost(N_Z, N_A, T, state_weight=1.5, action_weight=0.4, target=rng.normal(size=N_Z))
+    return ClosedLoop(U, cost, ActionSet(limit=limit), model=bent())
 
 
 def fields(count: int) -> np.ndarray:
@@ -106,7 +107,7 @@ def test_a_policy_and_its_law_act_alike() -> None:
 
 
 def test_without_a_target_in_the_basis_a_law_has_no_constant_part() -> None:
-    closed = replace(loop(), target=np.zeros(N_Z))
+    closed = replace(loop(), cost=Cost(N_Z, N_A, T, state_weight=1.5, action_weight=0.4))
     theta = np.ones((N_A, N_S + 1))
     same = theta * np.append(np.ones(N_S), 0.0)
     np.testing.assert_array_equal(
@@ -171,7 +172,8 @@ def test_the_riccati_law_of_a_linear_plant_is_reached() -> None:
     target = np.array([0.5, -0.2, 0.3, 0.1])
     best = track(ReducedModel(A=A, B=B, U=np.eye(4)), state_weight=2.0, action_weight=0.1).policy
     model = LinearModel("linear", A, B, np.zeros(4))
-    closed = ClosedLoop(np.eye(4), target, 2.0, 0.1, 200, model=model)
+    cost = Cost(4, 2, 200, state_weight=2.0, action_weight=0.1, target=target)
+    closed = ClosedLoop(np.eye(4), cost, model=model)
     start, weights = rng.normal(size=(6, 4)), np.full(6, 1 / 6)
     steady = ModelBasedSettings(iterations=200, least_gain=1e-10)
     riccati = closed.theta(best)
@@ -208,16 +210,12 @@ def test_units_of_actions_and_states_do_not_change_an_improvement() -> None:
     """A plant in other units takes the same steps: x has none."""
     closed, start = loop(), fields(3)
     scale, size = 100.0, 1e-3
-    other = replace(
-        closed,
-        model=LinearModel("linear", 0.5 * np.eye(N_Z), bent().B, np.zeros(N_Z)),
-    )
-    scaled = replace(
-        other,
-        model=LinearModel("linear", 0.5 * np.eye(N_Z), bent().B * scale / size, np.zeros(N_Z)),
-        target=scale * other.target,
-        state_weight=other.state_weight / scale**2,
-        action_weight=other.action_weight / size**2,
+    q, r = closed.cost.size
+    weights = {"state_weight": q / scale**2, "action_weight": r / size**2}
+    cost = Cost(N_Z, N_A, T, **weights, target=scale * closed.target)
+    other, scaled = (
+        replace(closed, cost=own, model=LinearModel("linear", 0.5 * np.eye(N_Z), B, np.zeros(N_Z)))
+        for own, B in ((closed.cost, bent().B), (cost, bent().B * scale / size))
     )
     settings = ModelBasedSettings(iterations=4, least_gain=0.0)
     weights, G = np.full(3, 1 / 3), np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -238,7 +236,7 @@ def test_the_unit_of_one_action_does_not_change_an_improvement() -> None:
         Q, R = np.array([2.0, 1.0, 0.0, 0.5]), np.diag([0.4, 0.1]) * own**2
         cost = Cost(4, 2, T, state_weight=Q, action_weight=R)
         model = LinearModel("linear", A, B * own, np.zeros(4))
-        closed = ClosedLoop(np.eye(4), np.zeros(4), *cost.size, T, model=model, cost=cost)
+        closed = ClosedLoop(np.eye(4), cost, model=model)
         curvature = curvature_of(closed)
         start = np.random.default_rng(4).normal(size=(6, 4))
         law = improve(closed, np.zeros((2, 5)), start, np.full(6, 1 / 6), curvature, settings)
@@ -328,7 +326,8 @@ def test_a_law_that_asks_for_more_than_there_is_everywhere_is_improved() -> None
     A, B = 0.8 * np.eye(3), np.eye(3)[:, :2]
     model = LinearModel("linear", A, B, np.zeros(3))
     target = np.array([5.0, 5.0, 0.0])
-    closed = ClosedLoop(np.eye(3), target, 1.0, 1e-3, T, ActionSet(2, 0.0, 3.0), model=model)
+    cost = Cost(3, 2, T, action_weight=1e-3, target=target)
+    closed = ClosedLoop(np.eye(3), cost, ActionSet(2, 0.0, 3.0), model=model)
     first = np.column_stack([-0.1 * np.eye(2, 3), np.full(2, 40.0)])
     measured = np.random.default_rng(4).normal(size=(6, 3))
     assert (closed.simulate(first, measured).actions == 3.0).all()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.renewal import (
@@ -33,7 +34,7 @@ class Logistic:
 
 @pytest.mark.parametrize(("r", "chaotic"), [(3.9, True), (2.5, False)])
 def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) -> None:
-    loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(r))  # type: ignore[arg-type]
+    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(r))  # type: ignore[arg-type]
     fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
     assert is_chaotic(loop, fields) == chaotic
     assert not is_chaotic(loop, fields[:1])  # one field tells nothing
@@ -47,14 +48,14 @@ class Decaying(Logistic):
 
 
 def test_a_linear_plant_is_never_chaotic_however_far_its_fields_are_from_each_other() -> None:
-    loop = ClosedLoop(np.eye(N_Z, 3), np.zeros(N_Z), 1.0, 1.0, 40, model=Decaying(1.1))  # type: ignore[arg-type]
+    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Decaying(1.1))  # type: ignore[arg-type]
     field = np.random.default_rng(0).normal(size=N_Z)
     assert not is_chaotic(loop, np.array([field, -field]))
 
 
 def test_fields_from_which_the_plant_diverges_say_nothing() -> None:
     """z' = 3.9 z (1 - z) tends to minus infinity from outside of 0 .. 1."""
-    loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(3.9))  # type: ignore[arg-type]
+    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(3.9))  # type: ignore[arg-type]
     assert not is_chaotic(loop, np.full((2, N_Z), 3.0))
 
 
@@ -70,11 +71,11 @@ class Falling:
 
 def test_states_of_a_plant_that_runs_away_do_not_serve_as_initial_fields() -> None:
     near = np.random.default_rng(0).uniform(0.006, 0.012, (4, N_Z))
-    falls = ClosedLoop(np.eye(N_Z, 3), np.zeros(N_Z), 1.0, 1.0, 40, model=Falling())  # type: ignore[arg-type]
+    falls = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Falling())  # type: ignore[arg-type]
     none = falls.no_control
     assert is_chaotic(falls, near)
     assert not any_state_serves(falls, none, near, np.concatenate([near, 30.0 * near]))
-    stays = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(3.9))  # type: ignore[arg-type]
+    stays = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(3.9))  # type: ignore[arg-type]
     fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
     states = 3.9 * fields * (1.0 - fields)
     assert any_state_serves(stays, stays.no_control, fields, states)

@@ -33,6 +33,7 @@ PLANT = LinearModel(
 )
 K_a, K_b = 0.3 * RNG.standard_normal((2, N_A, N))
 TARGET = RNG.standard_normal(N_Z)
+COST = Cost(N_Z, N_A, T, action_weight=0.5, target=TARGET)
 ROWS = ModelRows(
     A=U.T @ PLANT.A @ U,
     B=U.T @ PLANT.B,
@@ -49,13 +50,14 @@ WEIGHTS = np.array([0.1, 0.4, 0.3, 0.2])
 def loop_of(rows: ModelRows = ROWS, **others: object) -> LinearLoop:
     law = Observer(rows, T)
     given = {
+        "cost": COST,
         "model": PLANT,
         "law": law,
         "noise": 0.2,
         "action_set": ActionSet(limit=LIMIT),
         **others,
     }
-    return LinearLoop(rows.U, TARGET, 1.0, 0.5, T, **given)
+    return LinearLoop(rows.U, **given)
 
 
 def some(loop: LinearLoop) -> np.ndarray:
@@ -89,7 +91,7 @@ def test_it_is_the_law_that_answers_with_its_memory_and_saturation() -> None:
 @pytest.mark.parametrize("any_cost", [False, True])
 def test_the_gradient_agrees_with_differences(limit: float, any_cost: bool) -> None:
     cost = Cost(N_Z, N_A, T, state_weight=2.0, action_target=0.1, terminal_weight=3.0)
-    loop = loop_of(action_set=ActionSet(limit=limit), cost=cost if any_cost else None)
+    loop = loop_of(action_set=ActionSet(limit=limit), cost=cost if any_cost else COST)
     theta = some(loop)
     value, gradient = loop.gradient(theta, FIELDS, WEIGHTS)
     assert value == pytest.approx(WEIGHTS @ loop.costs(theta, FIELDS))
@@ -102,7 +104,7 @@ def test_the_gradient_agrees_with_differences(limit: float, any_cost: bool) -> N
 def test_without_a_filter_it_is_the_loop_of_the_affine_law() -> None:
     rows = ModelRows(ROWS.A, ROWS.B, U, K_a, K_b, ROWS.s_r)
     loop = loop_of(rows, noise=0.0, action_set=ActionSet(limit=0.0))
-    affine = ClosedLoop(U, TARGET, 1.0, 0.5, T, model=PLANT)
+    affine = ClosedLoop(U, COST, model=PLANT)
     np.testing.assert_allclose(
         loop.costs(loop.theta(loop.law.theta_start), FIELDS),
         affine.costs(affine.theta(rows.policy), FIELDS),
@@ -116,9 +118,9 @@ def test_where_few_numbers_are_seen_memory_wins_over_the_best_static_law() -> No
     fields, weights = RNG.standard_normal((24, N_Z)), np.full(24, 1 / 24)
     settings = ModelBasedSettings(least_gain=1e-4, iterations=200)
     own = {"model": PLANT, "noise": 0.3}
-    static = ClosedLoop(one, TARGET, 1.0, 0.5, T, **own)
+    static = ClosedLoop(one, COST, **own)
     law = Observer(seen, T)
-    observed = LinearLoop(one, TARGET, 1.0, 0.5, T, **own, law=law)
+    observed = LinearLoop(one, COST, **own, law=law)
     begun = static.theta(seen.policy)
     best = improve(static, begun, fields, weights, curvature_of(static), settings)
     begun = observed.theta(law.theta_start)

@@ -152,12 +152,12 @@ def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others(
     target = np.full((1, N_Z), 0.3)
     model, a_r = own.model, np.zeros(N_A)
     A, B = model.linearise(target[0], a_r)
-    K, b = finite_horizon(A, B, model.step(target, a_r[None])[0] - target[0], 1.0, 0.5, T)
+    K, b = finite_horizon(A, B, model.step(target, a_r[None])[0] - target[0], cost, target[0])
     a, found = own.step(none, z, 0)
     np.testing.assert_allclose(a, (z - target) @ K.T + b, rtol=1e-6)
     assert not found.any()
     without = replace(own, terminal=False)
-    assert without.regulator is None
+    assert without.about is None
     assert np.array_equal(
         without.costs(none, z, 0), replace(affine, terminal=False).costs(none, z, 0)
     )

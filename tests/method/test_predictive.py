@@ -134,7 +134,7 @@ def test_theta_holds_which_law_a_plan_deviates_from() -> None:
     own = law()
     found = own.planner(own.parts(theta(own, regulated=True)))
     assert found.regulated and not own.planner(own.parts(theta(own))).regulated
-    assert own.is_extended(theta(own, regulated=True)) and found.regulator is not None
+    assert own.is_extended(theta(own, regulated=True)) and found.about is not None
 
 
 def test_plans_are_tried_around_the_law_of_the_whole_state_where_the_target_has_one() -> None:

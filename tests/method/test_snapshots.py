@@ -117,6 +117,7 @@ def test_a_cost_is_that_of_the_whole_states(given: dict[str, Any]) -> None:
     for _ in range(2):  # also after the basis has grown
         states, actions = states_of(4), RNG.standard_normal((4, N_A))
         basis.extend(states)
+        own.make()
         x, wanted, found = basis.coordinates(states), np.zeros(4), np.zeros(4)
         for k in range(T):
             whole.add(wanted, states, actions, k)

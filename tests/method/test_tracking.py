@@ -11,7 +11,7 @@ from scipy import linalg
 
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.design.lqt import finite_horizon, finite_horizon_of, track, track_horizon
+from pdeloop.method.design.lqt import finite_horizon, track, track_horizon
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
@@ -73,7 +73,7 @@ def test_far_from_its_end_a_long_horizon_has_the_stationary_law() -> None:
     np.testing.assert_allclose(gains.K_a, K[0], atol=1e-9)
     np.testing.assert_allclose(gains.K_b @ cost.field_target, b[0], atol=1e-9)
     point = RNG.standard_normal(N)
-    own_K, own_b = finite_horizon_of(A, B, (A - np.eye(N)) @ point, cost, point)
+    own_K, own_b = finite_horizon(A, B, (A - np.eye(N)) @ point, cost, point)
     np.testing.assert_allclose(own_K, K[0], atol=1e-9)
     np.testing.assert_allclose(own_b - own_K @ point, b[0], atol=1e-9)
 
@@ -87,18 +87,12 @@ def test_a_diagonal_of_equal_numbers_designs_the_law_of_the_number() -> None:
     diagonal = track(model, **weights, cost=cost)
     np.testing.assert_allclose(diagonal.K_a, number.K_a, atol=1e-10)
     np.testing.assert_allclose(diagonal.K_b @ target, number.K_b @ target, atol=1e-10)
-    for one, other in zip(
-        finite_horizon(A, B, DRIFT, 2.0, 0.3, T),
-        finite_horizon_of(A, B, DRIFT, cost, target),
-        strict=True,
-    ):
-        np.testing.assert_allclose(one, other, atol=1e-10)
 
 
 def test_the_gradient_of_a_closed_loop_is_that_of_its_cost() -> None:
     cost = Cost(N, N_A, T, **WHOLE)
     model = LinearModel("linear", 0.5 * A, B, DRIFT)
-    loop = ClosedLoop(np.eye(N), cost.field_target, 1.0, 1.0, T, model=model, cost=cost)
+    loop = ClosedLoop(np.eye(N), cost, model=model)
     theta, fields = RNG.standard_normal((N_A, N + 1)) / 4, RNG.standard_normal((3, N))
     weights, step = np.full(3, 1 / 3), 1e-6
     value, gradient = loop.gradient(theta, fields, weights)

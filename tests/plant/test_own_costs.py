@@ -15,7 +15,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
-from pdeloop.method.design.lqt import finite_horizon_of, track_horizon
+from pdeloop.method.design.lqt import finite_horizon, track_horizon
 from pdeloop.method.laws import FeedForward, Law, Observer
 from pdeloop.method.laws.registry import laws_of
 from tests.support.small import FEW_FITS
@@ -137,7 +137,7 @@ def test_a_training_designs_and_adapts_for_it() -> None:
     )
     plant, U = DynamicsPlant(Servo()), run.models[0].U
     z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target
-    K, b = finite_horizon_of(A, B, drift, plant.cost, z_r)
+    K, b = finite_horizon(A, B, drift, plant.cost, z_r)
     first, n_s = run.warm[0], U.shape[1]
     np.testing.assert_allclose(first[:, :n_s] @ U.T, K, atol=1e-6)
     np.testing.assert_allclose(first[:, n_s:] @ U.T @ z_r, b - K @ z_r, atol=1e-6)

@@ -216,6 +216,17 @@ class Context:
         return isinstance(self.law, Observer) and (self.sensors > 0 or not self.U.any(axis=0).all())
 
     @cached_property
+    def stage(self) -> Cost:
+        """The cost, whatever says it."""
+        return self.cost or self.plain(self.target)
+
+    def plain(self, target: Array, q: float | None = None) -> Cost:
+        """q |x - x_r|^2 + r |a|^2, with x_r the target, and q that of the state if not given."""
+        q, r = self.state_weight if q is None else q, self.action_weight
+        given = {"state_weight": q, "action_weight": r, "target": target}
+        return Cost(len(target), self.exploration.actions.shape[1], self.horizon, **given)
+
+    @cached_property
     def largest(self) -> float:
         """The largest magnitude of a number of the states that were explored."""
         return max(float(np.abs(own.states).max()) for own in self.every_exploration)

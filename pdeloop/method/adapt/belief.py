@@ -67,19 +67,17 @@ class Belief:
 
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""
-        U, target, q, r = context.U, context.target, context.state_weight, context.action_weight
-        given = q, r, context.horizon, context.action_set
-        on: dict[str, Any] = {"model": self.model, "noise": context.noise, "cost": context.cost}
-        on["reach"] = FAR * context.largest
-        if isinstance(self.model, ReadingsModel):
+        allowed, model = context.action_set, self.model
+        if isinstance(model, ReadingsModel):
             assert isinstance(context.law, Observer)
-            seen = self.model.U.T
-            cost = context.cost and context.cost.through(self.model.U @ self.model.C)
-            own: dict[str, Any] = {"model": self.model, "law": context.law, "cost": cost}
-            return ReplayedLoop(seen @ U, seen @ target, *given, **own)
-        if isinstance(self.model, SensedModel):
-            return sensed_loop(context, self.model)
-        law, problem = context.with_constants, (U, target, *given)
+            cost = context.cost and context.cost.through(model.U)
+            cost = cost or context.plain(model.U.T @ context.target)
+            return ReplayedLoop(model.U.T @ context.U, cost, allowed, model=model, law=context.law)
+        if isinstance(model, SensedModel):
+            return sensed_loop(context, model)
+        on: dict[str, Any] = {"model": model, "noise": context.noise}
+        on["reach"] = FAR * context.largest
+        law, problem = context.with_constants, (context.U, context.stage, allowed)
         return LinearLoop(*problem, **on, law=law) if law else ClosedLoop(*problem, **on)
 
 

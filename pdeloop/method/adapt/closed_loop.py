@@ -37,36 +37,38 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
-from pdeloop.method.design.lqt import DesignError, finite_horizon_of, track_outputs
+from pdeloop.method.design.lqt import DesignError, Regulator, regulator, track_outputs
 from pdeloop.method.laws.linear import Linear
 from pdeloop.method.models import FieldModel
 from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
-
-LARGEST = 512
-"""Numbers of a state up to which Riccati equations are solved, with work of its third power."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """A model of the plant under laws a = K_a U^T z + b, and their cost on it.
 
-    The other arguments are those of a `Context`; noise: on every number of the state that the law sees,
-    the same in every simulation of as many fields; reach: magnitude of a state beyond which a
-    simulation counts as not finite. A derived class says how a law remembers, or what of a model's
-    state is seen.
+    cost: of the outputs; noise: on every number of the state that the law sees, the same in every
+    simulation of as many fields; reach: magnitude of a state beyond which a simulation counts as not
+    finite. A derived class says how a law remembers, or what of a model's state is seen.
     """
 
     U: Array
-    target: Array
-    state_weight: float
-    action_weight: float
-    horizon: int
+    cost: Cost
     action_set: ActionSet = ANY_ACTION
     model: FieldModel = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
-    cost: Cost | None = field(default=None, kw_only=True)
     reach: float = field(default=np.inf, kw_only=True)
+
+    @property
+    def target(self) -> Array:
+        """z_r."""
+        return self.cost.field_target
+
+    @property
+    def horizon(self) -> int:
+        """T."""
+        return self.cost.horizon
 
     @cached_property
     def s_r(self) -> Array:
@@ -198,20 +200,6 @@ class ClosedLoop:
     def _sweep(self) -> Sweep:
         return sweep_of(self.model, self.action_set, self.horizon, self.memory_input)
 
-    @cached_property
-    def stage(self) -> Cost:
-        """The cost, of the outputs unless it is another one."""
-        if self.cost is not None:
-            return self.cost
-        return Cost(
-            len(self.target),
-            self.model.n_a,
-            self.horizon,
-            state_weight=self.state_weight,
-            action_weight=self.action_weight,
-            target=self.target,
-        )
-
     def _rolled(
         self, theta: Array, fields: Array, offsets: Array | None
     ) -> tuple[Array, Array, Array, Array, Array | None]:
@@ -237,19 +225,14 @@ class ClosedLoop:
     ) -> tuple[Array, Array, Array, Array]:
         """J of rows (M,), and its derivatives by [z; p] and a of each step, and by the last [z; p]."""
         n_z, T = self.model.n_z, self.horizon
-        z, cost = states[:, :-1, :n_z], self.stage
         on_states, eta = np.zeros(states[:, :-1].shape), np.zeros(states[:, -1].shape)
-        if self.cost is None:
-            outputs = self._outputs(z)
-            if self.readings is not None:
-                outputs = outputs + self._innovations(fields)
-            J, on_outputs, on_actions = cost.along(outputs, actions, 0)
-            on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
-        else:
-            J, on_z, on_actions = cost.along(z, actions, 0)
-            of_end, at_end = cost.at_end(states[:, -1, :n_z])
-            J, on_states[..., :n_z], eta[:, :n_z] = J + of_end, on_z / T, at_end / T
-        return J / T, on_states, on_actions / T, eta
+        outputs = self._outputs(states[..., :n_z])
+        seen = outputs[:, :-1] + self._innovations(fields) if self.readings else outputs[:, :-1]
+        J, on_outputs, on_actions = self.cost.along(seen, actions, 0)
+        of_end, at_end = self.cost.at_end(outputs[:, -1])
+        on_states[..., :n_z] = self._pull_outputs(on_outputs) / T
+        eta[:, :n_z] = self._pull_outputs(at_end) / T
+        return (J + of_end) / T, on_states, on_actions / T, eta
 
     def _features(self, states: Array, offsets: Array | None) -> Array:
         """[s; p] of each step, (M, T, n_s + n_p)."""
@@ -276,21 +259,17 @@ class ClosedLoop:
         changed[:n_a, n_f:] -= excess.T
         return changed
 
+    @cached_property
+    def regulator(self) -> Regulator | None:
+        """The linear-quadratic problem at the target; None where there is none, or of readings."""
+        return None if self.readings else regulator(self.model, self.cost)
+
     def designed(self) -> Array | None:
-        """The LQ-tracking law of the model linearised at the target; None where there is none."""
-        cost, model = self.stage, self.model
-        if len(self.memory_input) or model.n_z != len(self.U) or model.n_z > LARGEST:
+        """The law of the problem at the target; None where there is none."""
+        about = self.regulator
+        if about is None or len(self.memory_input) or self.model.n_z != len(self.U):
             return None
-        a, target = cost.action_target, self.target
-        with np.errstate(all="ignore"):
-            A, B = model.linearise(target, a)
-            drift = model.step(target[None], a[None])[0] - target - B @ a
-            try:
-                K, b = finite_horizon_of(A, B, drift, cost, target)
-            except (np.linalg.LinAlgError, ValueError):
-                return None
-        theta = np.hstack([K @ self.U, np.tile((b - K @ target)[:, None], self.constants)])
-        return theta if np.isfinite(theta).all() else None
+        return np.hstack([about.K @ self.U, np.tile(about.b[:, None], self.constants)])
 
     def calmer(self, theta: Array, share: float) -> Array:
         """The law with this share of the gains of its actions, and the same action at the target."""
@@ -455,10 +434,10 @@ class ReplayedLoop(LinearLoop):
 
     def curvature(self, own: Array) -> Array:
         """With R + B^T P B of the cost of the readings."""
-        model, seen = self.model, self.model.C if self.cost is None else np.eye(self.model.n_z)
+        model = self.model
         try:
-            P = track_outputs(model.A, model.B, seen, self.stage).P
-            own = self.stage.action_matrix + model.B.T @ P @ model.B
+            P = track_outputs(model.A, model.B, model.C, self.cost).P
+            own = self.cost.action_matrix + model.B.T @ P @ model.B
         except DesignError:
             pass
         return super().curvature(own)

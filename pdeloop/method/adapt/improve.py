@@ -23,10 +23,8 @@ import numpy as np
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.cost import Cost
-from pdeloop.method.adapt.closed_loop import LARGEST, ClosedLoop
+from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.design.lqt import action_curvature
 
 _MEMORY = 40
 """Gradient differences that L-BFGS keeps."""
@@ -162,17 +160,10 @@ def index_of_cheapest(costs: Array, weights: Array) -> int:
 
 def curvature_of(loop: ClosedLoop) -> Array:
     """R + B^T P B of the model linearised at the target; R where there is none."""
-    n_z, n_a, q, r = loop.model.n_z, loop.model.n_a, loop.state_weight, loop.action_weight
-    # Not the stage cost of the loop: a model of the field has a target of readings.
-    cost = loop.cost or Cost(n_z, n_a, loop.horizon, state_weight=q, action_weight=r)
-    if n_z <= LARGEST:
-        A, B = loop.model.linearise(loop.target, cost.action_target)
-        if np.isfinite(A).all() and np.isfinite(B).all():
-            try:
-                found = action_curvature(A, B, cost)
-            except np.linalg.LinAlgError:
-                found = np.full((n_a, n_a), np.nan)
-            found = 0.5 * (found + found.T)
-            if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
-                return loop.curvature(found)
-    return loop.curvature(cost.action_matrix)
+    R, about = loop.cost.action_matrix, loop.regulator
+    if about is not None:
+        found = R + about.B.T @ about.P[:-1, :-1] @ about.B
+        found = 0.5 * (found + found.T)
+        if np.linalg.eigvalsh(found)[0] > 0.0:
+            return loop.curvature(found)
+    return loop.curvature(R)

@@ -50,6 +50,7 @@ class InCoordinates(Optimizer):
             replace(record, states=self._seen(Trajectory(record.states, record.actions)).states)
             for record in context.measured
         ]
+        self._cost = context.cost and CostInCoordinates(context.cost, self.basis)
         law, U = context.with_constants, self.basis.coordinates(context.U.T).T
         own = replace(
             context,
@@ -61,7 +62,7 @@ class InCoordinates(Optimizer):
             periodic=False,
             line=False,
             shape=(),
-            cost=context.cost and CostInCoordinates(context.cost, self.basis),
+            cost=self._cost,
             law=law and type(law)(replace(law.model, U=U), law.horizon),
         )
         self._own = make(own)
@@ -83,12 +84,13 @@ class InCoordinates(Optimizer):
         return self._own.ask()
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
-        return self._own.tell(
-            [
-                replace(result, trajectory=result.trajectory and self._seen(result.trajectory))
-                for result in results
-            ]
-        )
+        seen = [
+            replace(result, trajectory=result.trajectory and self._seen(result.trajectory))
+            for result in results
+        ]
+        if self._cost:
+            self._cost.make()
+        return self._own.tell(seen)
 
     def state(self) -> State:
         return {_ROWS: self.basis.rows} | {
@@ -101,6 +103,8 @@ class InCoordinates(Optimizer):
         if len(rows) > CAPACITY:
             raise ValueError(f"'{_ROWS}' has {len(rows)} rows; expected at most {CAPACITY}")
         self.basis.rows = rows
+        if self._cost:
+            self._cost.make()
         self._own.restore(part_of(state, _OWN))
 
     def _seen(self, trajectory: Trajectory) -> Trajectory:
@@ -121,31 +125,33 @@ class CostInCoordinates(Cost):
     """
 
     def __init__(self, whole: Cost, basis: SnapshotBasis) -> None:
-        super().__init__(CAPACITY, whole.n_a, whole.horizon)
-        self._whole, self._basis, self._rows = whole, basis, 0
-        self._made: Cost = self
+        self._whole, self._basis, self._rows = whole, basis, np.empty((0, 0))
+        self.make()
+
+    def make(self) -> None:
+        """Make it for the present W."""
+        whole, rows = self._whole, self._basis.rows
+        if rows is self._rows:
+            return
+        self._rows, W = rows, rows.T
+        (R, aims), (last, aim) = (self._squares(W, terminal=terminal) for terminal in (False, True))
+        target = np.column_stack([aims, np.repeat(aim, len(aims), axis=0)])
+        super().__init__(
+            CAPACITY,
+            whole.n_a,
+            whole.horizon,
+            action_weight=whole.action_weight,
+            action_target=whole.action_target,
+            output=np.vstack([R, last]),
+            target=target[0] if whole.target.ndim == 1 else target,
+            state_weight=np.repeat([1.0, 0.0], [len(R), len(last)]),
+            terminal_weight=np.repeat([0.0, 1.0], [len(R), len(last)]),
+        )
+        self.field_target = self._basis.coordinates(whole.field_target[None])[0]
 
     @property
-    def _present(self) -> Cost:
-        """For the present W."""
-        whole, rows = self._whole, self._basis.rows
-        if len(rows) != self._rows:
-            (R, aims), (last, aim) = (
-                self._squares(rows.T, terminal=terminal) for terminal in (False, True)
-            )
-            self._made = Cost(
-                CAPACITY,
-                whole.n_a,
-                whole.horizon,
-                action_weight=whole.action_weight,
-                action_target=whole.action_target,
-                output=np.vstack([R, last]),
-                target=np.column_stack([aims, np.repeat(aim, whole.horizon, axis=0)]),
-                state_weight=np.repeat([1.0, 0.0], [len(R), len(last)]),
-                terminal_weight=np.repeat([0.0, 1.0], [len(R), len(last)]),
-            )
-            self._rows = len(rows)
-        return self._made
+    def state_weights(self) -> None:
+        """Models are judged by all coordinates alike."""
 
     def _squares(self, W: Array, *, terminal: bool) -> tuple[Array, Array]:
         """R, and its aims Q^T w_k as rows, both with one number more for what no x can reach."""
@@ -158,19 +164,6 @@ class CostInCoordinates(Cost):
         whole = np.zeros((len(R) + 1, CAPACITY))
         whole[: len(R), : W.shape[1]] = R
         return whole, np.column_stack([aims, beyond])
-
-    def add(self, totals: Array, states: Array, actions: Array, k: int) -> None:
-        """See `Cost`, as all that follows."""
-        self._present.add(totals, states, actions, k)
-
-    def add_terminal(self, totals: Array, states: Array) -> None:
-        self._present.add_terminal(totals, states)
-
-    def along(self, states: Array, actions: Array, first: int) -> tuple[Array, Array, Array]:
-        return self._present.along(states, actions, first)
-
-    def at_end(self, states: Array) -> tuple[Array, Array]:
-        return self._present.at_end(states)
 
 
 def is_large(context: Context) -> bool:

@@ -272,7 +272,7 @@ class ModelBasedPredictive(Optimizer):
     def _plain(self, belief: Belief, policy: Array, fields: Array) -> Planner:
         """Plans of one step around a law."""
         law, context, model = self._law, self._context, belief.model
-        cost, settings = belief.loop(context).stage, law.settings
+        cost, settings = belief.loop(context).cost, law.settings
         return Planner(
             model,
             cost,
@@ -386,7 +386,7 @@ class ModelBasedPredictive(Optimizer):
 
 def around(plain: Planner) -> list[Planner]:
     """Plans around the trained law, and around that of the whole state where the target has one."""
-    return [plain, *([replace(plain, regulated=True)] if plain.regulator else [])]
+    return [plain, *([replace(plain, regulated=True)] if plain.about else [])]
 
 
 def ways_of(plain: Planner) -> list[Planner]:

@@ -49,7 +49,7 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, Simulation
 from pdeloop.method.adapt.improve import curvature_of, improve
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.design.lqg import kalman_filter
-from pdeloop.method.design.lqt import DesignError, finite_horizon
+from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.plans import Act, Planner, simulated
@@ -131,7 +131,7 @@ class SensedLoop(LinearLoop):
         if known is None:
             states, actions = (np.zeros((self.horizon, count, n)) for n in (self.model.n_z, n_a))
             return Simulation(states, actions, np.full(count, np.inf), features)
-        plan = Planner(self.model, self.stage, allowed, K, b, around=False, steps=1, terminal=False)
+        plan = Planner(self.model, self.cost, allowed, K, b, around=False, steps=1, terminal=False)
         act = from_estimates(
             lambda x, before, k: allowed.project(x @ K.T + b, after=before), known, self.noise
         )
@@ -140,9 +140,7 @@ class SensedLoop(LinearLoop):
 
     def without_memory(self, U: Array, kind: type[ClosedLoop], noise: float = 0.0) -> ClosedLoop:
         """The same model under laws a = K U^T z + b."""
-        weights = self.state_weight, self.action_weight
-        given = U, self.target, *weights, self.horizon, self.action_set
-        return kind(*given, model=self.model, noise=noise)
+        return kind(U, self.cost, self.action_set, model=self.model, noise=noise)
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""
@@ -155,8 +153,9 @@ class SensedLoop(LinearLoop):
             return known[record]
         if not len(record.actions) or not np.isfinite(record.states).all():
             return interpolated(record.states[0]), np.inf
-        target, weight = self.target[model.seen], self.state_weight * (model.n_z // model.sensors)
-        of_cost = distance(record, weight, self.action_weight, self.horizon)
+        q, r = self.cost.size
+        of_cost = distance(record, q * (model.n_z // model.sensors), r, self.horizon)
+        target = self.target[model.seen]
         given = record.acted_from, record.actions, target, of_cost, self.settings
         known[record] = initial_field(model, *given)
         return known[record]
@@ -226,12 +225,10 @@ def sensed_from(
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
     """The model under laws with an observer of the readings."""
     assert isinstance(context.law, Observer)
+    target = interpolated(context.target)
     return SensedLoop(
         model.at_sensors(context.U),
-        interpolated(context.target),
-        context.state_weight * model.sensors / model.n_z,
-        context.action_weight,
-        context.horizon,
+        context.plain(target, context.state_weight * model.sensors / model.n_z),
         context.action_set,
         model=model,
         noise=model.noise,
@@ -281,12 +278,10 @@ def whole_field_law(
     loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings, modes: int
 ) -> WholeFieldLaw | None:
     """The best law of so many POD modes; None where none is finite."""
-    model, n = loop.model, loop.model.n_z
-    none = np.zeros(model.n_a)
-    A, B = model.linearise(loop.target, none)
-    drift = model.step(loop.target[None], none[None])[0] - loop.target
-    K, b = finite_horizon(A, B, drift, loop.state_weight, loop.action_weight, loop.horizon)
-    b = b - K @ loop.target
+    n, about = loop.model.n_z, loop.regulator
+    if about is None:
+        return None
+    K, b = about.K, about.b
     first = loop.without_memory(np.eye(n), ClosedLoop)
     simulation = first.simulate(np.column_stack([K, b]), fields)
     seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])

@@ -38,7 +38,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.lqt import finite_horizon, finite_horizon_of, target_gain
+from pdeloop.method.design.lqt import LARGEST, finite_horizon, target_gain
 from pdeloop.method.models import FieldModel, FieldModelSettings, FittedModel, Measured, affine_law
 from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
@@ -69,8 +69,6 @@ from pdeloop.process.one_thread import one_thread
 _FIELD_STEPS = 4096
 """Steps of a trajectory by which a model of the whole field is selected, and of the simulations by
 which laws are compared, at most."""
-_FIELD_LARGEST = 512
-"""Largest state for which a model of the whole field is fitted for the first law."""
 _FIELD_THINNING = 5
 """Interval between the simulated states that the basis is computed from."""
 _FIELD_ROOM = 2.0
@@ -187,7 +185,7 @@ def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> Fitt
     the data do is chosen again by that. The work grows with the third power of the size of the state,
     so there is a largest one.
     """
-    if len(selection.target) > _FIELD_LARGEST:
+    if len(selection.target) > LARGEST:
         return None
     known = [Measured(z, a) for z, a in trajectories]
     folds = selection.settings.folds
@@ -292,11 +290,7 @@ def field_law(
         return report
     horizon = max(len(actions) for _, actions in trajectories)
     try:
-        if cost.plain and point is target:
-            q, r = cost.size
-            K, b = finite_horizon(A, B, drift, q, r, horizon)
-        else:
-            K, b = finite_horizon_of(A, B, drift, cost, point)
+        K, b = finite_horizon(A, B, drift, cost, point)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
         return report
     if not (np.isfinite(K).all() and np.isfinite(b).all()):

@@ -28,8 +28,9 @@ const,
 backwards from P = E_T'E_T and p = E_T'w_T. b_k knows the targets that are still to come.
 
 `finite_horizon`, about a point that need not be an equilibrium, and with one target: the first step's
-law a = K e + b of the deviation e. The Riccati recursion of [e; 1] is doubled until it covers the
-horizon, rounded up to a power of two; it needs no stabilisable model.
+law a = K e + b of the deviation e; `regulator`, at the target of a model. The Riccati recursion of
+[e; 1] is doubled until it covers the horizon, rounded up to a power of two; it needs no stabilisable
+model.
 
 References
 ----------
@@ -52,9 +53,12 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.models.base import FieldModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.process.one_thread import one_thread
 
+LARGEST = 512
+"""Numbers of a state up to which Riccati equations are solved, with work of its third power."""
 _REACH = 1e-12
 """Effect of the inputs on a direction, relative to the largest, below which it is out of reach."""
 _RECIPROCAL_CONDITION = 1e-14
@@ -306,35 +310,30 @@ def _steady_state_map(closed_loop: Array) -> Array:
 
 
 def finite_horizon(
-    A: Array, B: Array, drift: Array, state_weight: float, action_weight: float, horizon: int
-) -> tuple[Array, Array]:
-    """K (n_a, n) and b (n_a,) of a = K e + b, optimal over a horizon, in its first step; drift: d (n,).
-
-    >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), 1.0, 1.0, 64)
-    >>> K.round(6), b
-    (array([[-0.618034]]), array([-0.]))
-    """
-    whole, inputs = _extended(A, B, drift)
-    Q = np.diag(np.append(np.full(len(A), state_weight), 0.0))
-    P = _doubled(whole, inputs @ inputs.T / action_weight, Q, horizon)
-    return _first_step(whole, inputs, P, action_weight * np.eye(B.shape[1]))
-
-
-def finite_horizon_of(
     A: Array, B: Array, drift: Array, cost: Cost, point: Array
 ) -> tuple[Array, Array]:
-    """The same law for any quadratic cost, of the deviation e = z - point; point is (n,).
+    """K (n_a, n) and b (n_a,) of a = K e + b, e = z - point, in the first step of the cost's horizon.
 
-    A target over time counts with its mean, and the terminal weight does not count.
+    drift: d (n,); point: (n,). A target over time counts with its mean; the terminal weight does not.
+
+    >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), Cost(1, 1, 64), np.zeros(1))
+    >>> K.round(6), b
+    (array([[-0.618034]]), array([0.]))
     """
-    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
     P = cost_to_go(A, B, drift, cost, point)
-    K, b = _first_step(whole, inputs, P, cost.action_matrix)
-    return K, b + cost.action_target
+    return _first_step(A, B, drift, cost, P)
+
+
+def _first_step(A: Array, B: Array, drift: Array, cost: Cost, P: Array) -> tuple[Array, Array]:
+    """The law of `finite_horizon` with its cost to go."""
+    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
+    S = cost.action_matrix + inputs.T @ P @ inputs
+    gains = -linalg.solve(S, inputs.T @ P @ whole, assume_a="pos")
+    return gains[:, :-1], gains[:, -1] + cost.action_target
 
 
 def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Array:
-    """P (n + 1, n + 1) of the least cost [e; 1]^T P [e; 1] of the horizon, for `finite_horizon_of`."""
+    """P (n + 1, n + 1) of the least cost [e; 1]^T P [e; 1] of the horizon, for `finite_horizon`."""
     whole, inputs = _extended(A, B, drift + B @ cost.action_target)
     E = cost.residual(np.eye(len(A)))
     offset = E @ point - cost.residual_target().mean(axis=0)
@@ -343,16 +342,34 @@ def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Ar
     return _doubled(whole, G, rows.T @ rows, cost.horizon)
 
 
-def action_curvature(A: Array, B: Array, cost: Cost) -> Array:
-    """R + B^T P B (n_a, n_a): the cost of a deviation from the optimal action, to second order.
+class Regulator(NamedTuple):
+    """The problem of a horizon about the target z_r of a model.
 
-    >>> action_curvature(np.eye(1), np.eye(1), Cost(1, 1, 64)).round(6)
-    array([[2.618034]])
+    B (n, n_a): of the model there; P (n + 1, n + 1): the cost to go is [z - z_r; 1]^T P [z - z_r; 1]; K
+    (n_a, n), b (n_a,): the law a = K z + b.
     """
-    n = len(A)
-    P = cost_to_go(A, B, np.zeros(n), cost, np.zeros(n))[:n, :n]
-    curvature: Array = cost.action_matrix + B.T @ P @ B
-    return curvature
+
+    B: Array
+    P: Array
+    K: Array
+    b: Array
+
+
+def regulator(model: FieldModel, cost: Cost) -> Regulator | None:
+    """That of a model and a cost of its states; None where it has no finite one, or is too large."""
+    point, a = cost.field_target, cost.action_target
+    if model.n_z > LARGEST:
+        return None
+    with np.errstate(all="ignore"):
+        A, B = model.linearise(point, a)
+        drift = model.step(point[None], a[None])[0] - point - B @ a
+        try:
+            P = cost_to_go(A, B, drift, cost, point)
+            K, b = _first_step(A, B, drift, cost, P)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+    known = np.isfinite(P).all() and np.isfinite(K).all() and np.isfinite(b).all()
+    return Regulator(B, P, K, b - K @ point) if known else None
 
 
 def _extended(A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
@@ -360,12 +377,6 @@ def _extended(A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
     n, n_a = B.shape
     whole = np.block([[A, drift[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
     return whole, np.vstack([B, np.zeros((1, n_a))])
-
-
-def _first_step(whole: Array, inputs: Array, P: Array, R: Array) -> tuple[Array, Array]:
-    """K and b of the first step of the horizon whose cost to go is P."""
-    gains = -linalg.solve(R + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos")
-    return gains[:, :-1], gains[:, -1]
 
 
 def _doubled(whole: Array, G: Array, P: Array, horizon: int) -> Array:

@@ -42,7 +42,7 @@ from scipy import linalg
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import cost_to_go, finite_horizon_of
+from pdeloop.method.design.lqt import Regulator, regulator
 from pdeloop.method.laws.linear import at_step
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
@@ -58,8 +58,6 @@ BEFORE = 15
 """Iterations after which the best of several starts goes on alone."""
 FLAT = 1e-6
 """Share of its cost that an iteration has to gain, or a plan counts as found."""
-LARGEST = 512
-"""Numbers of a state up to which V is worked out; its work grows with their third power."""
 _CLOSE = 1e-9
 """Relative distance at which an action counts as the one that was requested."""
 Flags = NDArray[np.bool_]
@@ -169,7 +167,7 @@ class Planner:
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
         given, K, b = self._given(v, k, *self._feedback)
-        self._to_go  # noqa: B018 - works with the model, which one thread may use at a time
+        self.about  # noqa: B018 - works with the model, which one thread may use at a time
 
         def work(sweep: Sweep, rows: slice) -> None:
             with np.errstate(all="ignore"):
@@ -294,50 +292,27 @@ class Planner:
         """K and b of the law that a plan deviates from."""
         if not self.around:
             return np.zeros_like(self.K), np.zeros_like(self.b)
-        return (self.regulated and self.regulator) or (self.K, self.b)
+        about = self.about if self.regulated else None
+        return (self.K, self.b) if about is None else (about.K, about.b)
 
     @cached_property
-    def regulator(self) -> tuple[Array, Array] | None:
-        """K and b of the linear-quadratic law of the whole state; None without V."""
-        if self._to_go is None:
+    def about(self) -> Regulator | None:
+        """The linear-quadratic problem at the target, with V and a law; None without V."""
+        found = regulator(self.model, self.cost) if self.terminal else None
+        if found is None:
             return None
-        point, A, B, drift = self._at_target
-        K, b = finite_horizon_of(A, B, drift, self.cost, point)
-        known = bool(np.isfinite(K).all() and np.isfinite(b).all())
-        return (np.ascontiguousarray(K), b - K @ point) if known else None
+        return found._replace(P=0.5 * (found.P + found.P.T), K=np.ascontiguousarray(found.K))
 
     @cached_property
     def _sweep(self) -> Sweep:
         return sweep_of(self.model, self.action_set, min(self.steps, self.cost.horizon))
 
     @cached_property
-    def _to_go(self) -> Array | None:
-        """P of [z - z_r; 1]^T P [z - z_r; 1], the cost to go; None where there is none."""
-        if not self.terminal or self.model.n_z > LARGEST:
-            return None
-        with np.errstate(all="ignore"):
-            try:
-                point, A, B, drift = self._at_target
-                P = cost_to_go(A, B, drift, self.cost, point)
-            except (np.linalg.LinAlgError, ValueError):
-                return None
-        return 0.5 * (P + P.T) if np.isfinite(P).all() else None
-
-    @cached_property
-    def _at_target(self) -> tuple[Array, Array, Array, Array]:
-        """The target, and A, B and d of e_{k+1} = A e_k + B a_k + d about it."""
-        point, a_r = self.cost.field_target, self.cost.action_target
-        A, B = self.model.linearise(point, a_r)
-        drift = self.model.step(point[None], a_r[None])[0] - point
-        return point, A, B, drift - B @ a_r
-
-    @cached_property
     def _metric(self) -> Array:
         """(R + B^T P B)^-1, or R^-1 where there is no cost to go."""
         R = self.cost.action_matrix
-        if self._to_go is not None:
-            _, _, B, _ = self._at_target
-            R = R + B.T @ self._to_go[:-1, :-1] @ B
+        if self.about is not None:
+            R = R + self.about.B.T @ self.about.P[:-1, :-1] @ self.about.B
         found: Array = linalg.inv(0.5 * (R + R.T))
         return found
 
@@ -345,10 +320,10 @@ class Planner:
         """V (M,) of states (M, n_z) at step k, and dV/dz."""
         if k == self.cost.horizon:
             return self.cost.at_end(z)
-        if self._to_go is None:
+        if self.about is None:
             return np.zeros(len(z)), np.zeros_like(z)
         e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
-        on_e = np.einsum("mi,ij->mj", e, self._to_go)
+        on_e = np.einsum("mi,ij->mj", e, self.about.P)
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
 
 
