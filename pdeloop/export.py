@@ -20,9 +20,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.laws import Law
-from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.linear import FeedForward, Observer
+from pdeloop.method.laws.linear import Extended, FeedForward, Observer
 from pdeloop.method.laws.neural import Neural
 
 CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")

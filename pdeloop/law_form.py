@@ -21,9 +21,8 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.spec import ParameterError
-from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
-from pdeloop.method.laws.linear import Observer
+from pdeloop.method.laws.linear import Extended, Observer
 from pdeloop.method.laws.neural import Neural
 
 

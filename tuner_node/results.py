@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.topics import COMPLETED
 from pdeloop.method.laws import Affine
-from pdeloop.method.laws.extended import Extended
+from pdeloop.method.laws.linear import Extended
 from pdeloop.method.models.noise import contradicting_noise, rows_of, share_of_noise
 from pdeloop.method.models.selection import PREDICTED
 from tuner_node.batch import stacked

@@ -68,7 +68,7 @@ def test_nothing_but_the_registry_names_a_law() -> None:
         if re.search(r"\bFeedForward\b", path.read_text())
     }
     own = {f"pdeloop/method/laws/{name}.py" for name in ("__init__", "linear")}
-    own |= {"pdeloop/method/laws/extended.py"}  # laws that begin as it
+    own |= {"pdeloop/method/laws/linear.py"}  # laws that begin as it
     own |= {"pdeloop/export.py"}  # its form in C
     assert named - own <= {*TABLE["a law"]}
 

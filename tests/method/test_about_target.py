@@ -16,7 +16,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import ModelBased, verdict
 from pdeloop.method.adapt.base import Context, Record, Rollout, RolloutResult, Trajectory
-from pdeloop.method.adapt.progress import JUDGING
+from pdeloop.method.adapt.model_based import JUDGING
 from pdeloop.method.adapt.replay import best_on_same_fields, designed_again, law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel

@@ -30,8 +30,7 @@ from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.estimate import Estimate, mean_of
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
-from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.progress import JUDGING, RENEWING
+from pdeloop.method.adapt.model_based import JUDGING, RENEWING, ModelBased
 from pdeloop.method.adapt.renewal import mixtures, weighted
 from pdeloop.method.adapt.replay import FEWEST, best_measured, costs_by_field, step
 from pdeloop.method.adapt.sensed_loop import (

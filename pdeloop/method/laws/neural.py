@@ -11,8 +11,7 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Parts
-from pdeloop.method.laws.extended import Extended
-from pdeloop.method.laws.linear import at_step
+from pdeloop.method.laws.linear import Extended, at_step
 from pdeloop.method.settings import Settings, setting
 
 MOST_NEURONS = 512

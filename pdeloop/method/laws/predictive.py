@@ -18,8 +18,8 @@ from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.base import Law, Parts
-from pdeloop.method.laws.extended import Extended
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
+from pdeloop.method.laws.linear import Extended
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import Arrays, FieldModel
 from pdeloop.method.models.files import model_of, packed, unpacked
