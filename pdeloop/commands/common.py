@@ -168,16 +168,16 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
 
 def _optimizers(prefix: str, **_: object) -> list[str]:
     """The names of the optimisers, for the completion of the shells."""
-    from pdeloop.method.adapt.registry import offered
+    from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 
-    return offered()
+    return OWN_OPTIMIZERS.offered()
 
 
 def _laws(prefix: str, **_: object) -> list[str]:
     """The names of the laws, for the completion of the shells."""
-    from pdeloop.method.laws.registry import offered
+    from pdeloop.method.laws.registry import OWN_LAWS
 
-    return offered()
+    return OWN_LAWS.offered()
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:

@@ -107,6 +107,28 @@ class OwnCode:
                 f"nodes and workers {self.variable}={quoted} in the environment"
             )
 
+    def offered(self) -> list[str]:
+        """The names of what is installed, ours first."""
+        from importlib.metadata import entry_points  # a tenth of a short command's time
+
+        others = {entry.name for entry in entry_points(group=self.group)} - set(self.shipped)
+        return [*self.shipped, *sorted(others)]
+
+    def complete(
+        self, name: str, found: object, base: type = object, members: Sequence[str] = ()
+    ) -> type:
+        """What was found, if it is a class of this base that defines all of it; else ValueError."""
+        kind, api = getattr(found, "__name__", repr(found)), f"pdeloop.{self.word.capitalize()}"
+        if not (isinstance(found, type) and issubclass(found, base)):
+            derived = "" if base is object else f" derived from {api}"
+            raise ValueError(f"{self.word} {name!r}: {kind} must be a class{derived}")
+        missing = [own for own in members if not hasattr(found, own)]
+        missing += sorted(getattr(found, "__abstractmethods__", ()))
+        if missing:
+            what = ", ".join(missing)
+            raise ValueError(f"{self.word} {name!r}: {kind} does not define {what}; see {api}")
+        return found
+
     def load(self, name: str) -> Any:
         """The object that a name stands for. This executes code, whatever its origin.
 
@@ -138,19 +160,16 @@ class OwnCode:
 
     def _load_entry_point(self, name: str) -> Any:
         """Load the entry point of that name."""
-        from importlib.metadata import EntryPoint, entry_points  # a tenth of a short command's time
+        from importlib.metadata import entry_points  # a tenth of a short command's time
 
-        offered: dict[str, list[EntryPoint]] = {}
-        for entry in entry_points(group=self.group):
-            offered.setdefault(entry.name, []).append(entry)
-        found = {entry.value: entry for entry in offered.get(name, [])}
+        found = {entry.value: entry for entry in entry_points(group=self.group, name=name)}
         if not found and name.endswith(".py"):
             whole = shown(f"{name}:ClassName")
             raise ValueError(
                 f"{self.word} {shown(name)} is a file; name the class in it as well, as {whole}"
             )
         if not found:
-            known = [*self.shipped, *sorted(set(offered) - set(self.shipped))]
+            known = self.offered()
             one_of = f"one of {', '.join(known)}, or " if known else ""
             raise ValueError(
                 f"unknown {self.word} {shown(name)}: give {one_of}"

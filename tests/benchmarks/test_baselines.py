@@ -44,7 +44,7 @@ from pde_sim_node.plants.batch import BatchPlant
 from pdeloop import cli
 from pdeloop.episode import projected_law, rollout
 from pdeloop.finished_run import interval
-from pdeloop.method.adapt.registry import offered
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.method.design import lqt
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.study import Study, StudyError
@@ -127,10 +127,10 @@ def test_a_variant_is_of_the_optimizer_that_it_is_named_after(file: Path) -> Non
     content = yaml.safe_load(file.read_text())
     for label, table in content["variants"].items():
         chosen = {**content["settings"], **table}["optimizer"]
-        if (name := label.replace("-", "_")) in offered():
+        if (name := label.replace("-", "_")) in OWN_OPTIMIZERS.offered():
             assert chosen == name
         else:
-            assert chosen in offered()
+            assert chosen in OWN_OPTIMIZERS.offered()
 
 
 def test_the_splits_are_disjoint() -> None:

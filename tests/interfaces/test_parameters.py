@@ -21,7 +21,7 @@ from pdeloop.messages.parameters import NODES, table, taken_by, with_names
 from pdeloop.messages.problem import completed, find_problem, load_parameters, shipped_problems
 from pdeloop.messages.spec import ParameterError as Refused
 from pdeloop.messages.spec import Spec, check_names
-from pdeloop.method.adapt.registry import offered
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.ros.parameters import descriptor
 from tests.support.small import parameters
 from tuner_node.optimizer_parameters import setting_specs
@@ -358,7 +358,11 @@ def test_code_of_a_relative_file_is_the_same_for_a_command_and_a_node(
 
 def every_spec() -> list[Spec]:
     """Parameters of all nodes, of all equations, and the settings of all methods."""
-    of_methods = [spec for name in offered() for spec in setting_specs(parameters(optimizer=name))]
+    of_methods = [
+        spec
+        for name in OWN_OPTIMIZERS.offered()
+        for spec in setting_specs(parameters(optimizer=name))
+    ]
     of_equations = [spec for name in EQUATIONS for spec in physical_specs(name)]
     return [*table(), *of_methods, *of_equations]
 

@@ -22,7 +22,6 @@ from pdeloop.method.laws.registry import (
     along,
     law_kind,
     laws_of,
-    offered,
     updated,
 )
 
@@ -203,7 +202,7 @@ def test_a_law_that_cannot_be_used_is_refused_in_one_sentence(members, words) ->
 
 def test_the_registry_knows_ours_and_refuses_what_is_no_law(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv(OWN_LAWS.variable, "")
-    assert offered()[: len(SHIPPED)] == [kind.name for kind in SHIPPED]
+    assert OWN_LAWS.offered()[: len(SHIPPED)] == [kind.name for kind in SHIPPED]
     assert [law_kind(kind.name) for kind in SHIPPED] == SHIPPED
     assert OWN_LAWS.take(Affine) == "affine"
     with pytest.raises(ValueError, match="unknown law 'afine': give one of affine, feedforward"):
@@ -226,5 +225,5 @@ def test_an_installed_package_offers_its_laws_by_name(monkeypatch, tmp_path) -> 
     entries = ["[pdeloop.laws]", "tanh = packaged_law:Tanh", "affine = packaged_law:Tanh"]
     (about / "entry_points.txt").write_text("\n".join(entries))
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert law_kind("tanh").name == "tanh" and "tanh" in offered()
+    assert law_kind("tanh").name == "tanh" and "tanh" in OWN_LAWS.offered()
     assert law_kind("affine") is Affine, "no package takes a name of ours"

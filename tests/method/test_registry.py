@@ -12,7 +12,7 @@ import pytest
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased, Optimizer, TwoPoint
-from pdeloop.method.adapt.registry import offered, optimizer_kind
+from pdeloop.method.adapt.registry import OWN_OPTIMIZERS, optimizer_kind
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.settings import Settings, setting
 from pdeloop.problem_values import problem_values
@@ -66,7 +66,7 @@ def test_ours_are_offered_as_those_of_others_are() -> None:
 def test_an_installed_package_offers_its_optimisers_by_name(installed: Path) -> None:
     assert optimizer_kind("halved").name == "halved"
     assert optimizer_kind("two_point") is TwoPoint, "no package takes a name of ours"
-    assert {"halved", "two_point", "model_based"} <= set(offered())
+    assert {"halved", "two_point", "model_based"} <= set(OWN_OPTIMIZERS.offered())
     offer(installed, "second", "halved = foreign:Whole")
     with pytest.raises(ValueError, match="'halved' is offered by several installed packages"):
         optimizer_kind("halved")

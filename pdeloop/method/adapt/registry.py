@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, distribution, entry_points
+from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,11 @@ GROUP = "pdeloop.optimizers"
 """The group of entry points by which an installed package offers optimisers."""
 
 
+_MEMBERS = (
+    *("ask", "tell", "state", "restore", "policy", "tells", "done", "first_step", "Settings"),
+    *("name", "needs_trajectories", "iteration_rollouts", "preferences"),
+)
+"""What a class has to define."""
 _REMOVED = {"gauss_newton": "was removed: use model_based, or two_point"}
 """Optimisers of earlier versions, and what to use in their place."""
 
@@ -37,11 +42,6 @@ def _ours() -> dict[str, type[Optimizer]]:
 
 
 OWN_OPTIMIZERS = OwnCode("optimizer", "PDELOOP_OPTIMIZERS", _ours())
-
-
-def offered() -> list[str]:
-    """The names of the installed optimisers, including ours."""
-    return sorted({entry.name for entry in entry_points(group=GROUP)} - set(_REMOVED))
 
 
 def optimizer_kind(name: str) -> type[Optimizer]:
@@ -59,26 +59,8 @@ def optimizer_kind(name: str) -> type[Optimizer]:
             f"optimizer {name!r}: the entry points of pdeloop are out of date, as not even its own "
             "optimizers are found; install pdeloop again"
         )
-    return complete(name, OWN_OPTIMIZERS.configured(name))
-
-
-_MEMBERS = ("ask", "tell", "state", "restore", "policy", "tells", "done", "first_step", "Settings")
-_DECLARED = ("name", "needs_trajectories", "iteration_rollouts", "preferences")
-
-
-def complete(name: str, found: object) -> type[Optimizer]:
-    """Return the class that was found if it is a complete optimiser; else a ValueError."""
-    kind = getattr(found, "__name__", repr(found))
-    if not isinstance(found, type):
-        raise ValueError(f"optimizer {name!r}: {kind} must be a class")
-    missing = [item for item in (*_MEMBERS, *_DECLARED) if not hasattr(found, item)]
-    missing += sorted(getattr(found, "__abstractmethods__", ()))
-    if missing:
-        raise ValueError(
-            f"optimizer {name!r}: {kind} does not define {', '.join(missing)}; see "
-            "pdeloop.Optimizer"
-        )
-    return found
+    found = OWN_OPTIMIZERS.configured(name)
+    return OWN_OPTIMIZERS.complete(name, found, members=_MEMBERS)
 
 
 _COUNTED = ("cost", "rollouts", "diverged")

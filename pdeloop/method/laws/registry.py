@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
-from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -49,12 +48,6 @@ OWN_LAWS = OwnCode(
 )
 
 
-def offered() -> list[str]:
-    """The names of the installed laws, ours first."""
-    others = {entry.name for entry in entry_points(group=OWN_LAWS.group)} - set(OWN_LAWS.shipped)
-    return [*OWN_LAWS.shipped, *sorted(others)]
-
-
 def law_kind(name: str, values: Mapping[str, Any] = MappingProxyType({})) -> type[Law]:
     """The class of the law of that name, with the settings that parameters give it.
 
@@ -68,25 +61,12 @@ def law_kind(name: str, values: Mapping[str, Any] = MappingProxyType({})) -> typ
         A setting that it does not have, or out of its range.
     """
     OWN_LAWS.require(name)
-    kind = complete(name, OWN_LAWS.load(name))
+    kind: type[Law] = OWN_LAWS.complete(name, OWN_LAWS.load(name), Law)
     chosen = settings_from(LAW_SETTINGS, kind.Settings, values, f"law '{name}'")
     if chosen == kind.settings:
         return kind
     own = {"settings": chosen, "name": kind.name, "__module__": kind.__module__}
     return type(kind.__name__, (kind,), own)
-
-
-def complete(name: str, found: object) -> type[Law]:
-    """Return the class that was found if it is a complete law; else a ValueError."""
-    called = getattr(found, "__name__", repr(found))
-    if not (isinstance(found, type) and issubclass(found, Law)):
-        raise ValueError(f"law {name!r}: {called} must be a class derived from pdeloop.Law")
-    missing = sorted(getattr(found, "__abstractmethods__", ()))
-    if missing:
-        raise ValueError(
-            f"law {name!r}: {called} does not define {', '.join(missing)}; see pdeloop.Law"
-        )
-    return found
 
 
 MAX_NUMBER = 1e9
