@@ -32,7 +32,8 @@ from pdeloop.episode import Law, rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import cost_to_go, finite_horizon
+from pdeloop.method.design.lqt import cost_to_go, regulator
+from pdeloop.method.models.linear import LinearModel
 
 STEPS = 20
 """Of a plan."""
@@ -63,8 +64,11 @@ def linearisation(plant: Process) -> Linearisation:
 
 def clipped_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> Law:
     """The affine law of least cost over the horizon, within bounds."""
-    K, b = finite_horizon(model.A, model.B, model.d, cost, model.point)
-    return lambda k, states: admissible.project((states - model.point) @ K.T + b)
+    A, B, d, point = model
+    known = regulator(LinearModel("linear", A, B, d + point - A @ point), cost, point)
+    if known is None:
+        raise ValueError("the linearised plant has no law of finite cost")
+    return lambda k, states: admissible.project(states @ known.K.T + known.b)
 
 
 def predictive_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> Law:

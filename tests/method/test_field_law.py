@@ -15,15 +15,15 @@ from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.method.design import lqt
 from pdeloop.method.design.field_law import (
     FieldLaw,
-    _spread,
     aim_of,
     field_law,
     linearisation_point,
     states_under,
 )
-from pdeloop.method.design.lqt import DesignError, finite_horizon
-from pdeloop.method.models import Measured, affine_law
+from pdeloop.method.design.lqt import DesignError, regulator
+from pdeloop.method.models import affine_law
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, FittedModel
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import IdentificationSettings, ReducedModel
@@ -70,18 +70,6 @@ def law(true: SpectralModel, target: Array) -> ModelRows:
     return found.rows
 
 
-def test_pieces_that_are_spread_over_a_long_rollout_stand_for_it() -> None:
-    numbers = np.arange(10_001.0)[:, None]
-    parts = _spread(Measured(numbers, numbers[:-1]), 4)
-    assert sum(len(part.actions) for part in parts) == 4096
-    assert [part.states[0, 0] for part in parts] == [0.0, 2500.0, 5000.0, 7500.0]
-    for part in parts:
-        np.testing.assert_array_equal(np.diff(part.states, axis=0), 1.0)
-        np.testing.assert_array_equal(part.actions, part.states[:-1])
-    short = Measured(numbers[:4097], numbers[:4096])
-    assert _spread(short, 4) == [short]
-
-
 def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
     rng = np.random.default_rng(0)
     A, B, d = rng.standard_normal((5, 5)), rng.standard_normal((5, 2)), rng.standard_normal(5)
@@ -93,20 +81,19 @@ def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
         # a^T (R a + B^T (P (A e + B a + d) + p)) vanishes at the optimum
         P, p = Q * np.eye(5) + A.T @ P @ closed, closed.T @ (P @ d + p)
     cost = Cost(5, 2, 8, state_weight=Q, action_weight=R)
-    own = finite_horizon(A, B, d, cost, np.zeros(5))
-    np.testing.assert_allclose(own[0], K, rtol=1e-8)
-    np.testing.assert_allclose(own[1], b, rtol=1e-8)
+    own = regulator(LinearModel("linear", A, B, d), cost)
+    assert own is not None
+    np.testing.assert_allclose(own.K, K, rtol=1e-8)
+    np.testing.assert_allclose(own.b, b, rtol=1e-8)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_is_the_law_of_the_true_plant_linearised_at_the_target(size: float) -> None:
     true = plant()
     target = size * np.cos(2.0 * np.pi * np.arange(N_Z) / N_Z)
-    A, B = true.linearise(target, np.zeros(N_A))
-    drift = true.step(target[None], np.zeros((1, N_A)))[0] - target
-    cost = Cost(N_Z, N_A, STEPS, state_weight=Q, action_weight=R, target=target)
-    K, b = finite_horizon(A, B, drift, cost, target)
-    rows = law(true, target)
+    about, rows = regulator(true, cost_to(target)), law(true, target)
+    assert about is not None
+    A, K, b = about.A, about.K, about.b + about.K @ target
     np.testing.assert_allclose(rows.U.T @ rows.U, np.eye(6), atol=1e-12)
     assert np.linalg.norm(rows.K_a @ rows.U.T - K) < 0.01 * np.linalg.norm(K)
     constant = K @ target + rows.K_b @ rows.s_r

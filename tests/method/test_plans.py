@@ -13,7 +13,7 @@ from scipy.optimize import LinearConstraint, minimize
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import finite_horizon
+from pdeloop.method.design.lqt import regulator
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
@@ -149,12 +149,10 @@ def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others(
     plan = own._affine_plan(z, 0, 12)
     assert plan.any() and not affine._affine_plan(z, 0, 12).any()
     np.testing.assert_allclose(own.costs(plan, z, 0), affine.costs(none, z, 0), rtol=1e-9)
-    target = np.full((1, N_Z), 0.3)
-    model, a_r = own.model, np.zeros(N_A)
-    A, B = model.linearise(target[0], a_r)
-    K, b = finite_horizon(A, B, model.step(target, a_r[None])[0] - target[0], cost, target[0])
+    about = regulator(own.model, cost)
+    assert about is not None
     a, found = own.step(none, z, 0)
-    np.testing.assert_allclose(a, (z - target) @ K.T + b, rtol=1e-6)
+    np.testing.assert_allclose(a, z @ about.K.T + about.b, rtol=1e-6)
     assert not found.any()
     without = replace(own, terminal=False)
     assert without.about is None

@@ -15,9 +15,10 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased
-from pdeloop.method.design.lqt import finite_horizon, track_horizon
+from pdeloop.method.design.lqt import regulator, track_horizon
 from pdeloop.method.laws import FeedForward, Law, Observer
 from pdeloop.method.laws.registry import laws_of
+from pdeloop.method.models.linear import LinearModel
 from tests.support.small import FEW_FITS
 
 N_Z, N_A, T = 6, 2, 20
@@ -136,11 +137,11 @@ def test_a_training_designs_and_adapts_for_it() -> None:
         plant=Servo(), law="affine", rollouts=9, evaluation_fields=2, reduced_order=N_Z, **FEW_FITS
     )
     plant, U = DynamicsPlant(Servo()), run.models[0].U
-    z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target
-    K, b = finite_horizon(A, B, drift, plant.cost, z_r)
+    z_r, about = plant.field_target, regulator(LinearModel("", A, B, np.zeros(N_Z)), plant.cost)
+    assert about is not None
     first, n_s = run.warm[0], U.shape[1]
-    np.testing.assert_allclose(first[:, :n_s] @ U.T, K, atol=1e-6)
-    np.testing.assert_allclose(first[:, n_s:] @ U.T @ z_r, b - K @ z_r, atol=1e-6)
+    np.testing.assert_allclose(first[:, :n_s] @ U.T, about.K, atol=1e-6)
+    np.testing.assert_allclose(first[:, n_s:] @ U.T @ z_r, about.b, atol=1e-6)
     best = track_horizon(A, B, plant.cost, np.eye(N_Z))
     laws = {
         "best": lambda k, z: z @ best.K[k].T + best.b[k],

@@ -222,9 +222,14 @@ class Context:
 
     def plain(self, target: Array, q: float | None = None) -> Cost:
         """q |x - x_r|^2 + r |a|^2, with x_r the target, and q that of the state if not given."""
-        q, r = self.state_weight if q is None else q, self.action_weight
-        given = {"state_weight": q, "action_weight": r, "target": target}
-        return Cost(len(target), self.exploration.actions.shape[1], self.horizon, **given)
+        return Cost(
+            len(target),
+            self.exploration.actions.shape[1],
+            self.horizon,
+            state_weight=self.state_weight if q is None else q,
+            action_weight=self.action_weight,
+            target=target,
+        )
 
     @cached_property
     def largest(self) -> float:

@@ -50,7 +50,8 @@ class InCoordinates(Optimizer):
             replace(record, states=self._seen(Trajectory(record.states, record.actions)).states)
             for record in context.measured
         ]
-        self._cost = context.cost and CostInCoordinates(context.cost, self.basis)
+        whole = context.cost
+        self._cost = None if whole is None else CostInCoordinates(whole, self.basis)
         law, U = context.with_constants, self.basis.coordinates(context.U.T).T
         own = replace(
             context,

@@ -38,7 +38,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.design.lqt import LARGEST, finite_horizon, target_gain
+from pdeloop.method.design.lqt import LARGEST, regulator, target_gain
 from pdeloop.method.models import FieldModel, FieldModelSettings, FittedModel, Measured, affine_law
 from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
@@ -283,31 +283,24 @@ def field_law(
         return report
     aim = target if weights is None else aim_of(scale.reference, target, weights)
     point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
-    action = operating_inputs(trajectories)
-    A, B = model.linearise(point, action)
-    drift = model.step(point[None], action[None])[0] - B @ action - point
-    if not all(np.isfinite(part).all() for part in (A, B, drift)):
+    about = regulator(model, cost, point, operating_inputs(trajectories))
+    if about is None:  # it grows beyond all bounds within the horizon
         return report
+    K, b = about.K, about.b
     horizon = max(len(actions) for _, actions in trajectories)
-    try:
-        K, b = finite_horizon(A, B, drift, cost, point)
-    except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
-        return report
-    if not (np.isfinite(K).all() and np.isfinite(b).all()):
-        return report
     fields = [states[0] for states, _ in trajectories]
     if noise:
         fields = list(smoothed(np.stack(fields), noise))
-    best = saturated(affine_law(K, b - K @ point), action_set)
+    best = saturated(affine_law(K, b), action_set)
     none = saturated(affine_law(np.zeros_like(K), np.zeros_like(b)), action_set)
     ahead = min(horizon, _FIELD_STEPS)
     visited = [z for law in (best, none) for z in states_under(model, law, fields, ahead)]
     U = _basis(K, np.concatenate(visited)[::_FIELD_THINNING], target, order or n_s)
     K_a, s_r = K @ U, U.T @ target
     # There is no constant part where the target is outside of U.
-    K_b, _ = target_gain(b - K @ point, s_r)
-    d = U.T @ (point + drift - A @ point)
-    rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
+    K_b, _ = target_gain(b, s_r)
+    d = U.T @ (point + about.drift - about.A @ point)
+    rows = ModelRows(A=U.T @ about.A @ U, B=U.T @ about.B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0

@@ -27,8 +27,8 @@ const,
 
 backwards from P = E_T'E_T and p = E_T'w_T. b_k knows the targets that are still to come.
 
-`finite_horizon`, about a point that need not be an equilibrium, and with one target: the first step's
-law a = K e + b of the deviation e; `regulator`, at the target of a model. The Riccati recursion of
+`regulator`, about a point of a model that need not be an equilibrium, and with one target: the first
+step's law a = K z + b. The Riccati recursion of
 [e; 1] is doubled until it covers the horizon, rounded up to a power of two; it needs no stabilisable
 model.
 
@@ -44,7 +44,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from numbers import Real
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,9 +53,11 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.models.base import FieldModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.process.one_thread import one_thread
+
+if TYPE_CHECKING:
+    from pdeloop.method.models.base import FieldModel
 
 LARGEST = 512
 """Numbers of a state up to which Riccati equations are solved, with work of its third power."""
@@ -309,31 +311,11 @@ def _steady_state_map(closed_loop: Array) -> Array:
     return inverse
 
 
-def finite_horizon(
-    A: Array, B: Array, drift: Array, cost: Cost, point: Array
-) -> tuple[Array, Array]:
-    """K (n_a, n) and b (n_a,) of a = K e + b, e = z - point, in the first step of the cost's horizon.
-
-    drift: d (n,); point: (n,). A target over time counts with its mean; the terminal weight does not.
-
-    >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), Cost(1, 1, 64), np.zeros(1))
-    >>> K.round(6), b
-    (array([[-0.618034]]), array([0.]))
-    """
-    P = cost_to_go(A, B, drift, cost, point)
-    return _first_step(A, B, drift, cost, P)
-
-
-def _first_step(A: Array, B: Array, drift: Array, cost: Cost, P: Array) -> tuple[Array, Array]:
-    """The law of `finite_horizon` with its cost to go."""
-    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
-    S = cost.action_matrix + inputs.T @ P @ inputs
-    gains = -linalg.solve(S, inputs.T @ P @ whole, assume_a="pos")
-    return gains[:, :-1], gains[:, -1] + cost.action_target
-
-
 def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Array:
-    """P (n + 1, n + 1) of the least cost [e; 1]^T P [e; 1] of the horizon, for `finite_horizon`."""
+    """P (n + 1, n + 1) of the least cost [e; 1]^T P [e; 1] of the horizon.
+
+    A target over time counts with its mean; the terminal weight does not count.
+    """
     whole, inputs = _extended(A, B, drift + B @ cost.action_target)
     E = cost.residual(np.eye(len(A)))
     offset = E @ point - cost.residual_target().mean(axis=0)
@@ -343,21 +325,34 @@ def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Ar
 
 
 class Regulator(NamedTuple):
-    """The problem of a horizon about the target z_r of a model.
+    """The problem of a horizon about a point z_r, of e_{k+1} = A e_k + B a_k + drift, e = z - z_r.
 
-    B (n, n_a): of the model there; P (n + 1, n + 1): the cost to go is [z - z_r; 1]^T P [z - z_r; 1]; K
-    (n_a, n), b (n_a,): the law a = K z + b.
+    A (n, n), B (n, n_a), drift (n,): of a model there; P (n + 1, n + 1): of the cost to go [e; 1]^T P
+    [e; 1]; K (n_a, n), b (n_a,): the law a = K z + b.
     """
 
+    A: Array
     B: Array
+    drift: Array
     P: Array
     K: Array
     b: Array
 
 
-def regulator(model: FieldModel, cost: Cost) -> Regulator | None:
-    """That of a model and a cost of its states; None where it has no finite one, or is too large."""
-    point, a = cost.field_target, cost.action_target
+def regulator(
+    model: FieldModel, cost: Cost, point: Array | None = None, action: Array | None = None
+) -> Regulator | None:
+    """That of a model and a cost of its states; None where it has no finite one, or is too large.
+
+    point (n,), action (n_a,): where the model is linearised, the cost's targets if not given.
+
+    >>> from pdeloop.method.models.linear import LinearModel
+    >>> one = LinearModel("linear", np.eye(1), np.eye(1), np.zeros(1))
+    >>> regulator(one, Cost(1, 1, 64)).K.round(6)
+    array([[-0.618034]])
+    """
+    point = cost.field_target if point is None else point
+    a = cost.action_target if action is None else action
     if model.n_z > LARGEST:
         return None
     with np.errstate(all="ignore"):
@@ -365,11 +360,14 @@ def regulator(model: FieldModel, cost: Cost) -> Regulator | None:
         drift = model.step(point[None], a[None])[0] - point - B @ a
         try:
             P = cost_to_go(A, B, drift, cost, point)
-            K, b = _first_step(A, B, drift, cost, P)
+            whole, inputs = _extended(A, B, drift + B @ cost.action_target)
+            S = cost.action_matrix + inputs.T @ P @ inputs
+            gains = -linalg.solve(S, inputs.T @ P @ whole, assume_a="pos")
         except (np.linalg.LinAlgError, ValueError):
             return None
-    known = np.isfinite(P).all() and np.isfinite(K).all() and np.isfinite(b).all()
-    return Regulator(B, P, K, b - K @ point) if known else None
+    K, b = gains[:, :-1], gains[:, -1] + cost.action_target
+    known = np.isfinite(P).all() and np.isfinite(gains).all()
+    return Regulator(A, B, drift, P, K, b - K @ point) if known else None
 
 
 def _extended(A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
