@@ -175,12 +175,6 @@ class Schedule:
         # One is only worth it if as many rollouts again come before the last one.
         return at - self.known if 2 * at - self.known <= self.last else self.last
 
-    def often(self, own: int) -> int:
-        """The next renewal where a law is rolled out no more often than judges it."""
-        first = max(FIRST_RENEWAL - self.known, 1)
-        every = range(first, max(self.last, first) + 1, self.settings.judging)
-        return next((n for n in every if own < n <= self.last), self.last)
-
 
 class ModelBased(Optimizer):
     """Policy optimisation on a model; parameters as of `Optimizer`, its context with trajectories."""
@@ -272,6 +266,11 @@ class ModelBased(Optimizer):
     def records(self) -> list[Record]:
         """The rollouts that it was told of."""
         return self._records.all()
+
+    @property
+    def count(self) -> int:
+        """Number of rollouts that it was told of."""
+        return self._records.count
 
     @property
     def tells(self) -> int:

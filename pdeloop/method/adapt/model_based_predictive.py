@@ -73,9 +73,8 @@ FEW = 4
 RESTS = 0.01
 """The target is an equilibrium of the model if a step from there moves the state by at most this share
 of its mean distance from it."""
-_TRAINING, _JUDGING, _ENDED = "training", "judging", "ended"
 _OWN = "own."
-_NUMBERS = {"stage": "U", "tells": "i", "count": "i", "kept": "i", "share": "f"}
+_NUMBERS = {"kept": "i", "share": "f", "judged": "b", "plans": "b"}
 """What is one number or text of a checkpoint, and its NumPy kind."""
 
 
@@ -120,9 +119,8 @@ class ModelBasedPredictive(Optimizer):
         self._budget, self._judging = rollouts, max(min(self._settings.judging, spare), 0)
         self._kept = 0 if self._law.worth else self._judging
         self._affine = self._trained()
-        self._stage, self._tells, self._count, self._share = _TRAINING, 0, 0, np.inf
+        self._share, self._judged, self._plans = np.inf, False, False
         self._candidate: Candidate | None = None
-        self._chosen: Array | None = None
 
     def _trained(self) -> ModelBased:
         """The training of the affine law with all rollouts but those that are kept for plans."""
@@ -139,37 +137,34 @@ class ModelBasedPredictive(Optimizer):
     @property
     def policy(self) -> Array:
         """Theta of the present affine law, and at the end of the chosen one."""
-        return self._affine.policy.ravel() if self._chosen is None else self._chosen.copy()
+        chosen = self._candidate if self._plans else None
+        return self._affine.policy.ravel() if chosen is None else chosen.theta.copy()
 
     @property
     def tells(self) -> int:
         """Number of calls of `tell`."""
-        return self._tells
+        return self._affine.tells + self._judged
 
     @property
     def done(self) -> bool:
         """True once no further rollouts are needed."""
-        return self._stage == _ENDED
+        return self._affine.done and (self._candidate is None or self._judged)
 
     def ask(self) -> list[Rollout]:
         """Rollouts of affine laws, and the last ones of the law that plans."""
-        if self._stage == _TRAINING:
+        if self._candidate is None or self._judged:
             return self._affine.ask()
-        if self._candidate is None:
-            return []
         return [Rollout(self._candidate.theta.copy(), seed) for seed in self._seeds()]
 
     def _seeds(self) -> list[int]:
         """Of the initial fields of the last rollouts: fresh ones."""
-        return [field_seed(self._seed, self._count + n) for n in range(self._left)]
+        return [field_seed(self._seed, self._affine.count + n) for n in range(self._left)]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts."""
         asked = self.ask()
         require_results(results, len(asked))
-        self._count += len(asked)
-        self._tells += 1
-        if self._stage == _TRAINING:
+        if self._candidate is None:
             row = self._affine.tell(results)
             with one_thread():
                 if self._affine.done:
@@ -177,19 +172,19 @@ class ModelBasedPredictive(Optimizer):
                 elif "model" in row and not self._kept and self._affine.can_spare(self._judging):
                     self._look(row)
             return row
-        diverged = sum(not result.usable for result in results)
-        row = {"role": "judging", "rollouts": self._count, "diverged": diverged}
+        diverged, count = sum(not result.usable for result in results), self._affine.count
+        row = {"role": "judging", "rollouts": count + len(asked), "diverged": diverged}
         if not diverged:
             row["cost"] = float(np.mean([result.cost for result in results]))
         with one_thread():
             self._judge(asked, results, row)
-        self._stage = _ENDED
+        self._judged = True
         return row
 
     @property
     def _left(self) -> int:
         """Rollouts of a law that plans, once the affine law is trained."""
-        return min(self._judging, self._budget - self._count)
+        return min(self._judging, self._budget - self._affine.count)
 
     def _look(self, row: Row) -> None:
         """Keep rollouts for a law that plans, if another one could save enough on the model."""
@@ -224,7 +219,6 @@ class ModelBasedPredictive(Optimizer):
 
     def _begin_judging(self, row: Row) -> None:
         """Make the law that plans, or say why there is none."""
-        self._stage = _ENDED
         belief = self._affine.belief
         if not self._kept and self._left:  # which the affine law did not need
             self._look(row)
@@ -239,7 +233,7 @@ class ModelBasedPredictive(Optimizer):
         else:
             made = self._made(belief, row)
             if isinstance(made, Candidate):
-                self._candidate, self._stage = made, _JUDGING
+                self._candidate = made
                 row.pop("early", None)
                 return
             why = made
@@ -326,8 +320,7 @@ class ModelBasedPredictive(Optimizer):
             base = ADAPTED if policy.any() else NONE
         evidence = self._evidence(base, list(zip(asked, results, strict=True)), row)
         found = verdict.choose(evidence, base, self._settings.confidence)
-        if found.chosen == self.candidate:
-            self._chosen = self._candidate.theta
+        self._plans = found.chosen == self.candidate
         row |= found.row
 
     def _evidence(self, base: str, told: Told, row: Row) -> Mapping[str, Evidence]:
@@ -354,10 +347,9 @@ class ModelBasedPredictive(Optimizer):
         }
 
     def state(self) -> State:
-        """That of `ModelBased`, the stage, and the law that plans."""
+        """That of `ModelBased`, and the law that plans."""
         arrays: State = {_OWN + name: value for name, value in self._affine.state().items()}
         arrays |= {name: np.array(getattr(self, f"_{name}")) for name in _NUMBERS}
-        arrays["plans"] = np.array(self._chosen is not None)
         if self._candidate is not None:
             known = self._candidate
             arrays |= {"theta": known.theta, "costs": np.stack([known.costs, known.before])}
@@ -365,10 +357,7 @@ class ModelBasedPredictive(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
-        numbers = numbers_of(state, _NUMBERS, finite=False)
-        if (stage := numbers["stage"]) not in (_TRAINING, _JUDGING, _ENDED):
-            raise ValueError(f"its stage is {stage!r}")
-        for name, number in numbers.items():
+        for name, number in numbers_of(state, _NUMBERS, finite=False).items():
             setattr(self, f"_{name}", number)
         self._affine = self._trained()
         self._affine.restore(part_of(state, _OWN))
@@ -378,10 +367,8 @@ class ModelBasedPredictive(Optimizer):
             self._check(theta)
             costs, before = checked_array(state, "costs", "f", (2, None), finite=False)
             self._candidate = Candidate(theta, costs.copy(), before.copy())
-        plans = bool(checked_array(state, "plans", "b", ()))
-        if (plans or stage == _JUDGING) and self._candidate is None:
+        if self._plans and self._candidate is None:
             raise ValueError("it has no law that plans")
-        self._chosen = self._candidate.theta if plans and self._candidate else None
 
 
 def around(plain: Planner) -> list[Planner]:

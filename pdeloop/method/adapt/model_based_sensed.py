@@ -65,7 +65,7 @@ class ModelBasedReadings(ModelBased):
 
     def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
-        return self._schedule.often(own)
+        return min(own + self._settings.judging, self._schedule.last)
 
     def _data(self) -> list[Record]:
         """All rollouts as they were measured: the model's filter knows their noise."""
@@ -158,9 +158,9 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _scheduled(self, own: int) -> int:
         """After as many rollouts as judge a law; on a model of the field later after twice as many."""
-        last = self._schedule.last
         if self._sensed is None:
-            return min(own + self._settings.judging, last)
+            return super()._scheduled(own)
+        last = self._schedule.last
         return 2 * own if 4 * own <= last else last
 
     def _none_tells(self) -> bool:

@@ -101,7 +101,7 @@ class ModelBasedNeural(ModelBasedPredictive):
             return f"the law {own.without.name} does not stay finite on the model, or costs nothing"
         rows, cost = states[known].reshape(-1, states.shape[2]), float(costs[known].mean())
         network = Network.of(context.U, K, b, rows, curvature_of(loop), cost, own.settings.neurons)
-        seed = [self._seed, _STREAM, self._count]
+        seed = [self._seed, _STREAM, self._affine.count]
         draw = partial(mixtures, components=belief.components, periodic=context.periodic)
         training = NetworkTraining(network, planner, every, seed, draw, loop.noise)
         numbers = training.trained(own.settings.iterations)
