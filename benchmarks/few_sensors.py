@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 from benchmarks.families.cases import case_of
 from benchmarks.general import number, trained
 from benchmarks.kept import errors, kept_row, rows_of
-from pdeloop.method.adapt.estimate import mean_of
+from pdeloop.method.adapt.verdict import mean_of
 
 __all__ = ["run", "text"]
 

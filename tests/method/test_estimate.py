@@ -12,15 +12,18 @@ from scipy.special import ndtr, stdtr
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt import Record
-from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change, mean_of
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     ALL_AGREE,
     FIRST,
     NONE,
+    ZERO,
+    Estimate,
     Evidence,
     choose,
     evidence_of_rollouts,
+    mean_change,
+    mean_of,
 )
 
 DRAWS = 4000

@@ -11,17 +11,19 @@ import pytest
 
 from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_of
 from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
     NONE,
+    ZERO,
+    Estimate,
     Evidence,
     choose,
     evidence_of,
     evidence_of_rollouts,
+    mean_of,
 )
 
 

@@ -43,11 +43,10 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief, believe
-from pdeloop.method.adapt.estimate import ZERO, Estimate
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CLOSE, FIRST_RENEWAL, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records
-from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE
+from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, ZERO, Estimate
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.noise import cleaned_states

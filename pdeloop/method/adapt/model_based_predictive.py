@@ -42,7 +42,6 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.estimate import ZERO, mean_change
 from pdeloop.method.adapt.improve import cheapest
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.replay import costs_by_field
@@ -54,7 +53,15 @@ from pdeloop.method.adapt.sensed_loop import (
     sensed_loop,
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, PREDICTIVE, Evidence
+from pdeloop.method.adapt.verdict import (
+    ADAPTED,
+    FIRST,
+    NONE,
+    PREDICTIVE,
+    ZERO,
+    Evidence,
+    mean_change,
+)
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Affine
 from pdeloop.method.laws.plans import Planner, planned, seen_with_noise, simulated

@@ -28,7 +28,6 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt import verdict
 from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
-from pdeloop.method.adapt.estimate import Estimate, mean_of
 from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
 from pdeloop.method.adapt.model_based import JUDGING, RENEWING, ModelBased
 from pdeloop.method.adapt.renewal import mixtures, weighted
@@ -44,7 +43,7 @@ from pdeloop.method.adapt.sensed_loop import (
     whole_field_law,
 )
 from pdeloop.method.adapt.settings import FIRST_GAIN, READINGS_TRUST, ModelBasedSettings
-from pdeloop.method.adapt.verdict import ADAPTED
+from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.settings import SENSED_REPRODUCED

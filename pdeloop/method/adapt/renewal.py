@@ -42,9 +42,9 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.estimate import ZERO, Estimate, mean_change
 from pdeloop.method.adapt.improve import Improvement, cheapest, curvature_of, improve
 from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ModelBasedSettings
+from pdeloop.method.adapt.verdict import ZERO, Estimate, mean_change
 
 PARTS = 2
 """Parts of the fields, each held out once to choose how far the law moves."""
