@@ -16,7 +16,7 @@ from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import Estimate
 from pdeloop.method.models import FieldModel, FittedModel, Measured
 from pdeloop.method.models.base import errors
-from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
+from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, Selection
 from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
@@ -34,7 +34,7 @@ def lorenz(forcing: float, n_z: int = 12) -> FiniteDifferenceModel:
     }
     C = np.tile(0.1 * np.array(list(terms.values()))[:, None, None], (1, 1, n_z))
     B, c = np.eye(n_z)[:, :1], np.full(n_z, 0.1 * forcing)
-    return FiniteDifferenceModel("near-shared", tuple(terms), C, B, c, 8)
+    return of_features("near-shared", tuple(terms), C, B, c, 8)
 
 
 def drifting(rate: float, n_z: int = 12) -> LinearModel:

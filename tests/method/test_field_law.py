@@ -22,7 +22,7 @@ from pdeloop.method.design.field_law import (
 )
 from pdeloop.method.design.lqt import DesignError, regulator
 from pdeloop.method.models import affine_law
-from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.finite_difference import features_of, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, FittedModel
 from pdeloop.method.models.spectral import SpectralModel
@@ -322,7 +322,7 @@ def test_where_nothing_was_measured_only_an_exact_model_is_linearised(
     rng = np.random.default_rng(0)
     states, actions = rng.uniform(-1.0, 1.0, (50, 6)), rng.standard_normal((49, 1))
     features = features_of(1)
-    model = FiniteDifferenceModel(
+    model = of_features(
         "x", features, np.zeros((len(features), 1, 6)), np.zeros((6, 1)), np.zeros(6), 1
     )
     target = np.full(6, distance)

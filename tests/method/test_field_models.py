@@ -18,10 +18,10 @@ from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.base import errors, pieces, predicted
 from pdeloop.method.models.files import model_of
 from pdeloop.method.models.finite_difference import (
-    FiniteDifferenceModel,
     advance,
     features_of,
     neighbour_features,
+    of_features,
 )
 from pdeloop.method.models.linear import LinearModel, add_products
 from pdeloop.method.models.spectral import SpectralModel
@@ -53,7 +53,7 @@ def finite_difference(components, n_x=9):
     C = 0.03 * rng.normal(size=(len(features), components, n_x))
     n_z = components * n_x
     B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
-    return FiniteDifferenceModel("x1e-5", features, C, B, c, 3)
+    return of_features("x1e-5", features, C, B, c, 3)
 
 
 def neighbours(components, n_x=7):
@@ -62,7 +62,7 @@ def neighbours(components, n_x=7):
     C = 0.03 * rng.normal(size=(len(features), components, n_x))
     n_z = components * n_x
     B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
-    return FiniteDifferenceModel("near1e-9", features, C, B, c, 3)
+    return of_features("near1e-9", features, C, B, c, 3)
 
 
 def linear(n_z=10):
@@ -229,7 +229,7 @@ def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> No
     model = LinearModel("k", np.asfortranarray(np.eye(16)), np.zeros((16, 1)), np.zeros(16))
     features = features_of(1)
     C, B = np.zeros((len(features), 1, 16)), np.zeros((16, 3))[:, ::3]
-    differences = FiniteDifferenceModel("k", features, C, B, np.zeros(16), 1)
+    differences = of_features("k", features, C, B, np.zeros(16), 1)
     for states in kinds:
         for one in (model, differences):
             np.testing.assert_array_equal(one.step(states, np.zeros((4, 1))), states)

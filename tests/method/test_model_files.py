@@ -10,9 +10,9 @@ from pdeloop.method.models import FieldModel
 from pdeloop.method.models.base import MAX_SUBSTEPS
 from pdeloop.method.models.files import FORMS, model_of
 from pdeloop.method.models.finite_difference import (
-    FiniteDifferenceModel,
     features_of,
     neighbour_features,
+    of_features,
 )
 from pdeloop.method.models.linear import LinearModel, ProjectedModel, ReadingsModel
 from pdeloop.method.models.polynomial import PolynomialModel
@@ -49,7 +49,7 @@ def spectral(n_z: int) -> dict[str, object]:
 SENSORS = 4
 MODELS: dict[str, FieldModel] = {
     "spectral": SpectralModel(**spectral(N_Z)),  # type: ignore[arg-type]
-    "finite-difference": FiniteDifferenceModel(
+    "finite-difference": of_features(
         "k",
         features_of(1),
         numbers(len(features_of(1)), 1, N_Z),
@@ -58,7 +58,7 @@ MODELS: dict[str, FieldModel] = {
         4,
     ),
     "projected": ProjectedModel(
-        FiniteDifferenceModel(
+        of_features(
             "k",
             features_of(1, axes=2),
             numbers(len(features_of(1, axes=2)), 1, N_Z),
@@ -100,7 +100,7 @@ MODELS: dict[str, FieldModel] = {
 
 
 NEIGHBOURS = "neighbours"
-MODELS[NEIGHBOURS] = FiniteDifferenceModel(
+MODELS[NEIGHBOURS] = of_features(
     "k",
     neighbour_features(1),
     numbers(len(neighbour_features(1)), 1, N_Z),

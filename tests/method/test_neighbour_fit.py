@@ -57,9 +57,10 @@ CHAIN = {
 def test_a_plant_of_products_of_neighbours_is_recovered_to_1e_6_without_other_terms():
     rollouts = explored(chain, 2, N_X)
     model = fit_neighbours(Samples.of(rollouts), kind="near-shared")
-    found = {
-        (f.factors, f.shifts): C for f, C in zip(model.features, model.coefficients, strict=True)
-    }
+    found = {}
+    for (n, *row), C in zip(model.table.tolist(), model.coefficients, strict=True):
+        shifts = tuple(i if i < N_X / 2 else i - N_X for i in row[3 : 3 + n])
+        found[tuple(row[:n]), shifts] = C
     assert found.keys() == CHAIN.keys()
     for term, C in found.items():
         np.testing.assert_allclose(C / DT, CHAIN[term], atol=1e-6)
@@ -79,7 +80,7 @@ def test_whole_rollouts_of_a_chaotic_plant_are_predicted():
     assert fitted is not None
     assert fitted.model.kind == "near-shared" and fitted.error < 1e-4
     assert errors(fitted.model, rollouts[3:], np.zeros(N_X), 2.0)[0] < 1e-4
-    assert len(fitted.model.features) == 3
+    assert len(fitted.model.table) == 3
 
 
 GROWTH = 1.0 + 0.3 * np.cos(np.arange(N_X))
@@ -126,7 +127,7 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
         components=components,
         ridge=ridge,
     )
-    assert len(model.features) == terms
+    assert len(model.table) == terms
     assert errors(model, rollouts[3:], np.zeros(n_z), 2.0)[0] < 1e-8
 
 

@@ -16,7 +16,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.method.design.lqt import regulator
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
-from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel
+from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.models.sweep import SpectralSweep, Sweep
@@ -44,7 +44,7 @@ def differences() -> FiniteDifferenceModel:
     features = Feature((0,)), Feature((0,), 2), Feature((0, 0, 0))
     C = np.tile(np.array([0.3, 0.1, -0.2])[:, None, None], (1, 1, N_Z))
     B = 0.3 * np.random.default_rng(1).standard_normal((N_Z, N_A))
-    return FiniteDifferenceModel("x-shared", features, C, B, np.full(N_Z, 0.02), 3)
+    return of_features("x-shared", features, C, B, np.full(N_Z, 0.02), 3)
 
 
 def planner(model: FieldModel, cost: Cost | None = None, **changed: object) -> Planner:

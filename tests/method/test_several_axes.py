@@ -13,6 +13,7 @@ from pdeloop.method.models.finite_difference import (
     Feature,
     FiniteDifferenceModel,
     features_of,
+    of_features,
 )
 from pdeloop.method.models.linear import ProjectedModel, coarse_points
 from tests.support.fitted import fit_field_model
@@ -29,7 +30,7 @@ def model(components: int = 1, scale: float = 0.05) -> FiniteDifferenceModel:
         RNG.standard_normal((components * N_Z, N_A)),
         scale * RNG.standard_normal(components * N_Z),
     ]
-    return FiniteDifferenceModel("x1e-5", features, *numbers, 3, SHAPE)
+    return of_features("x1e-5", features, *numbers, 3, SHAPE)
 
 
 def coarse() -> ProjectedModel:
@@ -44,9 +45,7 @@ def test_a_difference_is_along_one_axis_of_a_ring(order: int) -> None:
     C = np.zeros((len(features), 1, N_Z))
     size = 1e-6
     C[features.index(Feature((0,), order))] = size
-    own = FiniteDifferenceModel(
-        "x-shared", features, C, np.zeros((N_Z, N_A)), np.zeros(N_Z), 1, SHAPE
-    )
+    own = of_features("x-shared", features, C, np.zeros((N_Z, N_A)), np.zeros(N_Z), 1, SHAPE)
     z = RNG.standard_normal(SHAPE)
     after = own.step(z.reshape(1, -1), np.zeros((1, N_A))).reshape(SHAPE)
     axis = 1 if order in (1, 2) else 0

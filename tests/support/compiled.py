@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pdeloop.method.models.finite_difference import FiniteDifferenceModel, features_of
+from pdeloop.method.models.finite_difference import features_of, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.training_run import load_compiled, resolve
@@ -28,7 +28,7 @@ def load_field_models() -> None:
     spectral = SpectralModel("poly2", none, none[None], np.ones((1, 1)), B, constant, 2)
     features = features_of(1)
     C = np.zeros((len(features), 1, n))
-    differences = FiniteDifferenceModel("tiny", features, C, B, constant, 1)
+    differences = of_features("tiny", features, C, B, constant, 1)
     states, actions = np.zeros((2, n)), np.zeros((2, 1))
     spectral.compiled.integrals(states, actions, states)
     differences.means(states, actions, states)

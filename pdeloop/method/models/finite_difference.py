@@ -54,8 +54,6 @@ from pdeloop.method.models.base import (
     checked_substeps,
     least_squares,
     orthonormal,
-    shaped,
-    text_of,
 )
 from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 
@@ -361,9 +359,9 @@ def neighbour_features(components: int, reach: int = 2) -> tuple[Feature, ...]:
 class FiniteDifferenceModel(StoredModel):
     """The equation above, with C (F, components, n_x), B (n_z, n_a) and c (n_z,).
 
-    features: F of them; derivatives of one monomial stand together, beginning with that of order 0;
-    substeps: Runge-Kutta steps of a sampling time; shape: grid points of each axis, the
-    last one fastest, whose product is n_x; empty: there is one.
+    table: F features; derivatives of one monomial stand together, beginning with that of order 0;
+    substeps: Runge-Kutta steps of a sampling time; axes: grid points of each axis, the last one
+    fastest, whose product is n_x.
     """
 
     FORM = "finite-difference"
@@ -376,86 +374,78 @@ class FiniteDifferenceModel(StoredModel):
         "axes": "i:d",
     }
     kind: str
-    features: tuple[Feature, ...]
+    table: Table
     coefficients: Array
     B: Array
     constant: Array
     substeps: int
-    shape: tuple[int, ...] = ()
-
-    @cached_property
-    def table(self) -> Table:
-        """Rows: number of factors, the factors, their shifts, and the order, of each feature."""
-        n_x, rows = self.coefficients.shape[2], []
-        for factors, order, shifts in self.features:
-            ahead = [shift % n_x for shift in shifts]
-            rows.append([len(factors), *_filled(factors, -1), *_filled(ahead, 0), order])
-        return np.array(rows, dtype=np.int64)
+    axes: Table
 
     def step(self, states: Array, actions: Array) -> Array:
         z, a = read_only(states), read_only(actions)
         after = np.empty_like(z)
-        advance(z, a, self.table, self.axes, *self._arrays, self.substeps, after)
+        advance(z, a, *self._known, after)
         return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         z, a, y = read_only(states), read_only(actions), read_only(covectors)
         on_states, on_actions = np.empty_like(z), np.empty_like(a)
-        known = (self.table, self.axes, *self._arrays, self.substeps)
-        pull_back(z, a, y, *known, on_states, on_actions)
+        pull_back(z, a, y, *self._known, on_states, on_actions)
         return on_states, on_actions
 
     def means(self, states: Array, actions: Array, after: Array) -> tuple[Array, Array]:
         """The features' means (M, F, n_x) on the path bent to end in `after`, and how far it misses."""
         z, a, end = read_only(states), read_only(actions), read_only(after)
-        found = np.empty((len(z), len(self.features), self.coefficients.shape[2]))
+        found = np.empty((len(z), len(self.table), self.coefficients.shape[2]))
         miss = np.empty_like(z)
-        known = (self.table, self.axes, *self._arrays, self.substeps)
-        mean_features(z, a, end, *known, found, miss)
+        mean_features(z, a, end, *self._known, found, miss)
         return found, miss
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> Self:
-        own = shaped(arrays, cls.SHAPES)
-        table, axes = own.pop("table"), own.pop("axes").tolist()
-        _, components, n_x = own["coefficients"].shape
-        factors, shifts = table[:, 1 : 1 + MOST_FACTORS], table[:, 1 + MOST_FACTORS : -1]
-        counts, orders = table[:, 0], table[:, -1]
-        used = np.arange(MOST_FACTORS) < counts[:, None]
+        model = super().from_arrays(arrays)
+        (_, components, n_x), axes = model.coefficients.shape, model.axes.tolist()
+        counts, shifts = model.table[:, 0], model.table[:, 1 + MOST_FACTORS : -1]
+        factors = model.table[:, 1 : 1 + MOST_FACTORS]
         ranges = (
             (counts - 1, MOST_FACTORS),
-            (factors[used], components),
+            (factors[np.arange(MOST_FACTORS) < counts[:, None]], components),
             (shifts, n_x),
-            (orders, 1 + 2 * len(axes)),
+            (model.table[:, -1], 1 + 2 * len(axes)),
         )
         if not all((numbers >= 0).all() and (numbers < end).all() for numbers, end in ranges):
             raise ValueError(f"a model of {n_x} points on {len(axes)} axes has unknown terms")
         if min(axes, default=0) < 1 or math.prod(axes) != n_x:
             raise ValueError(f"a model of {n_x} points has axes of {shown(axes)}")
-        if components * n_x != len(own["constant"]):
-            raise ValueError(f"a model of {n_x} points has {len(own['constant'])} numbers")
-        features = tuple(
-            Feature(
-                tuple(row[1 : 1 + row[0]]), row[-1], tuple(ahead[: row[0]]) if any(ahead) else ()
-            )
-            for row, ahead in zip(table.tolist(), shifts.tolist(), strict=True)
-        )
-        checked_substeps(own["substeps"])
-        kind, shape = text_of(arrays, "kind"), tuple(axes) if len(axes) > 1 else ()
-        return cls(kind=kind, features=features, shape=shape, **own)
+        if components * n_x != model.n_z:
+            raise ValueError(f"a model of {n_x} points has {model.n_z} numbers")
+        checked_substeps(model.substeps)
+        return model
 
     @cached_property
-    def axes(self) -> Table:
-        """Grid points of each axis, also of a single one."""
-        return np.array(self.shape or self.coefficients.shape[2:], dtype=np.int64)
-
-    @cached_property
-    def _arrays(self) -> tuple[Array, Array, Array]:
-        return read_only(self.coefficients), read_only(self.B), read_only(self.constant)
+    def _known(self) -> tuple[Table, Table, Array, Array, Array, int]:
+        arrays = read_only(self.coefficients), read_only(self.B), read_only(self.constant)
+        return self.table, self.axes, *arrays, self.substeps
 
 
-def _filled(numbers: Sequence[int], value: int) -> list[int]:
-    return [*numbers, *(value,) * (MOST_FACTORS - len(numbers))]
+def of_features(
+    kind: str,
+    features: Sequence[Feature],
+    C: Array,
+    B: Array,
+    constant: Array,
+    substeps: int,
+    shape: tuple[int, ...] = (),
+) -> FiniteDifferenceModel:
+    """The equation of these features; shape: points of each axis, where there are several."""
+    n_x, rows = C.shape[2], []
+    for factors, order, shifts in features:
+        unused = MOST_FACTORS - len(factors)
+        ahead = [shift % n_x for shift in shifts or (0,) * len(factors)]
+        rows.append([len(factors), *factors, *(-1,) * unused, *ahead, *(0,) * unused, order])
+    axes = np.array(shape or (n_x,), dtype=np.int64)
+    table = np.array(rows, dtype=np.int64)
+    return FiniteDifferenceModel(kind, table, C, B, constant, substeps, axes)
 
 
 _POINT_PASSES = 4
@@ -505,7 +495,7 @@ def nothing(
     """The equation of which nothing is known: a field stays as it is."""
     n_z, n_a = samples.before.shape[1], samples.actions.shape[1]
     C = np.zeros((len(features), components, n_z // components))
-    return FiniteDifferenceModel(kind, features, C, np.zeros((n_z, n_a)), np.zeros(n_z), 8, shape)
+    return of_features(kind, features, C, np.zeros((n_z, n_a)), np.zeros(n_z), 8, shape)
 
 
 def largest_of(samples: Samples) -> float:
@@ -516,12 +506,9 @@ def largest_of(samples: Samples) -> float:
 def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
     """Enough internal steps for a field of that size, of `reach` over its fastest rate each."""
     # Of a second difference on a unit grid the largest rate is 4, of others 1.
-    growth = np.array(
-        [
-            len(m) * size ** (len(m) - 1) * (4.0 if j and j % 2 == 0 else 1.0)
-            for m, j, _ in model.features
-        ]
-    )
+    factors, orders = model.table[:, 0], model.table[:, -1]
+    second = (orders > 0) & (orders % 2 == 0)
+    growth = factors * size ** (factors - 1) * np.where(second, 4.0, 1.0)
     rate = float((np.abs(model.coefficients) * growth[:, None, None]).sum(axis=0).max())
     return int(np.clip(np.ceil(rate / reach), 2, _POINT_SUBSTEPS))
 
@@ -691,7 +678,7 @@ def fitted(
     kept = explaining(missed.columns(), ridge is None)
     fewer = replace(
         every,
-        features=tuple(every.features[f] for f in kept),
+        table=every.table[kept],
         coefficients=np.ascontiguousarray(every.coefficients[kept]),
     )
     return _passes(fewer, samples, ridge) or every
