@@ -28,7 +28,7 @@ from pdeloop.method.settings import Settings, setting
 
 LONGEST = 80
 """Steps of a plan, at most, unless the settings ask for more."""
-MOST_NUMBERS = 50_000
+MOST_NUMBERS = 130_000
 """Numbers of a model that a theta has room for: messages carry one for each environment."""
 _MODEL = "model."
 _KEPT_PLANS, _KEPT_PLANNERS = 4096, 8

@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
-from typing import Any
+from io import BytesIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pdeloop.messages.array_files import MAX_ARRAY_BYTES, packed_arrays, unpack_arrays
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.documents import parse_json
 from pdeloop.method.models.base import Arrays, FieldModel, text_of
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel
 from pdeloop.method.models.linear import LinearModel, ProjectedModel, ReadingsModel
@@ -39,72 +36,23 @@ def model_of(arrays: Arrays) -> FieldModel:
     return FORMS[form](arrays)
 
 
-LARGEST = 1e9
-"""Largest magnitude of a packed number: messages clip those of laws there."""
-_KINDS = {"f": np.float64, "c": np.complex128, "i": np.int64, "b": np.bool_}
-_BITS = 22
-
-
 def packed(arrays: Arrays) -> Array:
-    """Arrays as a vector of finite numbers of at most `LARGEST`, from which `unpacked` makes them.
+    """Arrays as whole numbers below 2^24, three bytes of an npz file in each after its length.
 
-    A directory, with all texts, comes first, as character codes. Arrays of numbers that are infinite,
-    or larger, are written as bits.
-
-    >>> found = unpacked(np.append(packed({"a": np.array([1.0, np.inf])}), np.zeros(3)))
-    >>> found["a"]
-    array([ 1., inf])
+    >>> unpacked(np.append(packed({"a": np.array([1.0, np.inf])}), np.zeros(3)))
+    {'a': array([ 1., inf])}
     """
-    directory, numbers = list[list[object]](), list[Array]()
-    for name, array in arrays.items():
-        kind, values = str(array.dtype.kind), np.ascontiguousarray(array).ravel()
-        if kind == "U":
-            directory.append([name, kind, array.item()])
-            continue
-        own = values.view(np.float64) if kind in "cf" else values.astype(np.float64)
-        if own.size and not np.abs(own).max() <= LARGEST:
-            kind, own = kind.upper(), _bits_of(values.astype(_KINDS[kind]))
-        directory.append([name, kind, list(array.shape)])
-        numbers.append(own)
-    text = np.frombuffer(json.dumps(directory).encode(), dtype=np.uint8).astype(np.float64)
-    return np.concatenate([[float(len(text))], text, *numbers])
+    content = packed_arrays(arrays)
+    parts = np.frombuffer(content + bytes(-len(content) % 3), np.uint8).reshape(-1, 3)
+    return np.append(float(len(content)), parts @ np.array([1.0, 2.0**8, 2.0**16]))
 
 
 def unpacked(numbers: Array) -> Arrays:
     """The arrays of a vector that begins as `packed` made it; ValueError for anything else."""
     try:
         length = int(numbers[0])
-        text, at = bytes(numbers[1 : 1 + length].astype(np.uint8)), 1 + length
-        arrays: Arrays = {}
-        for name, kind, shape in parse_json(text.decode()):
-            if kind == "U":
-                arrays[name] = np.array(str(shape))
-                continue
-            dtype: type[Any] = _KINDS[kind.lower()]
-            count = math.prod(shape)
-            words = count * np.dtype(dtype).itemsize // 8 if kind.lower() in "cf" else count
-            size = words if kind.islower() else 3 * words
-            own = numbers[at : at + size]
-            at += size
-            as_stored = _of_bits(own) if kind.isupper() else own
-            values: NDArray[Any] = as_stored.view(dtype)[:count]
-            if kind in "ib":
-                values = own.astype(dtype)
-            arrays[name] = values.reshape(shape).copy()
-        return arrays
-    except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        words = numbers[1 : 2 + length // 3].astype("<u4")
+        content = words.view(np.uint8).reshape(-1, 4)[:, :3].tobytes()[:length]
+        return unpack_arrays(BytesIO(content), MAX_ARRAY_BYTES)
+    except (IndexError, OverflowError, ValueError) as error:
         raise ValueError(f"the numbers are those of no arrays ({error})") from error
-
-
-def _bits_of(values: Array) -> Array:
-    words = values.view(np.uint64)
-    mask = np.uint64((1 << _BITS) - 1)
-    parts = [(words >> np.uint64(_BITS * i)) & mask for i in range(3)]
-    return np.concatenate(parts).astype(np.float64)
-
-
-def _of_bits(numbers: Array) -> Array:
-    parts = numbers.astype(np.uint64).reshape(3, -1)
-    words = parts[0] | parts[1] << np.uint64(_BITS) | parts[2] << np.uint64(2 * _BITS)
-    found: Array = words.view(np.float64)
-    return found
