@@ -21,8 +21,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.jit.cache import cached_njit
-from pdeloop.jit.simd import WIDTH, read, splat, write
+from pdeloop.jit.cache import cached_njit, jit
+from pdeloop.jit.simd import WIDTH, fma, lane_sum, load, read, splat, store, write
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.solver import polynomial
 from pdeloop.solver.kernel import force
@@ -31,29 +31,43 @@ from pdeloop.solver.polynomial import PLAN, SOURCES, by_action, integrate, pull_
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 from pdeloop.solver.spectra import analyse, get, put, synthesise
 
+MAGNITUDE = 2**63 - 1
+"""The bits of a number but for its sign."""
+
+
+@jit
+def dot(a: int, b: int, n: int) -> float:
+    """The inner product of the n numbers at two addresses, n a multiple of eight."""
+    total = splat(0.0)
+    for x in range(0, n, 8):
+        total = fma(load(a, x), load(b, x), total)
+    found: float = lane_sum(total)
+    return found
+
 
 @cached_njit(*SOURCES, polynomial)
 def roll(
-    v: Array, feedback: Array, constant: Array, B: Array, e: Array, bounds: Array, reach: Array,
-    kept: int, plans: NDArray[np.void], levels: NDArray[np.int64], states: Array, requested: Array,
-    actions: Array,
+    v: Array, feedback: Array, constant: Array, B: Array, e: Array, bounds: Array,
+    reach: NDArray[np.int64], kept: int, plans: NDArray[np.void], levels: NDArray[np.int64],
+    states: Array, requested: Array, actions: Array,
 ) -> None:  # fmt: skip
     """Write [z; p] (H + 1, n_x + n_p) from the first of them, [r; u] (H, n_a + n_p) and [a; 1].
 
-    B (n_p, n_a); e (H, n_x), or no row; kept: 1, or 0 without a tape; actions (H, n_a + 1).
+    reach: words of the numbers; B (n_p, n_a); e (H, n_x), or no row; kept: 1, or 0 without a tape;
+    actions (H, n_a + 1).
     """
     H, (n_p, n_a), n = len(v), B.shape, states.shape[1]
-    n_x = n - n_p
+    n_x, words = n - n_p, states.view(np.int64)
     for i in range(H):
-        largest, level = 0.0, 0
-        for x in range(n_x):
-            largest = max(largest, abs(states[i, x]))
-        while level < reach.size and not largest <= reach[level]:
+        largest, level, state = 0, 0, states.ctypes.data + 8 * n * i
+        for x in range(n_x):  # magnitudes are ordered as their words are, with NaN behind infinity
+            largest = max(largest, words[i, x] & MAGNITUDE)
+        while level < reach.size and largest > reach[level]:
             level += 1
         levels[i] = level
         for j in range(n_a + n_p):
-            total = constant[j] + v[i, j]
-            for x in range(n):
+            total = constant[j] + v[i, j] + dot(feedback.ctypes.data + 8 * n * j, state, n_x)
+            for x in range(n_x, n):
                 total += feedback[j, x] * states[i, x]
             requested[i, j] = total
         for j in range(n_a):
@@ -68,11 +82,12 @@ def roll(
         w, d, c, apart = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
         block = kept * 4 * plan.fine.m
         tape = plan.tape + i * plan.steps * block
-        analyse(states.ctypes.data + 8 * n * i, w, d, plan, c, apart)
+        if i == 0 or len(e) or level != levels[i - 1]:  # else the spectrum is there
+            analyse(state, w, d, plan, c, apart)
         force(actions.ctypes.data + 8 * (n_a + 1) * i, w, d, plan, c, apart)
         for s in range(plan.steps):
             integrate(w, d, plan, c, apart, tape + s * block)
-        synthesise(states.ctypes.data + 8 * n * (i + 1), w, d, plan, c, apart)
+        synthesise(state + 8 * n, w, d, plan, c, apart)
         if len(e):
             for x in range(n_x):
                 states[i + 1, x] += e[i, x]
@@ -116,10 +131,13 @@ def roll_back(
         for m in range(n_p):
             found[i, n_a + m] = eta[n_x + m]
         synthesise(eta.ctypes.data, w, d, plan, c, apart)
-        for x in range(n):
+        for x in range(0, n_x, 8):
+            lanes = load(on_states.ctypes.data, n * i + x) + load(eta.ctypes.data, x)
+            for j in range(n_a + n_p):
+                lanes = fma(splat(found[i, j]), load(feedback.ctypes.data, n * j + x), lanes)
+            store(eta.ctypes.data, x, lanes)
+        for x in range(n_x, n):
             total = on_states[i, x]
-            if x < n_x:
-                total += eta[x]
             for j in range(n_a + n_p):
                 total += feedback[j, x] * found[i, j]
             eta[x] = total
@@ -141,7 +159,10 @@ class PolynomialSweep:
     """
 
     def __init__(self, steps: Sequence[PolynomialStep], reach: Array, horizon: int) -> None:
-        self._steps, self._reach = tuple(steps), read_only(reach)  # alive: plans have addresses
+        self._steps, self._reach = (
+            tuple(steps),
+            read_only(reach).view(np.int64),
+        )  # with the plans' memory
         self._plans, self._scratch = np.zeros(len(steps), PLAN), list[Array]()
         for i, step in enumerate(steps):
             plan = step.plan.copy()
@@ -175,7 +196,7 @@ class PolynomialSweep:
         actions = np.empty((H, n_a + 1))
         states[0] = z
         first = read_only(v), read_only(feedback), read_only(constant), read_only(B), read_only(e)
-        given = *first, read_only(bounds), self._reach, int(kept)
+        given = *first, read_only(bounds), self._reach.view(np.int64), int(kept)
         roll(*given, self._plans, self._levels, states, requested, actions)
         return states, requested, actions[:, :-1]
 
