@@ -101,13 +101,14 @@ def renew(
 
     improved, parts: the laws after the last descents; fields (n, n_z): measured initial ones, field i
     of part i modulo the number of parts, whatever comes later, so that no law of a part ever sees its
-    fields; final: others end sooner, on fewer fields that are drawn.
+    fields; final: others end sooner, as those of parts do, on fewer fields that are drawn.
     """
-    least_gain = settings.least_gain if final else FIRST_GAIN
     curvature, designed = curvature_of(loop), loop.designed()
     others = [] if designed is None else [designed]
 
-    def descend(starts: Sequence[Array], fields: Array, most: int) -> Improvement | None:
+    def descend(
+        starts: Sequence[Array], fields: Array, most: int, least_gain: float = FIRST_GAIN
+    ) -> Improvement | None:
         """The law after a descent from the cheapest of some laws; most: fields to draw."""
         every, weights = weighted(fields, draw(fields, most))
         starts = [*starts, *others]
@@ -123,8 +124,9 @@ def renew(
                 found = again if again and again.after < found.after else found
         return found
 
+    least_gain = settings.least_gain if final else FIRST_GAIN
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
-        only = descend([first, improved], fields, 0)
+        only = descend([first, improved], fields, 0, least_gain)
         if only is None:
             return None
         before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, only.theta))
@@ -138,7 +140,7 @@ def renew(
             descend([first, own], fields[part_of != part], of_parts)
             for part, own in enumerate(starts)
         ]
-        best = descend([first, start], fields, drawn)
+        best = descend([first, start], fields, drawn, least_gain)
         if best is None:
             return None
         made = [law.theta if law else own for law, own in zip(found, starts, strict=True)]
