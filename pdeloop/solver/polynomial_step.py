@@ -56,7 +56,10 @@ class PolynomialStep:
     """
 
     def __init__(self, equation: Polynomials) -> None:
-        self._equation = equation
+        acting = equation.multipliers.any(axis=1)  # a part without effect is not transformed
+        self._equation = equation = equation._replace(
+            multipliers=equation.multipliers[acting], polynomials=equation.polynomials[acting]
+        )
         n_x, (parts, powers) = len(equation.constant), equation.polynomials.shape
         degree, steps = powers + 1, equation.steps
         self._n_x, self._last, self._degree = n_x, n_x // 2, degree
