@@ -299,7 +299,7 @@ def all_free(data: Regression) -> Symbols:
 
 
 _SETTLED = 1e-3
-"""Least relative decrease of the one-step error with which the passes go on."""
+"""Relative change of the one-step error at which the passes end."""
 
 _PASSES = 12
 """Number of times that an equation is refitted along the paths of the previous fit."""
@@ -318,23 +318,36 @@ def fit_spectral(
     samples = samples.thinned(_SAMPLES)
     largest = float(np.abs(samples.before).max())
     model = nothing(form, samples.before.shape[1], samples.actions.shape[1], largest)
-    best, least = None, np.inf
+    # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
+    best, least, tried = None, np.inf, model
     for turn in range(_PASSES + 1):
-        data = _regression(model, samples, form)
-        if data is None:
+        data = _regression(tried, samples, form)
+        if data is None and best is None:
             break
-        settled = not data.miss < (1.0 - _SETTLED) * least
-        if data.miss < least and turn:
-            best, least = model, data.miss
+        settled = data is not None and abs(data.miss - least) <= _SETTLED * least
+        if data is not None and data.miss < least and turn:
+            best, least = tried, data.miss
         if turn == _PASSES or (settled and turn > len(form.shares)):
             break
-        found = solved(data, model, form, turn)
+        if data is not None and (tried is best or turn <= len(form.shares)):
+            model, found = tried, solved(data, tried, form, turn)
+        else:
+            found = _between(best or model, tried)  # half of the way
         if found is None:
             break
-        model = replace(found, substeps=substeps_of(found.symbols, largest, settings))
+        tried = replace(found, substeps=substeps_of(found.symbols, largest, settings))
     if best is None:
         return None
     return replace(best, fewer=fewer_of(best.symbols, largest, best.substeps, settings))
+
+
+def _between(first: SpectralModel, second: SpectralModel) -> SpectralModel:
+    """The equation in the middle of two of the same form."""
+    middle = {
+        name: 0.5 * (getattr(first, name) + getattr(second, name))
+        for name in ("linear", "multipliers", "polynomials", "B", "constant")
+    }
+    return replace(second, **middle)
 
 
 def nothing(form: Form, n_z: int, n_a: int, largest: float) -> SpectralModel:
