@@ -24,7 +24,8 @@ from pdeloop.method.design import lqg, lqt
 from pdeloop.method.design.field_law import FieldLaw, field_law
 from pdeloop.method.design.lqg import with_dead_time
 from pdeloop.method.design.lqt import DesignError
-from pdeloop.method.laws.registry import field_model_settings, law_kind
+from pdeloop.method.laws.registry import law_kind
+from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models import FieldModelSettings
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, Channels

@@ -27,7 +27,7 @@ from pdeloop.messages.frames import Frame
 from pdeloop.messages.parameters import model_order, taken_by
 from pdeloop.messages.protocol import ModelFailure, Publication
 from pdeloop.messages.topics import Topic
-from pdeloop.method.laws.registry import shared_methods
+from pdeloop.method.method_settings import shared_methods
 from pdeloop.method.settings import parameters_of, with_defaults
 from pdeloop.process.affinity import pin_process
 from pdeloop.process.isolation import keep_on_this_machine

@@ -12,7 +12,7 @@ from pdeloop.messages.problem import load_parameters
 from pdeloop.messages.spec import OPTIMIZER_SETTINGS, ParameterError, Spec, flatten
 from pdeloop.method.adapt import Optimizer
 from pdeloop.method.adapt.registry import optimizer_kind
-from pdeloop.method.laws.registry import Method, law_of, shared_methods
+from pdeloop.method.method_settings import Method, law_of, shared_methods
 from pdeloop.method.settings import parameters_of, with_defaults
 
 

@@ -4,8 +4,6 @@
 Which code may be run: `pdeloop.messages.own_code`.
 
 Of calls of a law's methods return values are checked, and exceptions become one sentence.
-
-And the methods whose constants parameters set for controller and tuner alike.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,21 +20,13 @@ from pdeloop.messages.arrays import Array, float_array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.own_code import OwnCode, OwnCodeError, called
-from pdeloop.messages.parameters import LAW
-from pdeloop.messages.spec import (
-    FIELD_MODEL_SETTINGS,
-    IDENTIFICATION_SETTINGS,
-    LAW_SETTINGS,
-    ParameterError,
-)
+from pdeloop.messages.spec import LAW_SETTINGS
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Affine, FeedForward, Observer
 from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Auto, AutoKalman, Predictive, PredictiveKalman
-from pdeloop.method.models.settings import FieldModelSettings
-from pdeloop.method.reduce.reduced_model import IdentificationSettings
-from pdeloop.method.settings import Settings, settings_from
+from pdeloop.method.settings import settings_from
 from pdeloop.process.one_thread import one_thread
 
 _OURS = Affine, FeedForward, Observer, ExtendedKalman, Predictive, Auto, Neural
@@ -190,37 +180,3 @@ def _numbers(law: Law, method: str, size: int, function: Callable[..., Any], *gi
 
 def _called(name: str, method: str, function: Callable[..., Any], *given: Any) -> Any:
     return called(f"{name}.{method}", function, *given)
-
-
-FIELD_MODELS = "models of the whole field"
-
-
-class Method(NamedTuple):
-    """The prefix of a method's parameters, the class of its constants, and its name in errors."""
-
-    prefix: str
-    settings: type[Settings]
-    name: str
-
-
-def field_model_settings(values: Mapping[str, Any]) -> FieldModelSettings:
-    """The constants of field models that parameters give. ParameterError for one out of range."""
-    return settings_from(FIELD_MODEL_SETTINGS, FieldModelSettings, values, FIELD_MODELS)
-
-
-def law_of(values: Mapping[str, Any]) -> type[Law]:
-    """The class of the law that parameters name. ParameterError if there is none of that name."""
-    try:
-        return law_kind(str(values.get("law", LAW.default)))
-    except ValueError as error:
-        raise ParameterError(str(error)) from error
-
-
-def shared_methods(values: Mapping[str, Any]) -> list[Method]:
-    """The methods that controller and tuner must agree on: law, identification, field models."""
-    law = law_of(values)
-    return [
-        Method(LAW_SETTINGS, law.Settings, f"law '{values['law']}'"),
-        Method(IDENTIFICATION_SETTINGS, IdentificationSettings, "identification"),
-        Method(FIELD_MODEL_SETTINGS, FieldModelSettings, FIELD_MODELS),
-    ]
