@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import get_ident
@@ -69,6 +69,7 @@ class Predictive(Extended):
         super().__init__(model, horizon)
         self._planners: OrderedDict[tuple[int, bytes], Planner] = OrderedDict()
         self._plans: OrderedDict[bytes, tuple[Array, Array]] = OrderedDict()
+        self._last: tuple[tuple[Array, ...], bytes] = (), b""
 
     @property
     def longest(self) -> int:
@@ -119,12 +120,20 @@ class Predictive(Extended):
     def planner(self, theta: Parts) -> Planner:
         """The planner in theta; ValueError where its numbers are those of none."""
         # Its model may be used by one thread at a time.
-        key = get_ident(), self.vector(theta).tobytes()
+        key = get_ident(), self._digest(theta)
         known = self._planners.get(key)
         if known is None:
             known = self._planners[key] = self._made(theta, unpacked(theta["plan"]))
             while len(self._planners) > _KEPT_PLANNERS:
                 self._planners.popitem(last=False)
+        return known
+
+    def _digest(self, theta: Parts) -> bytes:
+        """Of theta, worked out once for the same arrays, which the steps of an episode have."""
+        arrays, (last, known) = tuple(theta.values()), self._last
+        if len(arrays) != len(last) or any(a is not b for a, b in zip(arrays, last, strict=True)):
+            known = _digest_of(arrays)
+            self._last = arrays, known
         return known
 
     def _made(self, theta: Parts, arrays: Mapping[str, Any]) -> Planner:
@@ -204,10 +213,7 @@ class Predictive(Extended):
 
     def _planned(self, theta: Parts, z: Array, memory: Array, k: int) -> tuple[Array, Array]:
         """The action (n_a,) and its plan (H, n_a), kept for `memory_update` because it takes long."""
-        seen = hashlib.blake2b(digest_size=16)
-        for part in (*theta.values(), z, memory, np.array(k)):
-            seen.update(np.ascontiguousarray(part).data)
-        key = seen.digest()
+        key = self._digest(theta) + _digest_of((z, memory, np.array(k)))
         known = self._plans.get(key)
         if known is None:
             planner, H = self.planner(theta), self.longest
@@ -220,6 +226,13 @@ class Predictive(Extended):
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
         return known
+
+
+def _digest_of(arrays: Sequence[Array]) -> bytes:
+    seen = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        seen.update(np.ascontiguousarray(array).data)
+    return seen.digest()
 
 
 class Auto(Predictive):
