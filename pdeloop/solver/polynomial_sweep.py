@@ -159,10 +159,8 @@ class PolynomialSweep:
     """
 
     def __init__(self, steps: Sequence[PolynomialStep], reach: Array, horizon: int) -> None:
-        self._steps, self._reach = (
-            tuple(steps),
-            read_only(reach).view(np.int64),
-        )  # with the plans' memory
+        self._steps = tuple(steps)  # alive: plans have addresses
+        self._reach = read_only(reach).view(np.int64)
         self._plans, self._scratch = np.zeros(len(steps), PLAN), list[Array]()
         for i, step in enumerate(steps):
             plan = step.plan.copy()
@@ -196,7 +194,7 @@ class PolynomialSweep:
         actions = np.empty((H, n_a + 1))
         states[0] = z
         first = read_only(v), read_only(feedback), read_only(constant), read_only(B), read_only(e)
-        given = *first, read_only(bounds), self._reach.view(np.int64), int(kept)
+        given = *first, read_only(bounds), self._reach, int(kept)
         roll(*given, self._plans, self._levels, states, requested, actions)
         return states, requested, actions[:, :-1]
 
