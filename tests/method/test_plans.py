@@ -155,7 +155,7 @@ def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others(
     np.testing.assert_allclose(a, z @ about.K.T + about.b, rtol=1e-6)
     assert not found.any()
     without = replace(own, terminal=False)
-    assert without.about is None
+    assert without.regulator is None
     assert np.array_equal(
         without.costs(none, z, 0), replace(affine, terminal=False).costs(none, z, 0)
     )

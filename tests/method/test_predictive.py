@@ -134,7 +134,7 @@ def test_theta_holds_which_law_a_plan_deviates_from() -> None:
     own = law()
     found = own.planner(own.parts(theta(own, regulated=True)))
     assert found.regulated and not own.planner(own.parts(theta(own))).regulated
-    assert own.is_extended(theta(own, regulated=True)) and found.about is not None
+    assert own.is_extended(theta(own, regulated=True)) and found.regulator is not None
 
 
 def test_plans_are_tried_around_the_law_of_the_whole_state_where_the_target_has_one() -> None:
@@ -387,6 +387,13 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
     assert sum("could_save" in row for row in rows) == (kind is Eager)
     assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["judged", "plans"])
+def test_a_checkpoint_that_has_judged_plans_without_having_any_is_refused(name: str) -> None:
+    own = optimizer(kind=Predictive)
+    with pytest.raises(ValueError, match="it has no law that plans"):
+        own.restore({**own.state(), name: np.array(True)})
 
 
 @pytest.mark.parametrize(("effect", "closed"), [(1e-3, False), (1.0, True)])

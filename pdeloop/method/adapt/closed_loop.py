@@ -266,10 +266,10 @@ class ClosedLoop:
 
     def designed(self) -> Array | None:
         """The law of the problem at the target; None where there is none."""
-        about = self.regulator
-        if about is None or len(self.memory_input) or self.model.n_z != len(self.U):
+        lqr = self.regulator
+        if lqr is None or len(self.memory_input) or self.model.n_z != len(self.U):
             return None
-        return np.hstack([about.K @ self.U, np.tile(about.b[:, None], self.constants)])
+        return np.hstack([lqr.K @ self.U, np.tile(lqr.b[:, None], self.constants)])
 
     def calmer(self, theta: Array, share: float) -> Array:
         """The law with this share of the gains of its actions, and the same action at the target."""

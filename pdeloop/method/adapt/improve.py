@@ -160,9 +160,9 @@ def index_of_cheapest(costs: Array, weights: Array) -> int:
 
 def curvature_of(loop: ClosedLoop) -> Array:
     """R + B^T P B of the model linearised at the target; R where there is none."""
-    R, about = loop.cost.action_matrix, loop.regulator
-    if about is not None:
-        found = R + about.B.T @ about.P[:-1, :-1] @ about.B
+    R, lqr = loop.cost.action_matrix, loop.regulator
+    if lqr is not None:
+        found = R + lqr.B.T @ lqr.P[:-1, :-1] @ lqr.B
         found = 0.5 * (found + found.T)
         if np.linalg.eigvalsh(found)[0] > 0.0:
             return loop.curvature(found)

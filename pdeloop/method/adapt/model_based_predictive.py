@@ -374,13 +374,13 @@ class ModelBasedPredictive(Optimizer):
             self._check(theta)
             costs, before = checked_array(state, "costs", "f", (2, None), finite=False)
             self._candidate = Candidate(theta, costs.copy(), before.copy())
-        if self._plans and self._candidate is None:
+        if (self._judged or self._plans) and self._candidate is None:
             raise ValueError("it has no law that plans")
 
 
 def around(plain: Planner) -> list[Planner]:
     """Plans around the trained law, and around that of the whole state where the target has one."""
-    return [plain, *([replace(plain, regulated=True)] if plain.about else [])]
+    return [plain, *([replace(plain, regulated=True)] if plain.regulator else [])]
 
 
 def ways_of(plain: Planner) -> list[Planner]:

@@ -278,10 +278,10 @@ def whole_field_law(
     loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings, modes: int
 ) -> WholeFieldLaw | None:
     """The best law of so many POD modes; None where none is finite."""
-    n, about = loop.model.n_z, loop.regulator
-    if about is None:
+    n, lqr = loop.model.n_z, loop.regulator
+    if lqr is None:
         return None
-    K, b = about.K, about.b
+    K, b = lqr.K, lqr.b
     first = loop.without_memory(np.eye(n), ClosedLoop)
     simulation = first.simulate(np.column_stack([K, b]), fields)
     seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])

@@ -283,10 +283,10 @@ def field_law(
         return report
     aim = target if weights is None else aim_of(scale.reference, target, weights)
     point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
-    about = regulator(model, cost, point, operating_inputs(trajectories))
-    if about is None:  # it grows beyond all bounds within the horizon
+    lqr = regulator(model, cost, point, operating_inputs(trajectories))
+    if lqr is None:  # it grows beyond all bounds within the horizon
         return report
-    K, b = about.K, about.b
+    K, b = lqr.K, lqr.b
     horizon = max(len(actions) for _, actions in trajectories)
     fields = [states[0] for states, _ in trajectories]
     if noise:
@@ -299,8 +299,8 @@ def field_law(
     K_a, s_r = K @ U, U.T @ target
     # There is no constant part where the target is outside of U.
     K_b, _ = target_gain(b, s_r)
-    d = U.T @ (point + about.drift - about.A @ point)
-    rows = ModelRows(A=U.T @ about.A @ U, B=U.T @ about.B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
+    d = U.T @ (point + lqr.drift - lqr.A @ point)
+    rows = ModelRows(A=U.T @ lqr.A @ U, B=U.T @ lqr.B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0

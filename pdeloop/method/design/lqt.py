@@ -28,9 +28,8 @@ const,
 backwards from P = E_T'E_T and p = E_T'w_T. b_k knows the targets that are still to come.
 
 `regulator`, about a point of a model that need not be an equilibrium, and with one target: the first
-step's law a = K z + b. The Riccati recursion of
-[e; 1] is doubled until it covers the horizon, rounded up to a power of two; it needs no stabilisable
-model.
+step's law a = K z + b. The Riccati recursion of [e; 1] is doubled until it covers the horizon, rounded
+up to a power of two; it needs no stabilisable model.
 
 References
 ----------

@@ -167,7 +167,7 @@ class Planner:
         """
         J, g, kept = np.empty(len(z)), np.empty_like(v), np.empty_like(v)
         given, K, b = self._given(v, k, *self._feedback)
-        self.about  # noqa: B018 - works with the model, which one thread may use at a time
+        self.regulator  # noqa: B018 - works with the model, which one thread may use at a time
 
         def work(sweep: Sweep, rows: slice) -> None:
             with np.errstate(all="ignore"):
@@ -292,11 +292,11 @@ class Planner:
         """K and b of the law that a plan deviates from."""
         if not self.around:
             return np.zeros_like(self.K), np.zeros_like(self.b)
-        about = self.about if self.regulated else None
-        return (self.K, self.b) if about is None else (about.K, about.b)
+        lqr = self.regulator if self.regulated else None
+        return (self.K, self.b) if lqr is None else (lqr.K, lqr.b)
 
     @cached_property
-    def about(self) -> Regulator | None:
+    def regulator(self) -> Regulator | None:
         """The linear-quadratic problem at the target, with V and a law; None without V."""
         found = regulator(self.model, self.cost) if self.terminal else None
         if found is None:
@@ -311,8 +311,8 @@ class Planner:
     def _metric(self) -> Array:
         """(R + B^T P B)^-1, or R^-1 where there is no cost to go."""
         R = self.cost.action_matrix
-        if self.about is not None:
-            R = R + self.about.B.T @ self.about.P[:-1, :-1] @ self.about.B
+        if self.regulator is not None:
+            R = R + self.regulator.B.T @ self.regulator.P[:-1, :-1] @ self.regulator.B
         found: Array = linalg.inv(0.5 * (R + R.T))
         return found
 
@@ -320,10 +320,10 @@ class Planner:
         """V (M,) of states (M, n_z) at step k, and dV/dz."""
         if k == self.cost.horizon:
             return self.cost.at_end(z)
-        if self.about is None:
+        if self.regulator is None:
             return np.zeros(len(z)), np.zeros_like(z)
         e = np.column_stack([z - self.cost.field_target, np.ones(len(z))])
-        on_e = np.einsum("mi,ij->mj", e, self.about.P)
+        on_e = np.einsum("mi,ij->mj", e, self.regulator.P)
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
 
 
