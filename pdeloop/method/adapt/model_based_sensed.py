@@ -42,7 +42,12 @@ from pdeloop.method.adapt.sensed_loop import (
     to_be_fitted,
     whole_field_law,
 )
-from pdeloop.method.adapt.settings import FIRST_GAIN, READINGS_TRUST, ModelBasedSettings
+from pdeloop.method.adapt.settings import (
+    FIRST_GAIN,
+    FIRST_RENEWAL,
+    READINGS_TRUST,
+    ModelBasedSettings,
+)
 from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
@@ -64,7 +69,10 @@ class ModelBasedReadings(ModelBased):
 
     def _scheduled(self, own: int) -> int:
         """A law is rolled out no more often than judges it: steps are short."""
-        return min(own + self._settings.judging, self._schedule.last)
+        schedule, every = self._schedule, self._settings.judging
+        first = max(FIRST_RENEWAL - schedule.known, 1)
+        following = first if own < first else own + every - (own - first) % every
+        return min(following, schedule.last)
 
     def _data(self) -> list[Record]:
         """All rollouts as they were measured: the model's filter knows their noise."""
@@ -157,9 +165,9 @@ class ModelBasedSensed(ModelBasedReadings):
 
     def _scheduled(self, own: int) -> int:
         """After as many rollouts as judge a law; on a model of the field later after twice as many."""
-        if self._sensed is None:
-            return super()._scheduled(own)
         last = self._schedule.last
+        if self._sensed is None:
+            return min(own + self._settings.judging, last)
         return 2 * own if 4 * own <= last else last
 
     def _none_tells(self) -> bool:
