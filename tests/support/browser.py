@@ -106,7 +106,8 @@ class Browser:
         return str(self.ask("document.body.innerText"))[:2000]
 
     def click(self, selector: str) -> None:
-        """A click of the mouse in the middle of an element."""
+        """A click of the mouse in the middle of an element, once it takes one."""
+        self.until(f"!document.querySelector({selector!r}).disabled", PATIENCE)
         x, y = self.ask(
             f"(() => {{ const r = document.querySelector({selector!r}).getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
