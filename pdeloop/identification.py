@@ -42,11 +42,11 @@ from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
     Residuals,
-    changed,
     fit_percent,
     largest_pole,
     residuals,
     stability,
+    structural_break,
     without_insignificant_effects,
 )
 from pdeloop.process.one_thread import one_thread
@@ -340,7 +340,7 @@ def identify_data(
         better = delays.text(found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     seen = shifted(found.trajectories, used)
-    if other := changed(seen):
+    if other := structural_break(seen):
         i, k, ratio = other
         place = f"step {k} of " * (k > 1) + _source_text(found.sources[i])
         text = (

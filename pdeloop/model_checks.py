@@ -177,7 +177,7 @@ def _negative_log_likelihood(model: InnovationModel, trajectories: Sequence[Traj
     return total
 
 
-def changed(trajectories: Sequence[Trajectory]) -> tuple[int, int, float] | None:
+def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, float] | None:
     """Where the states begin to follow the inputs otherwise: trajectory, its step, ratio of squares.
 
     Residuals of steps by regressions on two rows, of all data and of those before and after a step

@@ -10,7 +10,7 @@ from controller_node.identification import DesignSettings, designed
 from pdeloop.data_file import Measurements
 from pdeloop.identification import identify_data
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
-from pdeloop.model_checks import changed, without_insignificant_effects
+from pdeloop.model_checks import structural_break, without_insignificant_effects
 
 A = np.array([[0.92, 0.019], [0.014, 0.946]])
 B = np.array([[0.096, 0.02], [0.015, 0.073]])
@@ -86,14 +86,15 @@ def test_two_machines_in_one_log_are_told() -> None:
         x = REST + A @ (x - REST) + B @ np.array([new[min(k, 399), 0] - HELD[0], 0.0])
     other = stuck + 0.03 * np.random.default_rng(6).standard_normal(stuck.shape)
     one = np.concatenate([z[:-1], other]), np.concatenate([u, new])
-    place = changed([one])
+    place = structural_break([one])
     assert place is not None and place[0] == 0 and abs(place[1] - 900) < 50 and place[2] > 3.0
-    found = changed([(z, u), (other, new)])
+    found = structural_break([(z, u), (other, new)])
     assert found is not None and found[:2] == (1, 1)
     short = [(z[:91], u[:90]), (other[:91], new[:90])]
     names = [{"trajectory": 0}, {"trajectory": 1}]
     given = {"identification": "regression", "reduced_order": 2}
     told = identify_data(Measurements(short, None, 1.0, sources=names), given).warnings
     assert any("from about trajectory 1 on the states follow" in text for text in told)
-    assert changed([(z, u)]) is None and changed([(z[:401] + 30.0, u[:400]), (z, u)]) is not None
-    assert changed([(z[:301], u[:300]), log(2, np.zeros(600), 600)]) is None
+    assert structural_break([(z, u)]) is None
+    assert structural_break([(z[:401] + 30.0, u[:400]), (z, u)]) is not None
+    assert structural_break([(z[:301], u[:300]), log(2, np.zeros(600), 600)]) is None
