@@ -45,6 +45,8 @@ MISSING = (
 """Lower-case texts that stand for a missing value."""
 TIME = re.compile(r"(t|[Tt]ime)(_[a-zµμ]+|\s*[\[(][^\])]*[\])])?")
 """The column of times where none is named: t or time, also with its unit, as t_ms or Time [ms]."""
+HEAD = 30
+"""Lines above the numbers, at most, among which that of the names is looked for."""
 TARGET = "target"
 """The word in the column of t whose row has z_r."""
 
@@ -85,7 +87,7 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: s
     if separator == " " and first[:1] == ["#"]:
         first = first[1:]
     head = [name.strip().lstrip("#").strip() for name in first]
-    width = max((i for i, name in enumerate(head) if name), default=-1) + 1
+    width = _filled(head)
     head = head[:width]
     places = places_of(head, columns, timed)
     channels = Channels([head[i] for i in places.states], [head[i] for i in places.inputs])
@@ -161,7 +163,7 @@ def _lines(text: str) -> tuple[str, Iterator[tuple[int, list[str]]]]:
     """The separator that the line of names has, and from there on the rows with their numbers."""
     skipped, head, separator = _head(text)
     try:
-        fields = {s: len(next(csv.reader([head], delimiter=s), [])) for s in SEPARATORS}
+        fields = {s: len(_cells(head, s)) for s in SEPARATORS}
     except csv.Error as error:
         raise ValueError(f"it is not a table: {error} in row {skipped + 1}") from error
     if not separator:
@@ -173,12 +175,19 @@ def _lines(text: str) -> tuple[str, Iterator[tuple[int, list[str]]]]:
     return separator, _rows(source, skipped, separator)
 
 
+def _cells(line: str, separator: str) -> list[str]:
+    """The cells of a line."""
+    return line.split() if separator == " " else next(csv.reader([line], delimiter=separator), [])
+
+
 def _head(text: str) -> tuple[int, str, str]:
     """Number of lines before the line of names, that line, and the separator that one before names.
 
-    Lines that begin with # are remarks; the last of them is the line of names if numbers follow it.
+    Lines that begin with # are remarks; the last of them is the line of names if numbers follow it. Of
+    several lines above the numbers, as with a title or names of groups, it is the first of those with
+    the most different names, if these are as many as the numbers.
     """
-    separator, remark = "", (0, "")
+    separator, remark, above = "", (0, ""), list[tuple[int, str]]()
     for skipped, line in enumerate(io.StringIO(text, newline=None)):
         words = line.strip()
         if words.lower().startswith("sep=") and len(words) == 5:  # as spreadsheets ask for
@@ -187,9 +196,44 @@ def _head(text: str) -> tuple[int, str, str]:
             remark = skipped, words
         elif words:
             bare = words.lstrip("\"'+-.").lower()
-            numeric = bare[:1].isdigit() or bare.startswith(TARGET)
-            return (*remark, separator) if numeric and remark[1] else (skipped, line, separator)
-    return (*remark, separator)
+            numeric = bare[:1].isdigit() or bare.startswith(TARGET) or _has_numbers(line)
+            if not above and numeric and remark[1]:
+                return (*remark, separator)
+            if numeric or len(above) == HEAD:
+                return (*_names(above or [(skipped, line)], line, separator), separator)
+            above.append((skipped, line))
+    return (*(above[0] if above else remark), separator)
+
+
+def _names(above: Sequence[tuple[int, str]], numbers: str, separator: str) -> tuple[int, str]:
+    """Of the lines above the first one with numbers that of the names."""
+    best, most = above[0], 1
+    try:
+        for s in (separator,) if separator else (*SEPARATORS, " "):
+            row = _cells(numbers, s)
+            for place, line in above if len(above) > 1 and (s != " " or most == 1) else []:
+                names = _cells(line, s)
+                different = len({name.strip() for name in names if name.strip()})
+                whole = _filled(row) <= _filled(names) <= len(row)
+                if whole and different > most and not any(map(_is_number, names)):
+                    best, most = (place, line), different
+    except csv.Error:
+        pass  # as told of the first line
+    return best
+
+
+def _has_numbers(line: str) -> bool:
+    """Whether most cells of a line are numbers, by any separator."""
+    try:
+        cells = [_cells(line.strip(), s) for s in SEPARATORS]
+    except csv.Error:
+        return False
+    return any(2 * sum(map(_is_number, row)) > len(row) for row in cells)
+
+
+def _filled(cells: Sequence[str]) -> int:
+    """Number of cells up to the last one that is not empty."""
+    return max((i for i, cell in enumerate(cells) if cell.strip()), default=-1) + 1
 
 
 def _rows(source: io.StringIO, skipped: int, separator: str) -> Iterator[tuple[int, list[str]]]:

@@ -89,6 +89,12 @@ def test_separators_decimal_marks_ends_of_lines_and_encodings_are_those_of_the_f
         "# of 2026\n# " + text(PLAIN),  # as numpy.savetxt writes names
         text(PLAIN).replace("target", "Target"),
         text([*PLAIN[:-1], [*PLAIN[-1][:5], "NaN", "-"]]),
+        "Machine 7 of hall 2\nwritten on 2026-01-31, by its logger\n\n" + text(PLAIN),
+        text([["", "Tanks", "", "", "", "Pumps", ""], *PLAIN]),  # groups above the names
+        text(
+            [["Machine 7", *[""] * 6], NAMES, ["s", *["degC"] * 4, "%", "%"], *rows()],
+            separator=";",
+        ),
     ],
 )
 def test_what_else_programs_write_is_read(tmp_path: Path, content: str) -> None:
