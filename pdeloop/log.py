@@ -204,8 +204,12 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     single = [int(rows[part.start]) for part in parts if part.stop - part.start == 1]
     parts = [part for part in parts if part.stop - part.start > 1]
     if remedies.cut:
-        own = (dropped, ""), (single, " that stand alone between gaps")
-        left = [f"{len(k)} rows{what}, the first of them row {k[0]}" for k, what in own if k]
+        own = (dropped, ""), (single, " alone between gaps")
+        left = [
+            f"{len(k)} row{'s' * (len(k) > 1)}{what}, the first of them row {k[0]}"
+            for k, what in own
+            if k
+        ]
         remarks += [f"left out {', and '.join(left)}"] if left else []
     elif single:
         remarks.append(

@@ -45,6 +45,8 @@ DRIFT = 50.0
 """Variances by which a trend in time lowers the squares of residuals, from which the plant drifts."""
 PAST = 4
 """Rows of states and inputs beside which that trend counts."""
+UNLOGGED = 4.0
+"""Ratio of squares that are not explained where an input stands still to those elsewhere."""
 OFFSET = 20.0
 """Standard deviations between 0 and the mean of a channel with a large offset."""
 ONE = 1e-7
@@ -231,7 +233,7 @@ def findings(
     result += [Finding(text, nothing) for text in _offsets(values, channels)]
     result += [Finding(text, nothing) for text in _twins(values, rows, channels)]
     result += [Finding(text, nothing) for text in _drifts(states, inputs, first, channels)]
-    return result
+    return result + _stuck(states, inputs, first, rows, channels)
 
 
 def _sentence(
@@ -370,6 +372,51 @@ def _drifts(states: Array, inputs: Array, first: Flags, channels: Channels) -> l
         f"{names} {drift} through the log, and not by an input, which a model takes for slow modes and "
         f"wrong gains: give what drives {them} as an input, or take the trend out"
     ]
+
+
+def _stuck(
+    states: Array, inputs: Array, first: Flags, rows: NDArray[np.int64], channels: Channels
+) -> list[Finding]:
+    """Inputs that stand still in the log for long, while the states move as by one that does not.
+
+    Steps are explained by linear regressions on two rows, of those rows and of the others apart.
+    """
+    pair = np.flatnonzero(~(first[2:] | first[1:-1]))
+    known = np.hstack(
+        [np.ones((len(pair), 1)), *(x[pair + i] for x in (states, inputs) for i in (0, 1))]
+    )
+    step = states[pair + 2] - states[pair + 1]
+    least = 5 * known.shape[1]
+    if len(pair) < 2 * least or not (np.isfinite(known).all() and np.isfinite(step).all()):
+        return []
+    found = []
+    for j, u in enumerate(inputs.T):
+        runs = _Runs.of(u, first)
+        longest = int(np.argmax(runs.lengths))
+        begin, length = int(runs.begins[longest]), int(runs.lengths[longest])
+        own = (pair >= begin) & (pair + 1 < begin + length)
+        others = np.quantile(runs.lengths, 0.95)
+        if length < LONGER * others or min(own.sum(), (~own).sum()) < least:
+            continue
+        inside, outside = (
+            np.var(step[part] - known[part] @ linalg.lstsq(known[part], step[part])[0], axis=0)
+            for part in (own, ~own)
+        )
+        usual = np.maximum(outside, EXPLAINED**2 * np.var(step, axis=0))
+        moved = np.flatnonzero(inside > UNLOGGED * usual)
+        if moved.size:
+            spoilt = np.zeros(len(states), dtype=bool)
+            spoilt[begin : begin + length] = True
+            names = listed([channels.state(i) for i in moved.tolist()])
+            found.append(
+                Finding(
+                    f"{channels.input(j)} stands at {u[begin]:.6g} in {length} rows, from row "
+                    f"{rows[begin]} on, while {names} {'moves' if moved.size == 1 else 'move'} as by an "
+                    "input that is not in the log: leave them out with --cut",
+                    spoilt,
+                )
+            )
+    return found
 
 
 def _frozen(x: Array, runs: _Runs, held: Flags) -> Flags:

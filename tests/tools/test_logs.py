@@ -153,8 +153,25 @@ def test_rows_that_are_not_the_plants_are_told_and_left_out(
     assert re.match(words, text) and text.endswith("with --cut")
     found = read_measurements(path, cut=True)
     (text,) = found.remarks
-    assert text.startswith(f"left out {left_out} rows")
+    assert text.startswith(f"left out {left_out} row")
     np.testing.assert_allclose(poles(found), TRUE, atol=0.02)
+
+
+def test_an_input_that_stands_in_the_log_alone_is_told_and_left_out(tmp_path: Path) -> None:
+    """A model of all rows would have gains of its input that are three times too small."""
+    u = U.copy()
+    u[80:230, 1] = u[80, 1]
+    path = write(tmp_path / "own.csv", Z, u)
+    words = r"a2 stands at \S+ in 15\d rows, from row (8\d) on, while z2 and z3 move as by an input"
+    assert [re.match(words, text) is not None for text in read_measurements(path).remarks] == [True]
+    found = read_measurements(path, cut=True)
+    model = pdeloop.identify(*found.trajectories, n_s=3)
+    gains = model.U @ np.linalg.solve(np.eye(3) - model.A, model.B)
+    np.testing.assert_allclose(gains, np.linalg.solve(np.eye(3) - A, B), rtol=0.1)
+    z = np.zeros_like(Z)  # an input that did stand is none
+    for k in range(ROWS - 1):
+        z[k + 1] = A @ z[k] + B @ u[k] + (Z[k + 1] - A @ Z[k] - B @ U[k])
+    assert read_measurements(write(path, z, u)).remarks == ()
 
 
 @pytest.mark.parametrize(("turn", "swing"), [(360.0, 9.0), (65536.0, 3000.0), (2 * np.pi, 0.02)])
@@ -225,7 +242,7 @@ def test_rows_of_another_step_that_cut_leaves_out_are_told(tmp_path: Path) -> No
     path = write(tmp_path / "log.csv", Z[kept], U[kept], T[kept])
     found = read_measurements(path, cut=True)
     assert [len(a) for _, a in found.trajectories] == [150]
-    told = "left out 49 rows that stand alone between gaps, the first of them row 153"
+    told = "left out 49 rows alone between gaps, the first of them row 153"
     assert found.remarks == (told,)
 
 
