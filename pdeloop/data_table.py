@@ -94,17 +94,18 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: s
     target: Array | None = None
     values, rows, numbers = array("d"), array("q"), _Numbers(head, separator)
     stamps: list[str] = []
-    times, unit = array("d"), ""
+    times, unit, own_places = array("d"), "", (*places.states, *places.inputs)
     for row, line in numbered:
         if any(cell.strip() for cell in line[width:]) or len(line) < width:
             raise ValueError(
                 f"expected {width} values in row {row}, as in the line of names, got {len(line)}"
             )
         stamp = line[places.time].strip() if places.time >= 0 else ""
-        others = [line[i].strip() for i in (*places.states, *places.inputs)]
-        if not rows and target is None and _are_units(stamp, others):
-            unit = stamp.strip("[]() ")
-            continue
+        if not rows and target is None:
+            others = [line[i].strip() for i in own_places]
+            if _are_units(stamp, others):
+                unit = stamp.strip("[]() ")
+                continue
         if stamp.lower() == TARGET:
             if target is not None:
                 raise ValueError(
@@ -120,7 +121,7 @@ def read_table(raw: bytes, columns: Columns, *, timed: bool = True, time_unit: s
             stamps.append(stamp)
         elif places.time >= 0:
             times.append(numbers.time(stamp, row))
-        values.extend(numbers.read(line, i, row) for i in (*places.states, *places.inputs))
+        values.extend([numbers.read(line, i, row) for i in own_places])
     own = np.array(values).reshape(-1, len(places.states) + len(places.inputs))
     if places.time < 0:
         numbers_of_rows = np.arange(len(own), dtype=np.float64)
@@ -323,6 +324,11 @@ class _Numbers:
 
     def read(self, line: Sequence[str], i: int, row: int) -> float:
         """The number in a cell; NaN where it is missing."""
+        if self._mark == ".":  # as nearly always: a comma is no number then
+            try:
+                return float(line[i])
+            except ValueError:
+                pass
         return self._number(line[i].strip(), self._head[i], row)
 
     def time(self, text: str, row: int) -> float:

@@ -411,8 +411,8 @@ def _stuck(
             found.append(
                 Finding(
                     f"{channels.input(j)} stands at {u[begin]:.6g} in {length} rows, from row "
-                    f"{rows[begin]} on, while {names} {'moves' if moved.size == 1 else 'move'} as by an "
-                    "input that is not in the log: leave them out with --cut",
+                    f"{rows[begin]} on, while {names} {'moves' if moved.size == 1 else 'move'} as by "
+                    "an input that is not in the log: leave them out with --cut",
                     spoilt,
                 )
             )

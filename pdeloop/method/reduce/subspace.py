@@ -74,6 +74,8 @@ MANY = 48
 """The order above which `LONGER` pasts are tried."""
 FOLDS = 4
 """Parts of the trajectories, each held out once."""
+ENOUGH, LONG = 50_000, 200
+"""Steps in all that tell sizes apart, and those of a part that are taken anyway."""
 RESOLVED = 1e-10
 """Least singular value of the prediction from the past, relative to the largest."""
 SEPARATE = 1e-3
@@ -212,6 +214,8 @@ def _choose(
 ) -> tuple[int, int, Array]:
     """p and n with the least error on parts that were held out, and the errors of all, (K, 1 or 2)."""
     parts, units = _parts(known), units_of(known)
+    most = max(ENOUGH // len(parts), LONG)
+    parts = [(z[: most + 1], a[:most]) for z, a in parts]
     # Of each fold: squared errors, and what they are relative to.
     sums = np.zeros((2, min(len(parts), FOLDS), len(tried), 1 + simulations))
     for fold, (others, own) in enumerate(turns(parts, FOLDS)):
