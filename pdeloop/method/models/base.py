@@ -231,12 +231,12 @@ Values = NDArray[Any]
 """Real or complex."""
 
 
-def orthonormal(columns: Array) -> Array:
-    """An orthonormal basis of the space of columns, some of which may be zero or the same."""
-    scale = np.linalg.norm(columns, axis=0)
+def orthonormal(columns: Values) -> Values:
+    """Orthonormal columns of the space of columns (..., N, n), zeros where some are dependent."""
+    scale = np.linalg.norm(columns, axis=-2, keepdims=True)
     columns = columns / np.where(scale > 0.0, scale, 1.0)
     basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    kept: Array = basis[:, sizes > 1e-10 * sizes[0]]
+    kept: Values = basis * (sizes > 1e-10 * sizes[..., :1])[..., None, :]
     return kept
 
 

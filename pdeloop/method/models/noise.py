@@ -10,16 +10,6 @@ the least P_d over bands of short waves and orders is the largest sigma^2 that t
 short waves of a front that moves over several points between two states are white in time as well, but
 not in space, as they gather around it. A model decides then whether there is noise (`selection`).
 
-Whether residuals are white in time and space is a portmanteau test (`is_white`). Those of a wrong model
-are smooth, or gather where the field is steep, so that they or their squares are correlated with their
-neighbours, whereas of independent noise each of m sample correlations rho of N numbers is N(0, 1/N),
-and Q = N sum rho^2 chi-square (Box and Pierce; McLeod and Li for the squares). As even the best model
-errs by a small part of the noise, correlations of up to a tolerance tau are accepted, too,
-
-    sqrt(Q) <= tau sqrt(N) + sqrt(chi-square quantile of m at 1 - level),
-
-which rejects independent noise at most at the rate `level`, by the triangle inequality.
-
 In the fit of an equation with constant coefficients to noisy rollouts (`fit_noisy`) the regression of
 `fit_spectral` fails: within one sampling time the plant changes the field hardly more than the noise
 does, and at wavenumbers without signal the noise of a state, absent from the next one, looks like fast
@@ -49,9 +39,6 @@ selected.
 
 References
 ----------
-Box, Pierce, "Distribution of residual autocorrelations", J. Am. Stat. Assoc. 65, 1970. McLeod, Li,
-"Diagnostic checking ARMA time series models using squared-residual autocorrelations", J. Time Series
-Analysis 4, 1983.
 Messenger, Bortz, "Weak SINDy for partial differential equations", J. Comput. Phys. 443, 2021. Ljung,
 "System Identification", 2nd ed., chapters 7 and 16. James, Stein, "Estimation with quadratic loss",
 1961 (the entries of B). Anderson, Moore, "Optimal Filtering", chapters 4 and 9 (the filter).
@@ -70,7 +57,14 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import FieldModel, Measured, least_squares, usable, weighing
+from pdeloop.method.models.base import (
+    FieldModel,
+    Measured,
+    least_squares,
+    orthonormal,
+    usable,
+    weighing,
+)
 from pdeloop.method.models.settings import (
     COEFFICIENT_RIDGE,
     FAR,
@@ -99,6 +93,8 @@ LEAST = 1e-3
 """Smallest noise, relative to the root mean square of the states; below, it changes no fit."""
 LOCAL = 0.3
 """Root sum of squares of the correlations in space with which differences count as white."""
+LAGS = 4
+"""Neighbours with which they are correlated."""
 FEWEST = 200
 """Coefficients of a band below which its powers are too uncertain."""
 
@@ -172,9 +168,13 @@ def _powers(usable: Sequence[Array]) -> Array | None:
 
 def _is_local(trajectories: Sequence[Array]) -> bool:
     """True if short waves of differences in time, or their squares, are correlated in space."""
-    short = [short_waves(np.diff(states, axis=0)) for states in trajectories]
-    _, in_space, _, squares_in_space = np.split(correlations(short)[0], 4)
-    return bool(np.sum(in_space**2) + np.sum(squares_in_space**2) > LOCAL**2)
+    short = np.concatenate([short_waves(np.diff(states, axis=0)) for states in trajectories])
+    total = 0.0
+    for values in (short - short.mean(), short**2 - np.mean(short**2)):
+        shifted = [np.roll(values, lag, axis=1) for lag in range(1, LAGS + 1)]
+        rho = [np.sum(values * other) for other in shifted] / max(np.sum(values**2), 1e-300)
+        total += float(np.sum(rho**2))
+    return total > LOCAL**2
 
 
 def short_waves(states: Array) -> Array:
@@ -187,41 +187,6 @@ def short_waves(states: Array) -> Array:
     spectra[:, 0] = np.sqrt(2.0) * spectra[:, 0].real  # the mean of the series, which is real
     found: Array = scipy.fft.irfft(spectra, 2 * (spectra.shape[1] - 1))
     return found
-
-
-LAGS = 4
-"""Neighbours in time, and in space, with which residuals are correlated."""
-
-
-def correlations(residuals: Sequence[Array]) -> tuple[Array, int]:
-    """Sample correlations of residuals (L, n) with their neighbours, and N, the count of numbers.
-
-    4 LAGS of them: of the residuals in time and in space, and of their squares in time and in space.
-    """
-    count = sum(own.size for own in residuals)
-    found = []
-    for parts in (residuals, [own**2 for own in residuals]):
-        mean = sum(float(own.sum()) for own in parts) / count
-        centred = [own - mean for own in parts]
-        total = max(sum(float(np.sum(own**2)) for own in centred), 1e-300)
-        for lag in range(1, LAGS + 1):
-            found.append(sum(float(np.sum(own[lag:] * own[:-lag])) for own in centred) / total)
-        for lag in range(1, LAGS + 1):
-            found.append(sum(float(np.sum(own * np.roll(own, lag, 1))) for own in centred) / total)
-    return np.array(found), count
-
-
-def is_white(residuals: Sequence[Array], level: float, tolerance: float = 0.0) -> bool:
-    """True unless residuals (L, n) are correlated beyond the tolerance; False without any.
-
-    level: rate at which independent ones with finite fourth moments are rejected.
-    """
-    residuals = [own for own in residuals if len(own) > LAGS]
-    if not residuals or not all(np.isfinite(own).all() for own in residuals):
-        return False
-    rho, count = correlations(residuals)
-    limit = np.sqrt(scipy.special.chdtri(len(rho), level))
-    return bool(np.sqrt(count * np.sum(rho**2)) <= tolerance * np.sqrt(count) + limit)
 
 
 def denoised(states: Array, noise: float) -> Array:
@@ -276,34 +241,27 @@ def signal_power(spectra: NDArray[Any], noise: float, points: int) -> tuple[Arra
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """States of rollouts, (L + 1, n_z) each, and the model's predictions of them.
+    """States of rollouts, (L + 1, n_z) each, and how well the model predicted them.
 
-    innovations: measured minus predicted states, (L, n_z) each; power: their mean at each wavenumber;
-    lost: predictions that were not finite, in whose place the last state stood.
+    power: mean one of measured minus predicted states at each wavenumber; lost: predictions that were
+    not finite, in whose place the last state stood.
     """
 
     states: list[Array]
-    innovations: list[Array]
     power: Array
     lost: int
 
 
 def filtered(
-    model: FieldModel,
-    rollouts: Sequence[Measured],
-    first: Sequence[Array],
-    shares: Array,
-    *,
-    settling: bool = False,
+    model: FieldModel, rollouts: Sequence[Measured], first: Sequence[Array], shares: Array
 ) -> Filtered:
     """The states of rollouts, each with one state more than actions.
 
-    first: their initial states; shares: g, of each wavenumber; settling: at least 1/(k + 2), that of an
-    unknown state that rests. A prediction far beyond the measured states is rejected.
+    first: their initial states; shares: g, of each wavenumber. A prediction far beyond the measured
+    states is rejected.
     """
     n_z, z = model.n_z, np.array(first)
     found = [np.empty(rollout.states.shape) for rollout in rollouts]
-    innovations = [np.empty(own[1:].shape) for own in found]
     for own, state in zip(found, z, strict=True):
         own[0] = state
     lengths = np.array([len(rollout.actions) for rollout in rollouts])
@@ -318,13 +276,12 @@ def filtered(
         predicted[wrong] = z[rows][wrong]
         left = np.stack([rollouts[i].states[k + 1] for i in rows]) - predicted
         innovation = scipy.fft.rfft(left) / n_z
-        own_shares = np.maximum(shares, 1.0 / (k + 2)) if settling else shares
-        z[rows] = predicted + n_z * scipy.fft.irfft(own_shares * innovation, n_z)
-        for i, own in zip(rows, left, strict=True):
-            found[i][k + 1], innovations[i][k] = z[i], own
+        z[rows] = predicted + n_z * scipy.fft.irfft(shares * innovation, n_z)
+        for i in rows:
+            found[i][k + 1] = z[i]
         total += np.sum(np.abs(innovation) ** 2, axis=0)
         count, lost = count + len(rows), lost + int(wrong.sum())
-    return Filtered(found, innovations, total / count, lost)
+    return Filtered(found, total / count, lost)
 
 
 _NOISY_STEPS = 2000
@@ -543,16 +500,7 @@ def _regression(
         W=total.reshape(len(W), -1, cut),
         phi=phi,
         common=columns,
-        free_of_common=_orthonormal(columns),
+        free_of_common=orthonormal(columns),
         miss=0.0,
         lost=int(ok.sum()),
     )
-
-
-def _orthonormal(columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Orthonormal columns of the space of those of each wavenumber; zeros where some are dependent."""
-    scale = np.linalg.norm(columns, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(
-        columns / np.where(scale > 0.0, scale, 1.0), full_matrices=False
-    )
-    return left * (values > 1e-10 * values[:, :1])[:, None]

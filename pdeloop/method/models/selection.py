@@ -24,11 +24,7 @@ rests, as at a stop.
 Noise that nobody declared is accepted only where a model says so. It cannot be predicted: unless a
 model without noise predicts the rollouts better than noise of the level that their differences allow
 (`noise_level`) would let it, an equation is fitted for that noise. The noise is there if this equation
-predicts rollouts that it was not fitted to better than any model without noise, and if what it does not
-predict of the short waves is measurement noise: its innovations there, along filtered states, have that
-level and are white in time and space (`is_white`). Those of a front that is narrower than the grid are
-not: they gather around it. Long waves are judged by the prediction, as their innovations hold the
-equation's own errors.
+predicts rollouts that it was not fitted to better than any model without noise.
 """
 
 from __future__ import annotations
@@ -40,7 +36,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # whose transforms, a tenth of a start, load when they are used
 
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
@@ -65,18 +60,14 @@ from pdeloop.method.models.finite_difference import (
 from pdeloop.method.models.linear import fit_coarse, fit_convolution, fit_linear, fit_low_rank
 from pdeloop.method.models.noise import (
     cleaned_states,
-    filtered,
     fit_noisy,
-    is_white,
     noise_level,
     share_of_noise,
-    short_waves,
 )
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
 from pdeloop.method.models.settings import (
     BETTER,
     DEFAULTS,
-    LEAST_CORRECTION,
     NOISE_MISJUDGED,
     FieldModelSettings,
 )
@@ -307,19 +298,8 @@ CHAOTIC_GROWTH = 20.0
 NEAR = (10.0, 3.0, 1.0)
 """Distances from the target, relative to the largest of initial states, of beginnings."""
 
-_NOISE_EXCESS = 1.3
-"""Largest root mean square of the innovations of an equation, relative to the noise."""
-_WHITE_LEVEL = 0.01
-"""Rate at which the test for white innovations rejects independent noise."""
-_WHITE_TOLERANCE = 0.5
-"""Root sum of squares of the correlations of innovations that counts as white."""
-
 PREDICTED = 0.5
 """E of a model without noise, relative to the share of the noise, below which there is no noise."""
-_BEGINNING = 8
-"""Innovations of a rollout that are left out, as those of its uncertain initial state."""
-_TURNS = 4
-"""Times that the filter's shares are computed from its innovations."""
 _GROWN = 10.0
 """E that the noise of an initial state may lead to, per share of the noise in the states."""
 
@@ -535,17 +515,6 @@ class Selection:
         found = replace(self, noise=noise).fit(known, knows_noise=True)
         if found is None or found.error > ACCEPTED_NOISY or not found.error < better_than:
             return None
-        known = with_clean([limited(rollout, self.action_set) for rollout in known], noise)
-        with one_thread():
-            left = innovations(found.model, known, noise)
-        if left is None:
-            return None
-        short = [short_waves(own) for own in left]
-        if not is_white(short, _WHITE_LEVEL, _WHITE_TOLERANCE):
-            return None
-        size = float(np.sqrt(np.mean(np.concatenate(short) ** 2)))
-        if size > _NOISE_EXCESS * noise:
-            return None
         return replace(found, rollouts=rollouts, most=ACCEPTED_NOISY, noise=noise)
 
     def _of_pieces(
@@ -585,21 +554,3 @@ def _moved(rollouts: Sequence[Measured]) -> list[bool]:
     """Which inputs moved."""
     every = zip(*(own.actions.T for own in rollouts), strict=True)
     return [bool(np.ptp(np.concatenate(own)) > 0.0) for own in every]
-
-
-def innovations(
-    model: FieldModel, rollouts: Sequence[Measured], noise: float
-) -> list[Array] | None:
-    """Measured minus predicted states along filtered ones, but for the first; None: it runs away."""
-    power = noise**2 / model.n_z
-    shares = np.full(model.n_z // 2 + 1, 0.5)
-    for _ in range(_TURNS):
-        first = [rollout.known[0] for rollout in rollouts]
-        along = filtered(model, rollouts, first, shares, settling=True)
-        if along.lost:
-            return None
-        left = [own[_BEGINNING:] for own in along.innovations]
-        spectra = np.concatenate([scipy.fft.rfft(own) / model.n_z for own in left])
-        error = np.maximum(np.mean(np.abs(spectra) ** 2, axis=0) - power, 0.0)
-        shares = np.clip(error / (error + power), LEAST_CORRECTION, 1.0)
-    return left
