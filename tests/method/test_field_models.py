@@ -15,8 +15,7 @@ from scipy.integrate import solve_ivp
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import read_only
 from pdeloop.method.models import Measured, affine_law
-from pdeloop.method.models.base import errors, pieces, predicted
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import errors, model_of, pieces, predicted
 from pdeloop.method.models.finite_difference import (
     advance,
     features_of,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pdeloop.method.models import Measured
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from tests.support.fitted import fit_field_model
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from pdeloop.method.models import FieldModel
-from pdeloop.method.models.base import MAX_SUBSTEPS
-from pdeloop.method.models.files import FORMS, model_of
+from pdeloop.method.models.base import FORMS, MAX_SUBSTEPS, model_of
 from pdeloop.method.models.finite_difference import (
     features_of,
     neighbour_features,

@@ -15,6 +15,7 @@ from pdeloop.evaluation import evaluate
 from pdeloop.export import law_of
 from pdeloop.finished_run import merged
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.array_files import packed, unpacked
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
@@ -30,7 +31,6 @@ from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto
 from pdeloop.method.laws.registry import action, updated
-from pdeloop.method.models.files import packed, unpacked
 from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.settings import Settings

@@ -28,7 +28,7 @@ from pdeloop.method.adapt.verdict import (
 )
 from pdeloop.method.design.lqg import law_of_innovations
 from pdeloop.method.laws import Observer
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.reduce.subspace import subspace_model
 

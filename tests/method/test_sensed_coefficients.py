@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,

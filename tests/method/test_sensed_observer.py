@@ -19,7 +19,7 @@ from pdeloop.method.adapt.sensed_loop import (
 )
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Observer
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     TERMS,

@@ -8,7 +8,7 @@ import pytest
 
 from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.models import Measured, linear
-from pdeloop.method.models.files import model_of
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.finite_difference import (
     Feature,
     FiniteDifferenceModel,

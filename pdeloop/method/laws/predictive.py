@@ -14,15 +14,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pdeloop.messages.action_set import ActionSet
-from pdeloop.messages.array_files import checked_array
+from pdeloop.messages.array_files import checked_array, packed, unpacked
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Extended
 from pdeloop.method.laws.plans import Planner
-from pdeloop.method.models.base import Arrays, FieldModel
-from pdeloop.method.models.files import model_of, packed, unpacked
+from pdeloop.method.models.base import Arrays, FieldModel, model_of
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.settings import Settings, setting
 

@@ -51,7 +51,7 @@ class FieldModel(Protocol):
         """A (n_z, n_z) and B (n_z, n_a), the derivatives of `step` at one point."""
 
     def arrays(self) -> Arrays:
-        """The model as arrays, from which `pdeloop.method.models.files.model_of` makes it again."""
+        """The model as arrays, from which `model_of` makes it again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +156,19 @@ class Samples:
         return weights
 
 
+FORMS: dict[str, Callable[[Arrays], Any]] = {}
+"""What makes a model of each form again."""
+
+
+def model_of(arrays: Arrays) -> FieldModel:
+    """The model whose `arrays` these are, the same to the bit; ValueError for no such form."""
+    form = text_of(arrays, "form")
+    if form not in FORMS:
+        raise ValueError(f"a field model is of the form {form!r}; expected one of {list(FORMS)}")
+    model: FieldModel = FORMS[form](arrays)
+    return model
+
+
 class StoredModel:
     """What models made of arrays have in common.
 
@@ -168,6 +181,9 @@ class StoredModel:
     kind: str
     constant: Array
     B: Array
+
+    def __init_subclass__(cls) -> None:
+        FORMS[cls.FORM] = cls.from_arrays
 
     @property
     def n_z(self) -> int:

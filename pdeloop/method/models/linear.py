@@ -25,7 +25,7 @@ Ljung, "System Identification: Theory for the User", 2nd ed., section 4.3 (innov
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -36,7 +36,14 @@ from numpy.typing import NDArray
 from pdeloop.jit.cache import cached_njit
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
-from pdeloop.method.models.base import Arrays, FieldModel, Samples, StoredModel
+from pdeloop.method.models.base import (
+    FORMS,
+    Arrays,
+    FieldModel,
+    Samples,
+    StoredModel,
+    model_of,
+)
 from pdeloop.method.models.finite_difference import FiniteDifferenceModel, fit_finite_difference
 from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 from pdeloop.method.reduce.reduced_model import Trajectory, turns
@@ -192,15 +199,16 @@ class ProjectedModel:
         return inner | own | {"form": np.array(self.FORM)}
 
     @classmethod
-    def from_arrays(
-        cls, arrays: Arrays, model_of: Callable[[Arrays], FieldModel]
-    ) -> ProjectedModel:
-        """The model of `arrays`; model_of: that of the inner one's."""
+    def from_arrays(cls, arrays: Arrays) -> ProjectedModel:
+        """The model of `arrays`."""
         inner = model_of(
             {name.removeprefix(_INNER): a for name, a in arrays.items() if name.startswith(_INNER)}
         )
         P = checked_array(arrays, "prolongation", "f", (None, inner.n_z))
         return cls(inner, checked_array(arrays, "restriction", "f", (inner.n_z, len(P))), P)
+
+
+FORMS[ProjectedModel.FORM] = ProjectedModel.from_arrays
 
 
 def _products(rows: Array, matrix: Array) -> Array:
