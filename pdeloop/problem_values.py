@@ -17,7 +17,7 @@ from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.parameters import LAW
 from pdeloop.messages.problem import find_problem, read_problem
 from pdeloop.messages.spec import flatten
-from pdeloop.method.models.settings import SENSED_MOST
+from pdeloop.method.models.sensed import SENSED_MOST
 from pdeloop.method.reduce.input_delay import LATEST
 from tuner_node.build import few_sensors
 from tuner_node.optimizer_parameters import training_parameters

@@ -15,7 +15,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
 from pdeloop.method.adapt import Context, Record, Rollout, RolloutResult, Trajectory
 from pdeloop.method.laws import Affine, Law
-from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
 
 
 class DispatchError(RuntimeError):

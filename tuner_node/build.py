@@ -27,7 +27,7 @@ from pdeloop.method.laws.neural import Neural
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
-from pdeloop.method.models.settings import SENSED_MOST
+from pdeloop.method.models.sensed import SENSED_MOST
 from pdeloop.method.reduce.snapshots import LARGE
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher

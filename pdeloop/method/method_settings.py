@@ -15,7 +15,7 @@ from pdeloop.messages.spec import (
 )
 from pdeloop.method.laws.base import Law
 from pdeloop.method.laws.registry import law_kind
-from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.models.base import FieldModelSettings
 from pdeloop.method.reduce.reduced_model import IdentificationSettings
 from pdeloop.method.settings import Settings, settings_from
 

@@ -8,9 +8,8 @@ from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Context, Record, Trajectory
 from pdeloop.method.adapt.belief import believe
 from pdeloop.method.models import Measured
-from pdeloop.method.models.base import errors
+from pdeloop.method.models.base import FieldModelSettings, errors
 from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.settings import FieldModelSettings
 
 N_Z, N_A, STEPS = 9, 2, 20
 

@@ -26,13 +26,13 @@ from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.laws.base import differentiable
 from pdeloop.method.laws.registry import MAX_NUMBER, action, along
+from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     WAVES,
     SensedFilter,
     coefficients_of,
     field_of,
 )
-from pdeloop.method.models.settings import DEFAULTS
 from tests.support.estimated import (
     CUBIC,
     LINEAR,

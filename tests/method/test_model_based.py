@@ -30,7 +30,7 @@ from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
 from pdeloop.method.design.lqt import track
 from pdeloop.method.models import Measured
-from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.models.base import FieldModelSettings
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.fitted import fit_field_model
 from tests.support.small import same_bits

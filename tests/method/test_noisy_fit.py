@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Measured, Samples, errors
+from pdeloop.method.models.base import FieldModelSettings, Measured, Samples, errors
 from pdeloop.method.models.noise import filtered, fit_noisy, significant, smoothed
 from pdeloop.method.models.selection import FORMS, with_clean
-from pdeloop.method.models.settings import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel, fit_spectral
 from tests.support.fitted import fit_field_model
 

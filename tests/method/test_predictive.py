@@ -31,7 +31,7 @@ from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto
 from pdeloop.method.laws.registry import action, updated
-from pdeloop.method.models.settings import FieldModelSettings
+from pdeloop.method.models.base import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.settings import Settings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral

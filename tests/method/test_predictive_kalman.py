@@ -25,7 +25,8 @@ from pdeloop.method.laws import ExtendedKalman
 from pdeloop.method.laws.plans import Planner, planned, simulated
 from pdeloop.method.laws.predictive import PredictiveKalman
 from pdeloop.method.laws.registry import action, along, updated
-from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED
+from pdeloop.method.models.base import DEFAULTS
+from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED
 from tests.support import sensed_optimiser
 from tests.support.estimated import (
     CUBIC,

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 import pdeloop
 from pdeloop.episode import rollout
+from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     SHARED,
@@ -23,8 +24,7 @@ from pdeloop.method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
-from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED
+from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED, fit_sensed, initial_field
 from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import model_of
+from pdeloop.method.models.base import DEFAULTS, model_of
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
@@ -23,7 +23,6 @@ from pdeloop.method.models.sensed import (
     well_posed,
 )
 from pdeloop.method.models.sensed_fit import Fitted, fit_sensed
-from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import DECLARED, SENSORS, readings_of
 from tests.support.small import same_bits
 

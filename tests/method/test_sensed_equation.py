@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
@@ -20,7 +21,6 @@ from pdeloop.method.models.sensed import (
     well_posed,
 )
 from pdeloop.method.models.sensed_fit import SensedFlow, fit_sensed
-from pdeloop.method.models.settings import DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 from tests.support.small import same_bits

@@ -13,8 +13,8 @@ from pdeloop.episode import rollout
 from pdeloop.messages.actuators import extents
 from pdeloop.method.adapt import Context, Record, Trajectory
 from pdeloop.method.adapt.sensed_loop import sensed_from
+from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import COEFFICIENTS, SHARED, SensedModel
-from pdeloop.method.models.settings import DEFAULTS
 from tests.support.sensed import SENSORS
 
 T = 12

@@ -25,8 +25,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.method.laws.base import Law
 from pdeloop.method.laws.linear import Linear, Observer
+from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.sensed import Actuators
-from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
 from pdeloop.method.seeds import field_seed
 from pdeloop.method.settings import Settings as _Settings
 

@@ -15,11 +15,10 @@ from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, ReplayedLoo
 from pdeloop.method.adapt.sensed_loop import sensed_loop
 from pdeloop.method.laws.linear import Observer, at_step
 from pdeloop.method.models import FieldModel, Measured, affine_law
-from pdeloop.method.models.base import model_of
+from pdeloop.method.models.base import FAR, model_of
 from pdeloop.method.models.linear import ReadingsModel, fit_readings
 from pdeloop.method.models.selection import Selection
 from pdeloop.method.models.sensed import SensedModel
-from pdeloop.method.models.settings import FAR
 
 _MODEL = "model."
 _NUMBERS = {"error": "f", "whole": "b"}

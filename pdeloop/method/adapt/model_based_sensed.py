@@ -51,7 +51,7 @@ from pdeloop.method.adapt.settings import (
 from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
-from pdeloop.method.models.settings import SENSED_REPRODUCED
+from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED
 
 
 class ModelBasedReadings(ModelBased):

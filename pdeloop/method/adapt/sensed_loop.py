@@ -53,7 +53,9 @@ from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.plans import Act, Planner, simulated
+from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.sensed import (
+    SENSED_MOST,
     WAVES,
     SensedFilter,
     SensedModel,
@@ -61,15 +63,10 @@ from pdeloop.method.models.sensed import (
     interpolated,
     sensed_model,
 )
-from pdeloop.method.models.sensed_fit import fit_sensed, initial_field
-from pdeloop.method.models.settings import (
-    DEFAULTS,
-    SENSED_MOST,
-    SENSED_NEWEST,
-    SENSED_REPRODUCED,
-    FieldModelSettings,
-)
+from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED, fit_sensed, initial_field
 
+SENSED_NEWEST = 8
+"""Maximum number of rollouts in a fit, the newest ones."""
 _LARGEST_COST = 3.0
 """Maximum cost of a rollout in a fit, per cost of the exploration."""
 _EXTRAPOLATION = 1.5

@@ -40,10 +40,12 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqt import LARGEST, regulator, target_gain
 from pdeloop.method.models import FieldModel, FieldModelSettings, FittedModel, Measured, affine_law
+from pdeloop.method.models.base import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
 from pdeloop.method.models.selection import (
+    BETTER,
     UNKNOWN,
     Accuracy,
     Kind,
@@ -51,8 +53,6 @@ from pdeloop.method.models.selection import (
     limited,
     scale_of,
 )
-from pdeloop.method.models.settings import BETTER
-from pdeloop.method.models.settings import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,

@@ -12,7 +12,9 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Law, Parts
 from pdeloop.method.laws.linear import Observer
+from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.sensed import (
+    SENSED_MOST,
     WAVES,
     Actuators,
     SensedFilter,
@@ -20,7 +22,6 @@ from pdeloop.method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from pdeloop.method.models.settings import DEFAULTS, SENSED_MOST, FieldModelSettings
 
 FIELD_COEFFICIENTS = 1 + 2 * WAVES
 """Fourier coefficients of an initial field."""

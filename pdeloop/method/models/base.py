@@ -14,12 +14,48 @@ from numpy.typing import NDArray
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
+from pdeloop.method.settings import Settings, setting
 
 MAX_SUBSTEPS = 2000
 """Most internal steps of a sampling time: twice what `FieldModelSettings` can ask for."""
+COEFFICIENT_RIDGE = 1e-9
+"""Ridge of the normal equations in normalised columns."""
+FAR = 1e3
+"""Multiple of the largest measured value beyond which a prediction is discarded."""
 Arrays = dict[str, NDArray[np.generic]]
 Law = Callable[[int, Array], Array]
 """(k, z_k of shape (M, n_z)) -> a_k of shape (M, n_a)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldModelSettings(Settings):
+    """Constants of fitting and choosing models of the whole field.
+
+    All are dimensionless: fields, inputs and time are scaled by the data. E is the squared error of
+    a simulated rollout over the sum of |z - z_r|^2.
+    """
+
+    # The choice of a kind.
+    reproduced: float = setting(2e-3, "E at which the first kind to reach it is selected", 0, 1)
+    folds: int = setting(3, "maximum number of cross-validation folds over rollouts", 2, 100)
+    worst: float = setting(2.0, "E assigned to a model that diverges", 1, 1e6)
+    largest_degree: int = setting(7, "largest degree in z of the kinds that are tried", 2, 7)
+    # Spectral models.
+    substeps: int = setting(64, "maximum number of internal steps per sampling time", 1, 1000)
+    reach: float = setting(
+        1.5, "fastest nonlinear rate times the internal step; ETDRK4 is stable up to 2.8", 0.1, 2.8
+    )
+    # The field between few sensors. "Error" is the squared error of simulated readings over their sum
+    # of squares, without the share of the noise.
+    sensed_unresolved: float = setting(
+        0.005, "share of the readings that counts as noise, as the grid does not resolve it", 0, 1
+    )
+    sensed_growth: float = setting(
+        0.5, "maximum growth of a wave per sampling time, as an exponent of e", 0, 10
+    )
+
+
+DEFAULTS = FieldModelSettings()
 
 
 class FieldModel(Protocol):

@@ -48,6 +48,7 @@ from pdeloop.jit.cache import cached_njit, jit
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.messages.text import shown
 from pdeloop.method.models.base import (
+    COEFFICIENT_RIDGE,
     Arrays,
     Samples,
     StoredModel,
@@ -55,8 +56,9 @@ from pdeloop.method.models.base import (
     least_squares,
     orthonormal,
 )
-from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
 
+POINT_SAMPLES = 800
+"""Maximum number of data steps in a fit of finite differences."""
 MOST_FACTORS = 3
 Table = NDArray[np.int64]
 """A feature a row: its number of factors, the factors, their shifts, and the order of its difference.

@@ -37,6 +37,7 @@ from pdeloop.jit.cache import cached_njit
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array, read_only
 from pdeloop.method.models.base import (
+    COEFFICIENT_RIDGE,
     FORMS,
     Arrays,
     FieldModel,
@@ -44,8 +45,11 @@ from pdeloop.method.models.base import (
     StoredModel,
     model_of,
 )
-from pdeloop.method.models.finite_difference import FiniteDifferenceModel, fit_finite_difference
-from pdeloop.method.models.settings import COEFFICIENT_RIDGE, POINT_SAMPLES
+from pdeloop.method.models.finite_difference import (
+    POINT_SAMPLES,
+    FiniteDifferenceModel,
+    fit_finite_difference,
+)
 from pdeloop.method.reduce.reduced_model import Trajectory, turns
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 

@@ -58,19 +58,15 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import (
+    COEFFICIENT_RIDGE,
+    FAR,
     FieldModel,
+    FieldModelSettings,
     Measured,
     least_squares,
     orthonormal,
     usable,
     weighing,
-)
-from pdeloop.method.models.settings import (
-    COEFFICIENT_RIDGE,
-    FAR,
-    LEAST_CORRECTION,
-    NOISE_MISJUDGED,
-    FieldModelSettings,
 )
 from pdeloop.method.models.spectral import (
     Form,
@@ -84,6 +80,11 @@ from pdeloop.method.models.spectral import (
 )
 from pdeloop.solver.polynomial_step import phi_functions
 
+NOISE_MISJUDGED = 2.0
+"""Ratio of the noise in the data to the declared noise, or its inverse, from which they count as
+different."""
+LEAST_CORRECTION = 0.02
+"""Minimum share of an innovation that corrects a filtered state."""
 ORDERS = (1, 2, 3, 4)
 BANDS = 4
 """Of the wavenumbers from a quarter of the highest one on."""

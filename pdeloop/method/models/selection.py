@@ -40,7 +40,9 @@ import numpy as np
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import (
+    DEFAULTS,
     FieldModel,
+    FieldModelSettings,
     Measured,
     Samples,
     beginnings,
@@ -59,22 +61,19 @@ from pdeloop.method.models.finite_difference import (
 )
 from pdeloop.method.models.linear import fit_coarse, fit_convolution, fit_linear, fit_low_rank
 from pdeloop.method.models.noise import (
+    NOISE_MISJUDGED,
     cleaned_states,
     fit_noisy,
     noise_level,
     share_of_noise,
 )
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
-from pdeloop.method.models.settings import (
-    BETTER,
-    DEFAULTS,
-    NOISE_MISJUDGED,
-    FieldModelSettings,
-)
 from pdeloop.method.models.spectral import Form, fit_spectral
 from pdeloop.method.reduce.reduced_model import turns
 from pdeloop.process.one_thread import one_thread
 
+BETTER = 3.0
+"""How many times smaller the E of a kind with more unknowns must be for it to be selected."""
 _FEWEST_POINTS, _FEWEST_CELLS = 8, 5
 """Minimum number of points of a field, and of cells with neighbours."""
 NEAR_NEEDED = 0.05

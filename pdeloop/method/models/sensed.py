@@ -48,11 +48,12 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import Arrays, shaped
-from pdeloop.method.models.settings import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.base import DEFAULTS, Arrays, FieldModelSettings, shaped
 from pdeloop.method.models.spectral import ORDERS, SpectralModel, Spectrum, fewer_of, substeps_of
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep
 
+SENSED_MOST = 32
+"""Maximum number of point sensors between which a field is estimated."""
 FIRST = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
 """p and j of the terms that every fit begins with."""
 TERMS = FIRST + tuple(

@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
+from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
@@ -57,9 +58,10 @@ from pdeloop.method.models.sensed import (
     unknowns,
     well_posed,
 )
-from pdeloop.method.models.settings import DEFAULTS, SENSED_REPRODUCED, FieldModelSettings
 from pdeloop.solver.polynomial_step import PolynomialStep, PolynomialSteps
 
+SENSED_REPRODUCED = 0.05
+"""Maximum error of an equation that is used."""
 # A rate per sampling time beyond which no coefficient of a step can be computed.
 _FASTEST = 1e50
 

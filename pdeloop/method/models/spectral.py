@@ -44,7 +44,9 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.models.base import (
+    COEFFICIENT_RIDGE,
     Arrays,
+    FieldModelSettings,
     Samples,
     StoredModel,
     Values,
@@ -54,7 +56,6 @@ from pdeloop.method.models.base import (
     shaped,
     text_of,
 )
-from pdeloop.method.models.settings import COEFFICIENT_RIDGE, FieldModelSettings
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep, phi_functions
 
 Spectrum = NDArray[np.complex128]
