@@ -56,8 +56,7 @@ from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import Law, rollout
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
 from pdeloop.process.one_thread import one_thread
 
 __all__ = ["run", "text"]

@@ -21,6 +21,7 @@ from pdeloop.messages.protocol import design_digest
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
 from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
+from pdeloop.method.adapt.trajectories import LARGE
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.linear import Extended
 from pdeloop.method.laws.neural import Neural
@@ -28,7 +29,6 @@ from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models.sensed import SENSED_MOST
-from pdeloop.method.reduce.snapshots import LARGE
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.optimizer_parameters import kind_of, settings_of

@@ -11,8 +11,8 @@ import pytest
 from pdeloop.method.adapt import Context, Trajectory, model_based, renewal
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.belief import Belief, believe
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.renewal import Renewal, renew_from_states
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import Estimate
 from pdeloop.method.models import FieldModel, FittedModel, Measured
 from pdeloop.method.models.base import errors

@@ -10,6 +10,7 @@ import pytest
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.adapt import ModelBased
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.sensed_loop import (
     FILTER_INFLATION,
@@ -22,7 +23,6 @@ from pdeloop.method.adapt.sensed_loop import (
     root_mean_square,
     whole_field_law,
 )
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.laws.base import differentiable
 from pdeloop.method.laws.registry import MAX_NUMBER, action, along

@@ -12,8 +12,9 @@ import pytest
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import curvature_of, improve
+from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
 from pdeloop.method.adapt.renewal import (
+    CONFIRMED,
     Renewal,
     averaged_over_shifts,
     invariant_share,
@@ -21,7 +22,6 @@ from pdeloop.method.adapt.renewal import (
     own_gain,
     renew,
 )
-from pdeloop.method.adapt.settings import CONFIRMED, ModelBasedSettings
 from pdeloop.method.design.lqt import track
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.spectral import SpectralModel

@@ -25,8 +25,8 @@ from pdeloop.method.adapt import (
 )
 from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ClosedLoop
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import JUDGING
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
 from pdeloop.method.design.lqt import track
 from pdeloop.method.models import Measured

@@ -16,10 +16,10 @@ from pdeloop.method.adapt import (
     Trajectory,
     model_based_sensed,
 )
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import JUDGING
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
 from pdeloop.method.adapt.sensed_loop import UNPREDICTED, noise_of_filter, sensed_from
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.models.sensed import SensedModel
 from tests.support.sensed_optimiser import measured, optimiser, small, told

@@ -21,12 +21,12 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajectory
 from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictive,
     around,
 )
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Affine, Law, Predictive
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto

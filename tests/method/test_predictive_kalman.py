@@ -16,11 +16,11 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased, Rollout, RolloutResult, sensed_loop
 from pdeloop.method.adapt.base import Optimizer
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictiveSensed,
 )
 from pdeloop.method.adapt.sensed_loop import from_estimates
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import ExtendedKalman
 from pdeloop.method.laws.plans import Planner, planned, simulated
 from pdeloop.method.laws.predictive import PredictiveKalman

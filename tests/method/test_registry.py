@@ -12,8 +12,8 @@ import pytest
 from pdeloop.messages.problem import shipped_problems
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import ModelBased, Optimizer, TwoPoint
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.registry import OWN_OPTIMIZERS, optimizer_kind
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.settings import Settings, setting
 from pdeloop.problem_values import problem_values
 from tests.support.small import parameters, same_bits, train_here

@@ -13,9 +13,9 @@ from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import Context, ModelBased, Record, RolloutResult, Trajectory
 from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ReplayedLoop
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.replay import best_measured, step
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,

@@ -8,6 +8,7 @@ import pytest
 
 from pdeloop.method.adapt import Context, Record, Trajectory
 from pdeloop.method.adapt.belief import Belief
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import cheapest, weighted
 from pdeloop.method.adapt.sensed_loop import (
     SensedLoop,
@@ -17,7 +18,6 @@ from pdeloop.method.adapt.sensed_loop import (
     sensed_loop,
     whole_field_law,
 )
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Observer
 from pdeloop.method.models.base import model_of
 from pdeloop.method.models.sensed import (

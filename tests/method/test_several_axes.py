@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.models import Measured, linear
 from pdeloop.method.models.base import model_of
 from pdeloop.method.models.finite_difference import (

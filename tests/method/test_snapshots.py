@@ -11,10 +11,16 @@ import pytest
 
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.in_coordinates import CostInCoordinates, InCoordinates
-from pdeloop.method.adapt.settings import ModelBasedSettings
-from pdeloop.method.adapt.trajectories import LowRankTrajectory, kept
-from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis, factored
+from pdeloop.method.adapt.trajectories import (
+    CAPACITY,
+    LARGE,
+    LowRankTrajectory,
+    SnapshotBasis,
+    factored,
+    kept,
+)
 from tests.support.small import same_bits
 
 N_Z, RANK, N_A, N_S, T = LARGE + 52, 9, 2, 4, 12

@@ -13,8 +13,8 @@ import pdeloop
 from pdeloop.episode import rollout
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Context, ModelBased, Optimizer, Rollout, RolloutResult, Trajectory
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.laws import Law, Observer
 from tests.support.sensed import SENSORS
 

@@ -24,8 +24,10 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.settings import Settings, setting
 
+FIRST_GAIN = 2e-2
+"""`least_gain` before the last renewal."""
 _MEMORY = 40
 """Gradient differences that L-BFGS keeps."""
 _WINDOW = 5
@@ -37,6 +39,50 @@ _HALVINGS = 12
 
 FAR = 10.0
 """The cost of a law without a finite one, per cost of the law to begin with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelBasedSettings(Settings):
+    """The constants of `model_based`.
+
+    All are dimensionless: costs and gains are scaled by those of the initial law.
+    """
+
+    judging: int = setting(3, "rollouts of the final law on fresh fields", 1, 100)
+    believed: float = setting(
+        0.05,
+        "largest E at which a model is used; above it, laws are steps along rollouts",
+        0.0,
+        1.0,
+    )
+    mixtures: int = setting(
+        24, "most initial fields that are drawn; half as many before the final law", 0, 1000
+    )
+    most_mixtures: int = setting(
+        96, "the same for a final law that fields left out do not confirm", 0, 1000
+    )
+    iterations: int = setting(100, "maximum number of L-BFGS steps per improvement", 1, 10_000)
+    least_gain: float = setting(
+        1e-3, "relative gain in a window of steps with which a descent continues", 0.0, 1.0
+    )
+    confidence: float = setting(
+        1.0, "standard errors, if exact, by which a law must beat the first one", 0.0, 10.0
+    )
+    enough_fields: int = setting(
+        48, "number of measured fields at which improvements stop", 2, 1_000_000
+    )
+    observer_iterations: int = setting(
+        400, "as iterations, for the last one of an observer of few sensors", 1, 10_000
+    )
+    filter_unpredicted: float = setting(
+        0.04,
+        "share of a field's size that a filter adds to a reading's noise, 1 to 6 times",
+        0.0,
+        1.0,
+    )
+    filter_margin: float = setting(
+        0.03, "share of the cost that a filter may add by trusting the equation less", 0.0, 1.0
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 
 With orthonormal rows W that span U, the target and the measured states, x = W^T z contains all that an
 optimiser needs: s = U^T z = (W^T U)^T x, and |z - z_r| = |x - W^T z_r|. W grows with later
-rollouts (`pdeloop.method.reduce.snapshots`); nothing else in a checkpoint grows with the size of a
+rollouts (`pdeloop.method.adapt.trajectories`); nothing else in a checkpoint grows with the size of a
 state.
 """
 
@@ -29,8 +29,7 @@ from pdeloop.method.adapt.base import (
     Trajectory,
     part_of,
 )
-from pdeloop.method.adapt.trajectories import LowRankTrajectory
-from pdeloop.method.reduce.snapshots import CAPACITY, LARGE, SnapshotBasis
+from pdeloop.method.adapt.trajectories import CAPACITY, LARGE, LowRankTrajectory, SnapshotBasis
 from pdeloop.process.one_thread import one_thread
 
 _ROWS, _OWN = "basis", "own."

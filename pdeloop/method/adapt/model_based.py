@@ -43,8 +43,9 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief, believe
+from pdeloop.method.adapt.improve import ModelBasedSettings
+from pdeloop.method.adapt.renewal import CHAOTIC_FIELDS
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
-from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CLOSE, FIRST_RENEWAL, ModelBasedSettings
 from pdeloop.method.adapt.trajectories import Records
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, ZERO, Estimate
 from pdeloop.method.laws.neural import Neural
@@ -57,6 +58,11 @@ __all__ = ["ModelBased"]
 
 RENEWING, JUDGING, ENDED = "renewing", "judging", "ended"
 _STAGES = (RENEWING, JUDGING, ENDED)
+FIRST_RENEWAL = 6
+"""Rollouts before the first improvement, explorations included; then at least twice as many each
+time."""
+CLOSE = 0.2
+"""Share by which no control may cost more than a law on the model, to be rolled out as well."""
 _LARGEST = 1e150
 """Largest change on fields that were left out."""
 _REACH = 3.0

@@ -42,7 +42,7 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import cheapest
+from pdeloop.method.adapt.improve import ModelBasedSettings, cheapest
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
@@ -52,7 +52,6 @@ from pdeloop.method.adapt.sensed_loop import (
     least_trusting,
     sensed_loop,
 )
-from pdeloop.method.adapt.settings import ModelBasedSettings
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,

@@ -28,8 +28,15 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt import verdict
 from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
-from pdeloop.method.adapt.improve import cheapest, curvature_of, improve, index_of_cheapest
-from pdeloop.method.adapt.model_based import JUDGING, RENEWING, ModelBased
+from pdeloop.method.adapt.improve import (
+    FIRST_GAIN,
+    ModelBasedSettings,
+    cheapest,
+    curvature_of,
+    improve,
+    index_of_cheapest,
+)
+from pdeloop.method.adapt.model_based import FIRST_RENEWAL, JUDGING, RENEWING, ModelBased
 from pdeloop.method.adapt.renewal import mixtures, weighted
 from pdeloop.method.adapt.replay import FEWEST, best_measured, costs_by_field, step
 from pdeloop.method.adapt.sensed_loop import (
@@ -42,16 +49,14 @@ from pdeloop.method.adapt.sensed_loop import (
     to_be_fitted,
     whole_field_law,
 )
-from pdeloop.method.adapt.settings import (
-    FIRST_GAIN,
-    FIRST_RENEWAL,
-    READINGS_TRUST,
-    ModelBasedSettings,
-)
 from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED
+
+READINGS_TRUST = 1.0
+"""Weight of the distance from the start of a step on a model of readings: for a linear plant the step
+is 1/(1 + weight) of the full one."""
 
 
 class ModelBasedReadings(ModelBased):

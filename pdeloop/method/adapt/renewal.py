@@ -42,10 +42,21 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import Improvement, cheapest, curvature_of, improve
-from pdeloop.method.adapt.settings import CHAOTIC_FIELDS, CONFIRMED, FIRST_GAIN, ModelBasedSettings
+from pdeloop.method.adapt.improve import (
+    FIRST_GAIN,
+    Improvement,
+    ModelBasedSettings,
+    cheapest,
+    curvature_of,
+    improve,
+)
 from pdeloop.method.adapt.verdict import ZERO, Estimate, mean_change
 
+CONFIRMED = 0.5
+"""Share of the gain on its own fields that a law must reach on those left out; otherwise it is made
+again on more drawn fields."""
+CHAOTIC_FIELDS = 32
+"""Measured states used as initial fields of a chaotic plant, for which no fields are drawn."""
 PARTS = 2
 """Parts of the fields, each held out once to choose how far the law moves."""
 Draw: TypeAlias = Callable[[Array, int], Array]

@@ -34,8 +34,7 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.settings import FIRST_GAIN, ModelBasedSettings
+from pdeloop.method.adapt.improve import FIRST_GAIN, ModelBasedSettings, curvature_of, improve
 from pdeloop.method.design.lqt import Gains, track
 from pdeloop.method.models.base import Measured, Samples
 from pdeloop.method.models.selection import limited

@@ -46,8 +46,7 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, Simulation
-from pdeloop.method.adapt.improve import curvature_of, improve
-from pdeloop.method.adapt.settings import ModelBasedSettings
+from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
 from pdeloop.method.design.lqg import kalman_filter
 from pdeloop.method.design.lqt import DesignError
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
