@@ -13,7 +13,6 @@ from pdeloop.method.adapt import ModelBased
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.sensed_loop import (
-    FILTER_INFLATION,
     FILTER_MODES,
     UNPREDICTED,
     estimated_laws,
@@ -56,7 +55,7 @@ Array = np.ndarray
 def test_of_a_linear_equation_it_is_the_kalman_filter() -> None:
     rng = np.random.default_rng(1)
     mean, factor = rng.standard_normal(SPREAD.size), SPREAD * rng.standard_normal(2 * [SPREAD.size])
-    known = SensedFilter(LINEAR, mean, factor, SIGMA, 1.1)
+    known = SensedFilter(LINEAR, mean, factor, SIGMA)
     A, B = LINEAR.linearise(np.zeros(64), np.zeros(N_A))
     H = np.eye(64)[SEEN]
     first = field_of(factor, 64)
@@ -69,7 +68,7 @@ def test_of_a_linear_equation_it_is_the_kalman_filter() -> None:
         own, S = known.measured(own, S, np.stack([y, 3.0 * y]))
         np.testing.assert_allclose(own[0], x, atol=1e-8)
         np.testing.assert_allclose(S[0].T @ S[0], P, atol=1e-8)
-        x, P = A @ x + B @ a, 1.1**2 * A @ P @ A.T
+        x, P = A @ x + B @ a, A @ P @ A.T
         own, S = known.predicted(own, S, np.stack([a, a]))
 
 
@@ -122,7 +121,7 @@ def test_its_simulation_is_what_the_law_does_on_the_model(limit: float) -> None:
     theta = law.theta_of(
         0.05 * np.random.default_rng(5).standard_normal((N_A, 64)),
         np.full(N_A, 0.1),
-        filter_of(CUBIC, kappa=1.02),
+        filter_of(CUBIC),
         DEFAULTS,
     )
     assert law.estimates(theta) and loop.theta(theta).ndim == 1
@@ -180,7 +179,7 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
 
     def theta_with(times: float) -> Array:
         noise = noise_of_filter(CUBIC, settings, times)
-        return law.vector(parts | {"noise": np.array([noise, FILTER_INFLATION])})
+        return law.vector(parts | {"noise": np.array([noise])})
 
     assert same_bits(theta_with(1.0), best)
     others = [theta_with(times) for times in UNPREDICTED]

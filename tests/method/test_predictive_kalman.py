@@ -43,7 +43,7 @@ from tests.support.small import same_bits
 Array = np.ndarray
 RNG = np.random.default_rng(4)
 K_E, B = 0.05 * RNG.standard_normal((N_A, 64)), np.full(N_A, 0.1)
-FILTER = filter_of(CUBIC, kappa=1.02)
+FILTER = filter_of(CUBIC)
 READINGS = RNG.standard_normal((6, SENSORS))
 
 

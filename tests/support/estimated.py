@@ -48,10 +48,8 @@ LINEAR = model_of(z1_x0=1.5, z1_x1=20.0, z1_x2=0.5)
 CUBIC = model_of(z1_x0=8.0, z1_x2=0.5, z3_x0=-1.0)
 
 
-def filter_of(
-    model: SensedModel, sigma: float = SIGMA, kappa: float = 1.0, factor: Array = FACTOR
-) -> SensedFilter:
-    return SensedFilter(model, np.zeros(SPREAD.size), factor, sigma, kappa)
+def filter_of(model: SensedModel, sigma: float = SIGMA, factor: Array = FACTOR) -> SensedFilter:
+    return SensedFilter(model, np.zeros(SPREAD.size), factor, sigma)
 
 
 def rows_of(gain: float = 0.0) -> ModelRows:

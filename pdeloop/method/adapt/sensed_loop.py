@@ -72,8 +72,6 @@ _EXTRAPOLATION = 1.5
 """Maximum of simulated fields, relative to the estimated initial ones."""
 FILTER_MODES = 24
 """Modes of the field that the law extended_kalman feeds back."""
-FILTER_INFLATION = 1.0
-"""Factor by which the standard deviations of its estimate grow in every step."""
 _FILTER_SEEN = 0.2
 """Noise, as a share of the size of a field, for which one of its laws is optimised."""
 _INDEPENDENT = 0.3
@@ -308,7 +306,7 @@ def estimated_laws(
     if whole is None:
         return [], 0
     of_fields, noise = prior(fields, weights, _INDEPENDENT), noise_of_filter(model, settings)
-    known = SensedFilter(model, *of_fields, noise, FILTER_INFLATION)
+    known = SensedFilter(model, *of_fields, noise)
     seen = replace(whole.loop, noise=_FILTER_SEEN * root_mean_square(model.spread))
     found = improve(seen, whole.theta, fields, weights, curvature_of(seen), settings)
     every = [(whole.theta, whole.steps), *([(found.theta, found.steps)] if found else [])]
@@ -340,7 +338,7 @@ def least_trusting(
         return best
     most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
-        noise = np.array([noise_of_filter(loop.model, settings, times), FILTER_INFLATION])
+        noise = np.array([noise_of_filter(loop.model, settings, times)])
         other = law.vector({**law.parts(best), "noise": noise})
         if loop.costs(other, fields)[known].mean() <= most:
             return other

@@ -61,7 +61,7 @@ class ExtendedKalman(Observer):
 
         K_e (n_a, n); equation (44 + n_a,), centres (n_a,) and widths (n_a,), as for `SensedModel`;
         integration (4,), its largest field, internal steps, their reach and its fastest growth; mean
-        (33,) and factor (33, 33) of initial fields; noise (2,), sigma and kappa.
+        (33,) and factor (33, 33) of initial fields; noise (1,), sigma.
         """
         n_a = self.n_a
         own = {
@@ -72,7 +72,7 @@ class ExtendedKalman(Observer):
             "integration": np.zeros(4),
             "mean": np.zeros(FIELD_COEFFICIENTS),
             "factor": np.zeros((FIELD_COEFFICIENTS, FIELD_COEFFICIENTS)),
-            "noise": np.zeros(2),
+            "noise": np.zeros(1),
         }
         return {**super().start(), **own}
 
@@ -105,7 +105,7 @@ class ExtendedKalman(Observer):
             ),
             "mean": known.mean,
             "factor": known.factor,
-            "noise": np.array([known.noise, known.inflation]),
+            "noise": np.array([known.noise]),
         }
         return self.vector(parts)
 

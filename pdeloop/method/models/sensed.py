@@ -25,9 +25,9 @@ eigenvectors V and values g of N^T N
 
 Over a step
 
-    x <- f(x, a),    S <- kappa (df/dz) S,
+    x <- f(x, a),    S <- (df/dz) S,
 
-the derivatives by differences. The inflation kappa >= 1 forgets what the linearisation misses.
+the derivatives by differences.
 
 References
 ----------
@@ -411,14 +411,13 @@ class SensedFilter:
 
     mean (33,): that of the Fourier coefficients of an initial field; factor (33, 33): the columns of a
     square root of their covariance, as rows; noise: sigma, with what the model does not predict of a
-    reading; inflation: kappa.
+    reading.
     """
 
     model: SensedModel
     mean: Array
     factor: Array
     noise: float
-    inflation: float
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
@@ -456,4 +455,4 @@ class SensedFilter:
             np.concatenate([x, near]), np.concatenate([a, np.repeat(a, columns, axis=0)])
         )
         x, moved = after[:count].copy(), after[count:].reshape(S.shape)
-        return x, self.inflation / _DIFFERENCE * (moved - x[:, None])
+        return x, 1.0 / _DIFFERENCE * (moved - x[:, None])
