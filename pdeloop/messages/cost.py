@@ -267,7 +267,7 @@ class _Square:
     """|E x - W x_r|^2 with E = W C and W'W a weight."""
 
     def __init__(self, weight: Array, output: Array | None) -> None:
-        self._weight, self._output = weight, output
+        self._weight = weight
         self._root = np.sqrt(weight) if weight.ndim < 2 else _root(weight)
         self._E: Array | None = None
         if output is not None:
