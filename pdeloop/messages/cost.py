@@ -117,9 +117,11 @@ class Cost:
         self._action = _Square(self.action_weight, None)
         self._terminal = _Square(self.terminal_weight, self.output)
 
-    def steady(self) -> Cost:
-        """The same with the mean of a moving target as its target."""
-        return self._with(self.n_z, self._mean, self.output)
+    def deviations(self) -> Cost:
+        """The same about the mean of a moving target, and the target of the actions."""
+        found = self._with(self.n_z, self.target - self._mean, self.output)
+        found.action_target[:] = 0.0
+        return found
 
     def through(self, matrix: Array, target: Array | None = None) -> Cost:
         """The same of x (n,) with z = matrix x; target: in place of its own."""

@@ -74,13 +74,22 @@ def test_no_law_costs_less_than_lq_tracking_over_the_horizon() -> None:
 
 
 @pytest.mark.parametrize("kind", [FeedForward, Observer])
-def test_the_law_with_a_feedforward_looks_ahead_from_its_start(kind: type[Law]) -> None:
-    """From s = 0 it takes the best way, with one feedback for all steps, of states and estimates."""
-    plant = DynamicsPlant(Servo())
-    best, known = track_horizon(A, B, plant.cost, np.eye(N_Z)), _feedforward(plant, np.zeros(N_Z))
+def test_the_law_with_a_feedforward_looks_ahead_about_any_origin(kind: type[Law]) -> None:
+    """From the mean target, far from 0, it takes the best way, with one feedback for all steps."""
+    rest = np.full((1, N_Z), 300.0)
+    d = rest[0] - A @ rest[0]
+
+    class Waves(Servo):
+        action_target = np.zeros(N_A)
+        target = 300.0 + np.sin(0.1 * np.pi * np.arange(T + 1))[:, None] * np.array([2.0, 1.0])
+
+        def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+            return A @ z + B @ a + d
+
+    plant = DynamicsPlant(Waves())
+    best, known = track_horizon(A, B, plant.cost, np.eye(N_Z), d), _feedforward(plant, d)
     (law,) = laws_of(kind, [known.model], T, plant.cost.texts)
     start, memory = law.parts(law.theta_start), law.memory_start()
-    rest = np.zeros((1, N_Z))
     found, expected = (
         pdeloop.rollout(plant, own, rest)
         for own in (
@@ -88,7 +97,7 @@ def test_the_law_with_a_feedforward_looks_ahead_from_its_start(kind: type[Law]) 
             lambda k, z: z @ best.K[k].T + best.b[k],
         )
     )
-    np.testing.assert_allclose(found.actions, expected.actions, atol=1e-10)
+    np.testing.assert_allclose(found.actions, expected.actions, atol=1e-9)
     (constant,) = laws_of(kind, [law.model], T)
     b = np.atleast_2d(constant.parts(constant.theta_start)["b"])
     assert np.ptp(b, axis=0).max() == 0.0
@@ -96,7 +105,8 @@ def test_the_law_with_a_feedforward_looks_ahead_from_its_start(kind: type[Law]) 
 
 def _feedforward(plant: DynamicsPlant, d: np.ndarray) -> FeedForward:
     """The law of rows that know of the constant term d by K_b alone, as those without a filter do."""
-    K, b = track_horizon(A, B, plant.cost.steady(), np.eye(N_Z), d)
+    mean = plant.cost.target[:T].mean(axis=0)
+    K, b = track_horizon(A, B, plant.cost.through(np.eye(N_Z), mean), np.eye(N_Z), d)
     z_r = plant.field_target
     K_b = np.outer(b[0], z_r) / (z_r @ z_r)
     rows = ModelRows(A=A, B=B, U=np.eye(N_Z), K_a=K[0], K_b=K_b, s_r=z_r)
@@ -129,7 +139,7 @@ def test_a_law_with_a_feedforward_holds_a_plant_that_moves_by_itself() -> None:
         for law in laws
     )
     least = pdeloop.rollout(plant, lambda k, z: z @ best.K[k].T + best.b[k], [5]).costs.mean[0]
-    assert least < knows < 1.01 * least and ignores > 1.5 * least
+    assert least < knows < 1.06 * least and ignores > 1.5 * least
 
 
 def test_a_training_designs_and_adapts_for_it() -> None:

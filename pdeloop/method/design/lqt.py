@@ -455,22 +455,20 @@ def track_horizon(
 def tracking_offsets(model: ModelRows, cost: Cost | None, horizon: int) -> Array:
     """b_k (T, n_a) of a_k = K_a s_k + b_k, by LQ tracking over the horizon on the model.
 
-    It looks ahead to the targets to come: a_k on its way from s_0 = 0, less what the first of its laws
-    does for the mean target, on its own way. K_b s_r is of that target, and knows of a constant term
-    d that A and B do not tell:
+    K_b s_r is of the mean target, and knows of a constant term d that A and B do not tell. It looks
+    ahead to the targets to come by their deviations from that alone, which depend on no d, and on no
+    origin of the states:
 
-        b_k = K_b s_r + (a_k - K_a s_k) - (a'_k - K_a s'_k).
+        b_k = K_b s_r + a_k - K_a e_k,        e_0 = 0,        e_{k+1} = A e_k + B a_k.
 
     Without a cost of this horizon all b_k are K_b s_r.
     """
     b = np.tile(model.constant, (horizon, 1))
     if cost is not None and cost.horizon == horizon:
-        z_of, d = model.measurement, 0.0 if model.d is None else model.d
-        K, ahead = track_horizon(model.A, model.B, cost, z_of, d)
-        steady = track_horizon(model.A, model.B, cost.steady(), z_of, d).b[0]
-        s = rest = np.zeros(len(model.A))
+        K, ahead = track_horizon(model.A, model.B, cost.deviations(), model.measurement)
+        e = np.zeros(len(model.A))
         for k in range(horizon):
-            a, held = K[k] @ s + ahead[k], K[0] @ rest + steady
-            b[k] += a - held - model.K_a @ (s - rest)
-            s, rest = model.A @ s + model.B @ a + d, model.A @ rest + model.B @ held + d
+            a = K[k] @ e + ahead[k]
+            b[k] += a - model.K_a @ e
+            e = model.A @ e + model.B @ a
     return b
