@@ -32,7 +32,7 @@ from pdeloop.episode import Law, rollout
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import cost_to_go, regulator
+from pdeloop.method.design.lqt import Regulator, regulator
 from pdeloop.method.models.linear import LinearModel
 
 STEPS = 20
@@ -64,11 +64,17 @@ def linearisation(plant: Process) -> Linearisation:
 
 def clipped_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> Law:
     """The affine law of least cost over the horizon, within bounds."""
+    known = problem_of(model, cost)
+    return lambda k, states: admissible.project(states @ known.K.T + known.b)
+
+
+def problem_of(model: Linearisation, cost: Cost) -> Regulator:
+    """The linear-quadratic problem of a linearised plant."""
     A, B, d, point = model
     known = regulator(LinearModel("linear", A, B, d + point - A @ point), cost, point)
     if known is None:
         raise ValueError("the linearised plant has no law of finite cost")
-    return lambda k, states: admissible.project(states @ known.K.T + known.b)
+    return known
 
 
 def predictive_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> Law:
@@ -80,7 +86,7 @@ def predictive_law(model: Linearisation, cost: Cost, admissible: ActionSet) -> L
     E = cost.residual(np.eye(n))
     offset = E @ point - cost.residual_target().mean(axis=0)
     stage = np.column_stack([E, offset])
-    weights = [stage.T @ stage] * (STEPS - 1) + [cost_to_go(A, B, d, cost, point)]
+    weights = [stage.T @ stage] * (STEPS - 1) + [problem_of(model, cost).P]
     R, a_r = cost.action_matrix, cost.action_target
     whole = np.block([[A, d[:, None]], [np.zeros(n), np.ones(1)]])
     inputs = np.vstack([B, np.zeros((1, n_a))])

@@ -310,19 +310,6 @@ def _steady_state_map(closed_loop: Array) -> Array:
     return inverse
 
 
-def cost_to_go(A: Array, B: Array, drift: Array, cost: Cost, point: Array) -> Array:
-    """P (n + 1, n + 1) of the least cost [e; 1]^T P [e; 1] of the horizon.
-
-    A target over time counts with its mean; the terminal weight does not count.
-    """
-    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
-    E = cost.residual(np.eye(len(A)))
-    offset = E @ point - cost.residual_target().mean(axis=0)
-    rows = np.column_stack([E, offset])
-    G = inputs @ linalg.solve(cost.action_matrix, inputs.T, assume_a="pos")
-    return _doubled(whole, G, rows.T @ rows, cost.horizon)
-
-
 class Regulator(NamedTuple):
     """The problem of a horizon about a point z_r, of e_{k+1} = A e_k + B a_k + drift, e = z - z_r.
 
@@ -343,7 +330,8 @@ def regulator(
 ) -> Regulator | None:
     """That of a model and a cost of its states; None where it has no finite one, or is too large.
 
-    point (n,), action (n_a,): where the model is linearised, the cost's targets if not given.
+    A target over time counts with its mean; the terminal weight does not count. point (n,), action
+    (n_a,): where the model is linearised, the cost's targets if not given.
 
     >>> from pdeloop.method.models.linear import LinearModel
     >>> one = LinearModel("linear", np.eye(1), np.eye(1), np.zeros(1))
@@ -357,9 +345,14 @@ def regulator(
     with np.errstate(all="ignore"):
         A, B = model.linearise(point, a)
         drift = model.step(point[None], a[None])[0] - point - B @ a
+        (n, n_a), E = B.shape, cost.residual(np.eye(model.n_z))
+        rows = np.column_stack([E, E @ point - cost.residual_target().mean(axis=0)])
+        pushed = drift + B @ cost.action_target
+        whole = np.block([[A, pushed[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
+        inputs = np.vstack([B, np.zeros((1, n_a))])
         try:
-            P = cost_to_go(A, B, drift, cost, point)
-            whole, inputs = _extended(A, B, drift + B @ cost.action_target)
+            G = inputs @ linalg.solve(cost.action_matrix, inputs.T, assume_a="pos")
+            P = _doubled(whole, G, rows.T @ rows, cost.horizon)
             S = cost.action_matrix + inputs.T @ P @ inputs
             gains = -linalg.solve(S, inputs.T @ P @ whole, assume_a="pos")
         except (np.linalg.LinAlgError, ValueError):
@@ -367,13 +360,6 @@ def regulator(
     K, b = gains[:, :-1], gains[:, -1] + cost.action_target
     known = np.isfinite(P).all() and np.isfinite(gains).all()
     return Regulator(A, B, drift, P, K, b - K @ point) if known else None
-
-
-def _extended(A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
-    """The system of [e; 1]."""
-    n, n_a = B.shape
-    whole = np.block([[A, drift[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
-    return whole, np.vstack([B, np.zeros((1, n_a))])
 
 
 def _doubled(whole: Array, G: Array, P: Array, horizon: int) -> Array:
