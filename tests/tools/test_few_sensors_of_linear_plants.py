@@ -14,6 +14,7 @@ import pdeloop
 from pdeloop.messages.cost import Cost, measured_cost
 from pdeloop.method.design.lqt import track_horizon
 from pdeloop.report.data import gather
+from tests.support.small import FEW_STEPS
 
 pytestmark = pytest.mark.filterwarnings("ignore::pdeloop.TrainingWarning")
 
@@ -36,17 +37,17 @@ class Rod(pdeloop.Dynamics):
         return z @ self.A.T + a @ self.B.T
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_order_is_that_of_the_state_and_not_the_number_of_sensors(seed: int) -> None:
+def test_the_order_is_that_of_the_state_and_not_the_number_of_sensors() -> None:
     """LQG of the true model, which weighs the whole state, costs 0.82; of the readings 1.18."""
-    run = pdeloop.train(plant=Rod(), sensors=3, rollouts=6, seed=seed)
+    run = pdeloop.train(plant=Rod(), sensors=3, rollouts=6, evaluation_fields=5)
     assert len(run.models[0].A) > 3
     assert run.costs["lqt"].mean() < 1.3 < 1.9 < run.costs["none"].mean()
     assert run.costs["adapted"].mean() < 1.3
 
 
 def test_where_every_law_runs_away_no_control_is_tried_and_left_for_a_better_one() -> None:
-    run = pdeloop.train(plant=Rod(), sensors=3, rollouts=20, seed=2, reduced_order=3)
+    small = {"rollouts": 16, "evaluation_fields": 3, **FEW_STEPS}
+    run = pdeloop.train(plant=Rod(), sensors=3, seed=2, reduced_order=3, **small)
     assert run.costs["lqt"].min() > 100.0
     assert run.costs["adapted"].mean() < 0.7 * run.costs["none"].mean()
 
@@ -72,10 +73,9 @@ class Chain(pdeloop.Dynamics):
         return z @ self.A.T + a @ self.B.T
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_model_that_is_exact_on_held_out_readings_is_the_one_that_is_chosen(seed: int) -> None:
+def test_a_model_that_is_exact_on_held_out_readings_is_the_one_that_is_chosen() -> None:
     """Where there is no noise, a filter forgets a wrong initial state slowly: no model is to blame."""
-    run = pdeloop.train(plant=Chain(), sensors=3, rollouts=6, seed=seed)
+    run = pdeloop.train(plant=Chain(), sensors=3, rollouts=6, evaluation_fields=5)
     assert len(run.models[0].A) == 12
     poles = np.abs(np.linalg.eigvals(run.models[0].A))
     np.testing.assert_allclose(poles, np.abs(np.linalg.eigvals(Chain().A)), rtol=1e-3)
@@ -93,13 +93,14 @@ class Weighed(Rod):
     action_low, action_high = 0.0, 1.0
 
 
-@pytest.mark.parametrize("law", ["extended_kalman", "affine"])
-def test_weights_of_outputs_are_those_of_the_state_between_the_sensors(law: str) -> None:
-    run = pdeloop.train(plant=Weighed(), sensors=4, rollouts=9, law=law)
-    whole = pdeloop.train(plant=Weighed(), rollouts=9)
-    costs = {name: own.mean() for name, own in run.costs.items()}
-    assert costs["adapted"] < 0.5 * costs["none"]
-    assert costs["adapted"] < 1.3 * whole.costs["adapted"].mean()
+def test_weights_of_outputs_are_those_of_the_state_between_the_sensors() -> None:
+    small: dict[str, Any] = {"plant": Weighed(), "rollouts": 9, **FEW_STEPS}
+    whole = pdeloop.train(**small)
+    for law in ("extended_kalman", "affine"):
+        run = pdeloop.train(**small, sensors=4, law=law)
+        costs = {name: own.mean() for name, own in run.costs.items()}
+        assert costs["adapted"] < 0.5 * costs["none"]
+        assert costs["adapted"] < 1.3 * whole.costs["adapted"].mean()
 
 
 def test_the_cost_of_readings_is_that_of_states_that_are_linear_between_sensors() -> None:
