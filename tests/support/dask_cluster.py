@@ -14,9 +14,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from tests.support.interpreter import ROOT
+from tests.support.loop_harness import Forked
 from tests.support.small_study import LIMIT
 
-Process = subprocess.Popen[bytes]
+Process = subprocess.Popen[bytes] | Forked
 
 
 class DaskCluster:
@@ -29,7 +30,8 @@ class DaskCluster:
     scheduler : Popen
         Its process.
     workers : list of Popen
-        Those of the workers, which are one thread each.
+        Those of the workers, which are one thread each. Without packages of their own they are forked,
+        as what `loop_harness` starts.
     """
 
     def __init__(self, folder: Path, stack: ExitStack, tls: Sequence[str] = ()) -> None:
@@ -37,7 +39,7 @@ class DaskCluster:
         self._folder, self._stack, self._tls = folder, stack, tls
         self.workers: list[Process] = []
         self.scheduler: Process | None = None
-        self.address = ""
+        self.address, self._count = "", 0
 
     def start_scheduler(self, packages: str = str(ROOT)) -> None:
         """packages: a folder of packages that the process has instead of those here."""
@@ -71,14 +73,22 @@ class DaskCluster:
         return self._folder / "scheduler.json"
 
     def _started(self, command: str, *options: str, packages: str) -> Process:
-        words = [sys.executable, "-m", f"distributed.cli.{command}", "--host", "127.0.0.1"]
-        words += ["--scheduler-file", str(self._file), "--no-dashboard", *self._tls, *options]
+        words = ["--host", "127.0.0.1", "--scheduler-file", str(self._file), "--no-dashboard"]
+        words += [*self._tls, *options]
         # Of a session of its own; what it leaves when it is killed is in `folder`.
-        own = {"PYTHONPATH": packages, "TMPDIR": str(self._folder)}
-        log = self._stack.enter_context((self._folder / f"{command}.log").open("ab"))
-        process = subprocess.Popen(
-            words, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **own}
-        )
+        environment = {**os.environ, "PYTHONPATH": packages, "TMPDIR": str(self._folder)}
+        self._count += 1
+        path = self._folder / f"{self._count}-{command}.log"
+        process: Process
+        if packages == str(ROOT):  # as an interpreter that has loaded what a worker does
+            code = f"from distributed.cli.{command} import main; main()"
+            process = Forked("-c", [code, *words], path, environment)
+        else:
+            log = self._stack.enter_context(path.open("ab"))
+            module = (sys.executable, "-m", f"distributed.cli.{command}")
+            process = subprocess.Popen(
+                [*module, *words], stdout=log, stderr=log, start_new_session=True, env=environment
+            )
         self._stack.callback(process.wait, LIMIT)
         self._stack.callback(_kill_session, process.pid)
         return process

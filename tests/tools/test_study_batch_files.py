@@ -137,7 +137,9 @@ def test_a_kubernetes_job_starts_its_workers_again_and_is_complete(reference: Pa
         try:
             assert run(Study.of(CONTENT), out, lambda: cluster(dask.address), tell=kill_one) == []
             assert dask.scheduler is not None
-            dask.scheduler.terminate()  # as the pod of the scheduler, when the study is finished
+            dask.scheduler.send_signal(
+                signal.SIGTERM
+            )  # as the pod of the scheduler, when the study is finished
             kubelet.join(LIMIT)
         finally:
             ends.append(0)
