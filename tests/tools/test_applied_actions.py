@@ -19,6 +19,7 @@ from pdeloop.report.data import of_run
 from pdeloop.report.figures import behaviour
 from pdeloop.report.places import FEW, saturated, share_text
 from pdeloop.report.style import STYLE
+from tests.support.small import FEW_STEPS
 
 
 class Row(pdeloop.Dynamics):
@@ -72,7 +73,8 @@ def apart(figure: Figure, ax: Axes) -> bool:
 def test_the_behaviour_in_a_report_has_its_legends_apart_and_numbers_of_a_vector(
     tmp_path: Path,
 ) -> None:
-    run = pdeloop.train(plant=Row(FEW), rollouts=6, evaluation_fields=2, out=tmp_path / "run")
+    few = {"rollouts": 6, "evaluation_fields": 2, **FEW_STEPS}
+    run = pdeloop.train(plant=Row(FEW), **few, out=tmp_path / "run")
     with rc_context(STYLE):
         figure = behaviour(of_run(run))
         FigureCanvasAgg(figure).draw()

@@ -230,7 +230,7 @@ def test_a_first_law_that_need_not_be_begun_with_is_not_bad() -> None:
     assert judged(9.0, 99.0, compared=True)[0] and judged(9.0, 1.0, compared=True) == (True, "")
     assert judged(9.0, 9.1, compared=True)[0] and not judged(9.0, 9.1)[0]
     assert not judged(np.inf, np.inf, compared=True)[0]
-    values = resolve("kdv", {"sensors": 8})
+    values = {**resolve("kdv", {"sensors": 8}), "horizon": 40}
     good, text = next((f.good, f.text) for f in check(values) if f.name == "first law")
     assert good and "does not help; the adaptation compares it" in text
 

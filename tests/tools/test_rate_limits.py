@@ -18,6 +18,7 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.laws import Affine
 from pdeloop.problem_check import check
 from pdeloop.report.places import share_text
+from tests.support.small import FEW_FITS
 from tests.tools.test_exported_bounds import N_A, N_Z, model
 
 RATE = 0.15
@@ -57,7 +58,8 @@ def least_cost(fields: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def run() -> pdeloop.FinishedRun:
-    return pdeloop.train(plant=Valve(), rollouts=24, evaluation_fields=40, reduced_order=2)
+    few = {"rollouts": 16, "evaluation_fields": 10, "optimizer_settings.mixtures": 2, **FEW_FITS}
+    return pdeloop.train(plant=Valve(), reduced_order=2, **few)
 
 
 def test_a_training_comes_near_the_best_law_within_the_limits(run: pdeloop.FinishedRun) -> None:
