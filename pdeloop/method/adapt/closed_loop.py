@@ -240,25 +240,6 @@ class ClosedLoop:
         s = self._outputs(states[:, :-1, :n_z]) @ self.U
         return np.concatenate([s if offsets is None else s + offsets, states[:, :-1, n_z:]], axis=2)
 
-    def unsaturated(self, theta: Array, fields: Array, weights: Array) -> Array:
-        """The law without the mean excess over a bound that an action is at from all fields.
-
-        There the cost does not depend on theta; then actions are on both sides of the bound.
-        """
-        simulation, n_a = self.simulate(theta, fields), self.model.n_a
-        n_f = theta.shape[1] - self.constants
-        requested = simulation.features[:, :, :-1] @ theta[:n_a, :n_f].T
-        requested += self.constant_feature * theta[:n_a, n_f:].T[:, None][: self.horizon]
-        excess = requested - simulation.actions
-        if self.constants == 1:
-            excess = excess.reshape(1, -1, n_a)
-            weights = np.tile(weights, self.horizon) / self.horizon
-        always = (excess != 0.0).all(axis=1)
-        excess = np.where(always, np.einsum("kfi,f->ki", excess, weights), 0.0)
-        changed = theta.copy()
-        changed[:n_a, n_f:] -= excess.T
-        return changed
-
     @cached_property
     def regulator(self) -> Regulator | None:
         """The linear-quadratic problem at the target; None where there is none, or of readings."""

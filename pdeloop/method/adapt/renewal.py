@@ -126,14 +126,7 @@ def renew(
         if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
             starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
         start = cheapest(loop, starts, every, weights)
-        found = improve(loop, start, every, weights, curvature, settings, least_gain)
-        rests = found is not None and not found.after < (1.0 - least_gain) * found.before
-        if loop.action_set.bounded and found and rests:  # the gradient of saturated actions is 0
-            start = loop.unsaturated(found.theta, every, weights)
-            if not np.array_equal(start, found.theta):
-                again = improve(loop, start, every, weights, curvature, settings, least_gain)
-                found = again if again and again.after < found.after else found
-        return found
+        return improve(loop, start, every, weights, curvature, settings, least_gain)
 
     least_gain = settings.least_gain if final else FIRST_GAIN
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
