@@ -37,7 +37,7 @@ from pdeloop.method.reduce.identifiability import (
     require_effects,
 )
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
-from pdeloop.method.reduce.reduced_model import ReducedModel, Steps, Trajectory, steps_of
+from pdeloop.method.reduce.reduced_model import ReducedModel, Samples, Trajectory, steps_of
 from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
@@ -577,7 +577,7 @@ def _identified(
     return Identified(
         model,
         sources,
-        len(steps_of(trajectories).inputs),
+        len(steps_of(trajectories)),
         study,
         examined(seen, model, method=method, p=p, channels=channels),
         max(aligned, key=lambda trajectory: len(trajectory[1])),
@@ -598,12 +598,12 @@ def _identified(
     )
 
 
-def _truncated(p: int, data: Steps, U: Array) -> ReducedModel:
+def _truncated(p: int, data: Samples, U: Array) -> ReducedModel:
     """The model of truncated DMDc on given modes, of rank p or, if it is 0, n_s + n_a."""
     n_s = U.shape[1]
     if 0 < p < n_s:
         raise ValueError("more modes than directions")
-    return regression.truncated_fit(data, U, p or n_s + data.inputs.shape[1])
+    return regression.truncated_fit(data, U, p or n_s + data.actions.shape[1])
 
 
 def _refitted(

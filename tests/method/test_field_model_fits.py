@@ -15,7 +15,7 @@ from benchmarks.families import equations, plants
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured
-from pdeloop.method.models.base import Samples, errors
+from pdeloop.method.models.base import errors, samples_of
 from pdeloop.method.models.linear import fit_linear
 from pdeloop.method.models.selection import NEAR_RIDGES, kinds_of
 from tests.support.fitted import fit_field_model
@@ -248,7 +248,7 @@ def test_an_offset_changes_no_linear_model() -> None:
         z.append(A @ z[-1] + B @ a)
     states = np.array(z)
     celsius, kelvin = (
-        fit_linear(Samples.of([Measured(own, actions)]), kind="linear", ridge=1e-4)
+        fit_linear(samples_of([Measured(own, actions)]), kind="linear", ridge=1e-4)
         for own in (states, states + 273.15)
     )
     assert celsius is not None and kelvin is not None

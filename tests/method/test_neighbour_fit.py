@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pdeloop.method.models import FieldModelSettings, finite_difference
-from pdeloop.method.models.base import Samples, errors
+from pdeloop.method.models.base import errors, samples_of
 from pdeloop.method.models.finite_difference import fit_neighbours
 from pdeloop.method.models.selection import NEAR_NEEDED, kinds_of
 from tests.support.fitted import fit_field_model
@@ -56,7 +56,7 @@ CHAIN = {
 
 def test_a_plant_of_products_of_neighbours_is_recovered_to_1e_6_without_other_terms():
     rollouts = explored(chain, 2, N_X)
-    model = fit_neighbours(Samples.of(rollouts), kind="near-shared")
+    model = fit_neighbours(samples_of(rollouts), kind="near-shared")
     found = {}
     for (n, *row), C in zip(model.table.tolist(), model.coefficients, strict=True):
         shifts = tuple(i if i < N_X / 2 else i - N_X for i in row[3 : 3 + n])
@@ -122,7 +122,7 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
     n_z, start = components * N_X, 1.0 if rate is species else 0.0
     rollouts = explored(rate, 4, n_z, variance=variance, start=start)
     model = fit_neighbours(
-        Samples.of(rollouts[:3]),
+        samples_of(rollouts[:3]),
         kind="k",
         components=components,
         ridge=ridge,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import FieldModelSettings, Measured, Samples, errors
+from pdeloop.method.models.base import FieldModelSettings, Measured, errors, samples_of
 from pdeloop.method.models.noise import filtered, fit_noisy, significant, smoothed
 from pdeloop.method.models.selection import FORMS, with_clean
 from pdeloop.method.models.spectral import SpectralModel, fit_spectral
@@ -73,7 +73,7 @@ def test_noise_leaves_the_equation_right() -> None:
     assert model is not None
     assert error_in(model, true) < 0.02
     # What is fitted as if it were exact is far off: noise is taken for decay.
-    naive = fit_spectral(Samples.of(rollouts), CUBIC, SETTINGS)
+    naive = fit_spectral(samples_of(rollouts), CUBIC, SETTINGS)
     assert naive is None or error_in(naive, true) > 100 * error_in(model, true)
     low = slice(1, 6)
     assert model.symbols[0, low].real == pytest.approx(

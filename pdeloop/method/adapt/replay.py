@@ -36,7 +36,7 @@ from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import FIRST_GAIN, ModelBasedSettings, curvature_of, improve
 from pdeloop.method.design.lqt import Gains, track
-from pdeloop.method.models.base import Measured, Samples
+from pdeloop.method.models.base import Measured, samples_of
 from pdeloop.method.models.selection import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
@@ -130,7 +130,7 @@ def _tracking(context: Context, records: Sequence[Record], *, products: bool) ->
     """LQ tracking on A and B of a regression, of x with products, or of s with a constant term d."""
     U, n_s = context.U, context.U.shape[1]
     rollouts = [Measured(record.states, record.actions) for record in records]
-    samples = Samples.of([limited(rollout, context.action_set) for rollout in rollouts])
+    samples = samples_of([limited(rollout, context.action_set) for rollout in rollouts])
     rows, columns = np.triu_indices(n_s)
     a, n = samples.actions, n_s + samples.actions.shape[1]
     origin = context.target if products else 0.0

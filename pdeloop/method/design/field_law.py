@@ -41,7 +41,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqt import LARGEST, regulator, target_gain
 from pdeloop.method.models import FieldModel, FieldModelSettings, FittedModel, Measured, affine_law
 from pdeloop.method.models.base import DEFAULTS as MODEL_DEFAULTS
-from pdeloop.method.models.base import Law, Samples, pieces, predicted, saturated
+from pdeloop.method.models.base import Law, pieces, predicted, samples_of, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
 from pdeloop.method.models.selection import (
@@ -58,7 +58,6 @@ from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
     IdentificationSettings,
     ReducedModel,
-    Steps,
     Trajectory,
     leading_modes,
     operating_inputs,
@@ -211,9 +210,9 @@ def regression_kind(n_s: int, constant: bool) -> Kind:
     """The regression of this order as a kind of model, to be judged like the others."""
 
     def made(rollouts: Sequence[Measured], _: float) -> FieldModel:
-        samples = Samples.of(rollouts)
+        samples = samples_of(rollouts)
         U = leading_modes(samples.after, n_s)[0]
-        return _whole(fit(Steps(samples.before, samples.after, samples.actions), U, constant))
+        return _whole(fit(samples, U, constant))
 
     return Kind("regression", made, (float(n_s), 0))
 

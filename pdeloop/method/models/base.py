@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
+from pdeloop.method.reduce.reduced_model import Samples
 from pdeloop.method.settings import Settings, setting
 
 MAX_SUBSTEPS = 2000
@@ -146,50 +147,22 @@ def saturated(law: Law, action_set: ActionSet) -> Law:
     return limited
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Steps of the plant: z_k, a_k, z_{k+1}, a row each, (N, n_z), (N, n_a), (N, n_z)."""
-
-    before: Array
-    actions: Array
-    after: Array
-
-    def __len__(self) -> int:
-        return len(self.before)
-
-    @staticmethod
-    def of(rollouts: Sequence[Measured]) -> Samples:
-        """Those of rollouts that are finite, in their order."""
-        parts = []
-        for rollout in rollouts:
-            states, actions = rollout.known, np.asarray(rollout.actions)
-            n = min(len(actions), len(states) - 1)
-            if n < 1:
-                continue
-            finite = np.isfinite(states)
-            whole = np.hstack([finite[:n], finite[1 : n + 1], np.isfinite(actions[:n])])
-            kept = whole.all(axis=1)
-            parts.append((states[:n][kept], actions[:n][kept], states[1 : n + 1][kept]))
-        if not parts:
-            return Samples(*(np.empty((0, 0)) for _ in range(3)))
-        before, actions, after = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Samples(before, actions, after)
-
-    def thinned(self, most: int) -> Samples:
-        """At most this many of them, equally spaced."""
-        some = slice(None, None, max(-(-len(self) // most), 1))
-        return Samples(self.before[some], self.actions[some], self.after[some])
-
-    def weights(self) -> Array:
-        """1 / max(|Δz|, mean |Δz|): a step counts relative to how much changes in it.
-
-        Where the field rests, what is left is the error of the model's integration, which would
-        otherwise outweigh everything; so less than the mean change counts as the mean.
-        """
-        change = np.linalg.norm(self.after - self.before, axis=1)
-        size = np.maximum(change, change.mean())
-        weights: Array = 1.0 / np.where(size > 0.0, size, 1.0)
-        return weights
+def samples_of(rollouts: Sequence[Measured]) -> Samples:
+    """The steps of rollouts that are finite, in their order."""
+    parts = []
+    for rollout in rollouts:
+        states, actions = rollout.known, np.asarray(rollout.actions)
+        n = min(len(actions), len(states) - 1)
+        if n < 1:
+            continue
+        finite = np.isfinite(states)
+        whole = np.hstack([finite[:n], finite[1 : n + 1], np.isfinite(actions[:n])])
+        kept = whole.all(axis=1)
+        parts.append((states[:n][kept], actions[:n][kept], states[1 : n + 1][kept]))
+    if not parts:
+        return Samples(*(np.empty((0, 0)) for _ in range(3)))
+    before, actions, after = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Samples(before, actions, after)
 
 
 FORMS: dict[str, Callable[[Arrays], Any]] = {}
@@ -375,7 +348,7 @@ def weighing(weights: Array | None) -> Callable[[Array], Array]:
 
 def one_step(model: FieldModel, rollouts: Sequence[Measured], units: Array) -> Array:
     """Sums of squares of the errors of single steps, and of the changes in a step, (2,)."""
-    samples = Samples.of(rollouts)
+    samples = samples_of(rollouts)
     with np.errstate(all="ignore"):
         missed = samples.after - model.step(samples.before, samples.actions)
         parts = [np.sum((part / units) ** 2) for part in (missed, samples.after - samples.before)]

@@ -50,12 +50,12 @@ from pdeloop.messages.text import shown
 from pdeloop.method.models.base import (
     COEFFICIENT_RIDGE,
     Arrays,
-    Samples,
     StoredModel,
     checked_substeps,
     least_squares,
     orthonormal,
 )
+from pdeloop.method.reduce.reduced_model import Samples
 
 POINT_SAMPLES = 800
 """Maximum number of data steps in a fit of finite differences."""

@@ -41,7 +41,6 @@ from pdeloop.method.models.base import (
     FORMS,
     Arrays,
     FieldModel,
-    Samples,
     StoredModel,
     model_of,
 )
@@ -50,7 +49,7 @@ from pdeloop.method.models.finite_difference import (
     FiniteDifferenceModel,
     fit_finite_difference,
 )
-from pdeloop.method.reduce.reduced_model import Trajectory, turns
+from pdeloop.method.reduce.reduced_model import Samples, Trajectory, turns
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 

@@ -32,15 +32,15 @@ from pdeloop.messages.arrays import Array, read_only
 from pdeloop.method.models.base import (
     Arrays,
     Measured,
-    Samples,
     StoredModel,
     errors,
     pieces,
     predicted,
+    samples_of,
     usable,
 )
 from pdeloop.method.models.linear import add_products
-from pdeloop.method.reduce.reduced_model import turns
+from pdeloop.method.reduce.reduced_model import Samples, turns
 
 LARGEST_STATE = 256
 """Numbers of a state up to which a polynomial is fitted."""
@@ -210,7 +210,7 @@ class _Scaled:
 def fit_polynomial(rollouts: Sequence[Measured]) -> PolynomialModel | None:
     """The polynomial that predicts rollouts, and pieces of them, best that it was not fitted to."""
     rollouts = usable([Measured(own.known, own.actions) for own in rollouts])
-    samples = Samples.of(rollouts)
+    samples = samples_of(rollouts)
     if len(samples) < 4 * _PARTS:
         return None
     short = len(rollouts) < _PARTS
@@ -219,7 +219,7 @@ def fit_polynomial(rollouts: Sequence[Measured]) -> PolynomialModel | None:
     leading = [q for i, q in enumerate(LEADING) if not i or LEADING[i - 1] < n_z]
     missed = np.zeros((len(leading), len(ridges)))
     for others, own in turns(_cut(rollouts) if short else rollouts, _PARTS):
-        data = _Scaled.of(Samples.of(others))
+        data = _Scaled.of(samples_of(others))
         # Whole rollouts tell what is unstable, and pieces what is wrong where nothing predicts those.
         both = [own] if short else [own, _cut(own)]
         for i, q in enumerate(leading):

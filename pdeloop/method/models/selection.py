@@ -44,12 +44,12 @@ from pdeloop.method.models.base import (
     FieldModel,
     FieldModelSettings,
     Measured,
-    Samples,
     beginnings,
     errors,
     one_step,
     pieces,
     predicted,
+    samples_of,
     saturated,
     usable,
 )
@@ -172,7 +172,7 @@ def _of_samples(
     """A kind that is fitted to the steps of rollouts, whatever their order."""
 
     def fitted(rollouts: Sequence[Measured], _: float) -> FieldModel | None:
-        return fit(Samples.of(rollouts), kind=name, **known)
+        return fit(samples_of(rollouts), kind=name, **known)
 
     return Kind(name, fitted, unknowns, needed=needed)
 
@@ -181,7 +181,7 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
     def fit(rollouts: Sequence[Measured], noise: float) -> FieldModel | None:
         if noise and not form.free:
             return fit_noisy(rollouts, form, settings, noise)
-        return fit_spectral(Samples.of(rollouts), form, settings)
+        return fit_spectral(samples_of(rollouts), form, settings)
 
     enough = SQUARES_ENOUGH if form is FORMS[0] else 1.0
     return Kind(form.name, fit, form.unknowns, not form.free, enough=enough)
@@ -262,7 +262,7 @@ def with_clean(rollouts: Sequence[Measured], noise: float, *, line: bool = True)
 
 def fitted(kind: Kind, rollouts: Sequence[Measured], noise: float = 0.0) -> FieldModel | None:
     """A fit, or None where the data overflow it."""
-    if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
+    if len(samples_of(rollouts)) < FEWEST_SAMPLES:
         return None
     try:
         with np.errstate(all="ignore"):
@@ -385,7 +385,7 @@ class Selection:
         """
         target, noise, settings, given = self.target, self.noise, self.settings, rollouts
         rollouts = [limited(rollout, self.action_set) for rollout in rollouts]
-        if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
+        if len(samples_of(rollouts)) < FEWEST_SAMPLES:
             return None
         if noise:
             rollouts = with_clean(rollouts, noise, line=self.line)

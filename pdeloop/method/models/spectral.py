@@ -47,7 +47,6 @@ from pdeloop.method.models.base import (
     COEFFICIENT_RIDGE,
     Arrays,
     FieldModelSettings,
-    Samples,
     StoredModel,
     Values,
     checked_substeps,
@@ -56,6 +55,7 @@ from pdeloop.method.models.base import (
     shaped,
     text_of,
 )
+from pdeloop.method.reduce.reduced_model import Samples
 from pdeloop.solver.polynomial_step import Polynomials, PolynomialStep, phi_functions
 
 Spectrum = NDArray[np.complex128]

@@ -34,7 +34,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce import channels as words
 from pdeloop.method.reduce.channels import NUMBERED, Channels, constant, scaled
 from pdeloop.method.reduce.reduced_model import (
-    Steps,
+    Samples,
     Trajectory,
     numerical_rank,
     repeated,
@@ -127,9 +127,9 @@ def examine_excitation(trajectory: Trajectory) -> Identifiability:
         return examine_steps(data, U)
 
 
-def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Identifiability:
+def examine_steps(data: Samples, U: Array, channels: Channels = NUMBERED) -> Identifiability:
     """Examine whether the steps determine a model on the modes U (n_z, n_s), with one LAPACK thread."""
-    s, y = data.before @ U, data.inputs
+    s, y = data.before @ U, data.actions
     values = linalg.svdvals(scaled(np.hstack([s, y]))[0])
     unknowns = s.shape[1] + y.shape[1]
     rank = numerical_rank(values, len(y), unknowns)
@@ -160,7 +160,7 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
     cannot be told apart are left to others.
     """
     data, coarse = steps_of(trajectories), list(trajectories)
-    y = data.inputs
+    y = data.actions
     with one_thread():
         if examine_steps(data, linalg.svd(data.after, full_matrices=False)[2][:1].T).faults:
             return
@@ -193,7 +193,7 @@ def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
         return []
     known = np.concatenate(before)
     with one_thread():
-        own, _ = _inputs(Steps(known, known, np.concatenate(inputs)), known[:, :1], NUMBERED)
+        own, _ = _inputs(Samples(known, np.concatenate(inputs), known), known[:, :1], NUMBERED)
     return [int(j) for j in np.flatnonzero(own < FED_BACK)]
 
 
@@ -210,11 +210,13 @@ def _with_past(z: Array, a: Array) -> Trajectory:
     return z, a
 
 
-def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
+def _with_effect(data: Samples, asked: Iterable[int]) -> set[int]:
     """Inputs of which z_{k+1} tells more than noise would: Hotelling's test of a column of B."""
     from scipy import special  # here, as no training needs it
 
-    before, after, y = (part - part.mean(axis=0) for part in (data.before, data.after, data.inputs))
+    before, after, y = (
+        part - part.mean(axis=0) for part in (data.before, data.after, data.actions)
+    )
     y = scaled(y)[0]
     steps, n_a = y.shape
     _, values, modes = linalg.svd(after, full_matrices=False)
@@ -234,9 +236,9 @@ def _with_effect(data: Steps, asked: Iterable[int]) -> set[int]:
     return found
 
 
-def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]]:
+def _inputs(data: Samples, s: Array, channels: Channels) -> tuple[Array, list[str]]:
     """The independence of every input, and the sentences about inputs that have none."""
-    y, (steps, n_a) = data.inputs, data.inputs.shape
+    y, (steps, n_a) = data.actions, data.actions.shape
     # Without a step for the constant it cannot be told from the others.
     drift = steps - 1 - s.shape[1] >= n_a
     offset = y.mean(axis=0) if drift else np.zeros(n_a)

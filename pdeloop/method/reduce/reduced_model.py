@@ -356,12 +356,31 @@ def _independent(columns: Array) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """Steps of trajectories, a row each: z_k and z_{k+1} (N, n_z), and the inputs a_k (N, n_a)."""
+class Samples:
+    """Steps of the plant: z_k, a_k, z_{k+1}, a row each, (N, n_z), (N, n_a), (N, n_z)."""
 
     before: Array
+    actions: Array
     after: Array
-    inputs: Array
+
+    def __len__(self) -> int:
+        return len(self.before)
+
+    def thinned(self, most: int) -> Samples:
+        """At most this many of them, equally spaced."""
+        some = slice(None, None, max(-(-len(self) // most), 1))
+        return Samples(self.before[some], self.actions[some], self.after[some])
+
+    def weights(self) -> Array:
+        """1 / max(|Δz|, mean |Δz|): a step counts relative to how much changes in it.
+
+        Where the field rests, what is left is the error of the model's integration, which would
+        otherwise outweigh everything; so less than the mean change counts as the mean.
+        """
+        change = np.linalg.norm(self.after - self.before, axis=1)
+        size = np.maximum(change, change.mean())
+        weights: Array = 1.0 / np.where(size > 0.0, size, 1.0)
+        return weights
 
 
 def operating_inputs(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Array:
@@ -370,12 +389,12 @@ def operating_inputs(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Arr
     return np.where((a.min(axis=0) <= 0.0) & (a.max(axis=0) >= 0.0), 0.0, a.mean(axis=0))
 
 
-def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
+def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Samples:
     """The steps of trajectories of one plant; a duplicated one counts once.
 
     ValueError for shapes that do not fit, NaN and infinity.
     """
-    befores, afters, inputs = [], [], []
+    befores, taken, afters = [], [], []
     if (
         not isinstance(trajectories, Sequence)
         or not trajectories
@@ -396,8 +415,8 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
             )
         befores.append(z[:-1])
         afters.append(z[1:])
-        inputs.append(own)
-    return Steps(*(np.concatenate(parts) for parts in (befores, afters, inputs)))
+        taken.append(own)
+    return Samples(*(np.concatenate(parts) for parts in (befores, taken, afters)))
 
 
 def repeated(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> dict[int, int]:

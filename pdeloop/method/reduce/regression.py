@@ -58,7 +58,7 @@ from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
     IdentificationSettings,
     ReducedModel,
-    Steps,
+    Samples,
     Trajectory,
     distinct,
     leading_modes,
@@ -97,7 +97,7 @@ def exact_regression(
     cannot be told apart.
     """
     data = steps_of(trajectories)
-    steps, n_a = data.inputs.shape
+    steps, n_a = data.actions.shape
     check_sizes(n_s, n_a, steps)
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with one_thread():
@@ -136,7 +136,7 @@ def needs_constant(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], n_s: int
         n = min(
             n_s,
             numerical_rank(values, *data.after.shape),
-            len(data.inputs) - len(held.inputs[0]) - 2,
+            len(data.actions) - len(held.actions[0]) - 2,
         )
         if n < 1:
             return False
@@ -153,7 +153,7 @@ def needs_constant(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], n_s: int
 def has_offset(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> bool:
     """False if the constant term of all steps together is rounding, or they leave no room for one."""
     data = steps_of(trajectories)
-    steps, n_a = data.inputs.shape
+    steps, n_a = data.actions.shape
     with one_thread():
         U, values, _ = linalg.svd(data.after.T, full_matrices=False)
         n = min(numerical_rank(values, *data.after.shape), steps - n_a - 1)
@@ -161,16 +161,16 @@ def has_offset(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> bool:
     return bool(n > 0 and steps * d @ d > NEGLIGIBLE * np.sum(data.after**2))
 
 
-def residuals(model: ReducedModel | ModelRows, data: Steps) -> Array:
+def residuals(model: ReducedModel | ModelRows, data: Samples) -> Array:
     """s_{k+1} - A s_k - B a_k - d of single steps in reduced coordinates, a row each."""
     s, after = data.before @ model.U, data.after @ model.U
-    found: Array = after - s @ model.A.T - data.inputs @ model.B.T
+    found: Array = after - s @ model.A.T - data.actions @ model.B.T
     return found if model.d is None else found - model.d
 
 
-def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
+def fit(data: Samples, U: Array, constant: bool = False) -> ReducedModel:
     """`exact_regression` on given modes U (n_z, n_s), unchecked. Call it with one LAPACK thread."""
-    s, y, n_s = data.before @ U, data.inputs, U.shape[1]
+    s, y, n_s = data.before @ U, data.actions, U.shape[1]
     if constant:
         # About the means, which is the same and loses no digits to a large offset.
         before, after, inputs = (part.mean(axis=0) for part in (data.before, data.after, y))
@@ -178,7 +178,7 @@ def fit(data: Steps, U: Array, constant: bool = False) -> ReducedModel:
         _, sizes, modes = linalg.svd(own, full_matrices=False)
         modes = modes[sizes > STILL * linalg.norm(s @ modes.T, axis=0)]
         own = own if len(modes) == n_s else own @ modes.T @ modes  # the rest is the constant
-        steps = Steps(own, (data.after - after) @ U, y - inputs)
+        steps = Samples(own, y - inputs, (data.after - after) @ U)
         centred = fit(steps, np.eye(n_s))
         d = after @ U - centred.A @ (before @ U) - centred.B @ inputs
         return ReducedModel(centred.A, centred.B, U, d)
@@ -208,7 +208,7 @@ def truncated_dmdc(
     trajectories hold. Too small loses the effect of the actuators; too large fits noise.
     """
     data = steps_of(trajectories)
-    steps, n_a = data.inputs.shape
+    steps, n_a = data.actions.shape
     n_z = data.before.shape[1]
     check_truncated_sizes(p, n_s, n_z=n_z, n_a=n_a, steps=steps)
 
@@ -219,10 +219,10 @@ def truncated_dmdc(
         return truncated_fit(data, basis, p, channels)
 
 
-def truncated_fit(data: Steps, U: Array, p: int, channels: Channels = NUMBERED) -> ReducedModel:
+def truncated_fit(data: Samples, U: Array, p: int, channels: Channels = NUMBERED) -> ReducedModel:
     """`truncated_dmdc` on given modes U (n_z, n_s). Call it with one LAPACK thread."""
-    n_z, (steps, n_a) = len(U), data.inputs.shape
-    stacked = np.vstack([data.before.T, data.inputs.T])
+    n_z, (steps, n_a) = len(U), data.actions.shape
+    stacked = np.vstack([data.before.T, data.actions.T])
     psi, xi, lam_t = linalg.svd(stacked, full_matrices=False)
     rank = numerical_rank(xi, n_z + n_a, steps)
     if p > rank:
@@ -230,7 +230,7 @@ def truncated_fit(data: Steps, U: Array, p: int, channels: Channels = NUMBERED) 
             f"p must be at most the numerical rank of the data, {rank}, but p is {p}; lower p "
             "or excite more."
         )
-    kept = _kept(psi, data.inputs.shape[1], p)
+    kept = _kept(psi, data.actions.shape[1], p)
     if (lost := np.flatnonzero(kept < LOST)).size:
         names = [channels.input(j) for j in lost.tolist()]
         raise NotIdentifiableError(cut_off(names, kept[lost].tolist(), p))
@@ -244,9 +244,9 @@ def truncation_remarks(
     """Name the inputs that p directions of [Z; Y] hardly keep."""
     data = steps_of(trajectories)
     with one_thread():
-        stacked = np.vstack([data.before.T, data.inputs.T])
+        stacked = np.vstack([data.before.T, data.actions.T])
         psi, _, _ = linalg.svd(stacked, full_matrices=False)
-    kept = _kept(psi, data.inputs.shape[1], p)
+    kept = _kept(psi, data.actions.shape[1], p)
     shrunk = np.flatnonzero(kept < SHRUNK)
     names = [channels.input(j) for j in shrunk.tolist()]
     return [cut_off(names, kept[shrunk].tolist(), p)] if names else []
@@ -349,7 +349,7 @@ def study_orders(
     *,
     channels: Channels = NUMBERED,
     settings: IdentificationSettings = DEFAULTS,
-    fitted_by: Callable[[Steps, Array], ReducedModel] | None = None,
+    fitted_by: Callable[[Samples, Array], ReducedModel] | None = None,
     constant: bool | None = None,
 ) -> OrderStudy:
     """Try orders of a reduced model on held-out parts of trajectories of one plant.
@@ -403,7 +403,7 @@ def study_orders(
     errors, scales = [], np.zeros(2)
     with one_thread():  # as in the identification itself
         singular_values: Array = linalg.svdvals(everything.after)
-        if len(everything.inputs) > 1 and singular_values[0] > 0.0:
+        if len(everything) > 1 and singular_values[0] > 0.0:
             examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
         if constant is None:
             constant = needs_constant(known, max((n for n in tried if n <= MOST), default=1))
@@ -419,8 +419,8 @@ def study_orders(
             scales += np.sum([_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held], axis=0)
     if not (tried and errors):
         raise ValueError(
-            f"the {len(everything.inputs)} steps with {everything.inputs.shape[1]} inputs are too few, "
-            "or vary too little, to hold some of them out; record a longer trajectory"
+            f"the {len(everything)} steps with {everything.actions.shape[1]} inputs are too few, or "
+            "vary too little, to hold some of them out; record a longer trajectory"
         )
     total = np.sum([fold[: len(tried)] for fold in errors], axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -432,7 +432,10 @@ def study_orders(
 
 
 def _held_out(
-    by: Callable[[Steps, Array], ReducedModel], data: Steps, U: Array, held: Sequence[Trajectory]
+    by: Callable[[Samples, Array], ReducedModel],
+    data: Samples,
+    U: Array,
+    held: Sequence[Trajectory],
 ) -> Array:
     """Sums of squared errors on held-out pieces: of one step, and rolled out; infinite: no model."""
     try:
@@ -452,10 +455,10 @@ def _held_out(
     return total
 
 
-def _determined(data: Steps, modes: Array) -> int:
+def _determined(data: Samples, modes: Array) -> int:
     """The highest order whose regressors, on the leading modes (n_z, n), are independent here."""
-    steps, n_a = data.inputs.shape
-    columns, _ = scaled(np.hstack([data.inputs, data.before @ modes])[:, :steps])
+    steps, n_a = data.actions.shape
+    columns, _ = scaled(np.hstack([data.actions, data.before @ modes])[:, :steps])
     heights = np.abs(np.diag(linalg.qr(columns, mode="r")[0]))
     lost = np.flatnonzero(heights <= steps * np.finfo(np.float64).eps)
     most: int = (lost[0] if lost.size else heights.size) - n_a

@@ -45,7 +45,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels
 from pdeloop.method.reduce.identifiability import NotIdentifiableError, examine_steps
 from pdeloop.method.reduce.reduced_model import (
-    Steps,
+    Samples,
     Trajectory,
     distinct,
     leading_modes,
@@ -150,9 +150,9 @@ def subspace_model(
     """
     data = steps_of(trajectories)
     known = distinct(trajectories)
-    means = np.zeros(data.after.shape[1]), np.zeros(data.inputs.shape[1])
+    means = np.zeros(data.after.shape[1]), np.zeros(data.actions.shape[1])
     if constant:
-        means = data.after.mean(axis=0), data.inputs.mean(axis=0)
+        means = data.after.mean(axis=0), data.actions.mean(axis=0)
         known = [(z - means[0], a - means[1]) for z, a in known]
     with one_thread():
         few, affine = 0 < order <= MANY, constant and simulations
@@ -171,9 +171,9 @@ def subspace_model(
         else:
             tried = [(past, order)] if past and order else []
         if not tried:
-            n_a = data.inputs.shape[1]
+            n_a = data.actions.shape[1]
             raise NotIdentifiableError(
-                f"{len(data.inputs)} steps do not determine a model with {n_a} inputs in innovation "
+                f"{len(data.actions)} steps do not determine a model with {n_a} inputs in innovation "
                 f"form: expected more than {n_a + 1} after the first ones of every part, while a "
                 "quarter is held out; take a longer horizon, or add a log"
             )
@@ -474,7 +474,7 @@ def _fitted(
     kept, (count, n_a), r = predictor.kept(n), inputs.shape, y.shape[1]
     if check:
         states = predictor.states(n)
-        steps = Steps(states[~last], states[1:][~last[:-1]], inputs)
+        steps = Samples(states[~last], inputs, states[1:][~last[:-1]])
         examine_steps(steps, np.eye(kept), channels).require()
     every, both = predictor.triangles
     most = every.shape[1] - 1 - r
