@@ -122,7 +122,7 @@ def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
 def test_actuators_need_not_be_equally_spaced() -> None:
     positions = [0.1, 0.22, 0.55]
     strong = {"actuator_positions": positions, "n_a": 3, "exploration_variance": 4.0}
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=30, **strong)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=12, **strong)
     model, _, error = _fitted(problem, 1000)
     assert error < 1e-4
     x = np.arange(len(model.B)) / len(model.B)
@@ -169,7 +169,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
 def test_noise_does_not_make_short_waves_grow() -> None:
     """The readings are noise: a fit may only take it for fields of a well-posed equation."""
     rng = np.random.default_rng(1)
-    readings, actions = rng.standard_normal((1, 20, 4)), rng.standard_normal((1, 20, 2))
+    readings, actions = rng.standard_normal((1, 12, 4)), rng.standard_normal((1, 12, 2))
     with threadpool_limits(1):
         found = fit_sensed(list(readings), list(actions), equally_spaced(2), 0.5)
     assert found.error > SENSED_REPRODUCED and np.isfinite(found.fields).all()
@@ -237,6 +237,7 @@ def test_what_readings_do_not_tell_is_as_large_as_in_other_rollouts() -> None:
     assert found.spread[1] > 0.25 and found.spread[8] < 0.1 * found.spread[1]
     assert np.linalg.norm(found.fields - fields) < 0.15 * np.linalg.norm(fields)
     assert found.noise == pytest.approx(0.1, rel=0.1)
+    assert np.std(found.shared[SHARED:]) < 0.1  # of actuators that are equally strong
 
 
 def test_a_fit_goes_on_from_an_earlier_equation() -> None:
@@ -256,20 +257,19 @@ def test_a_fit_goes_on_from_an_earlier_equation() -> None:
     assert again.error == pytest.approx(first.error, abs=1e-3)
 
 
-def test_actuators_differ_in_strength_only_where_readings_say_so() -> None:
-    for strengths in ([5.0, 5.0, 5.0], [5.0, 8.0, 2.0]):
-        readings, actions, _ = _drawn(REACTION, 4, 0.02, strengths)
-        with threadpool_limits(1):
-            found = fit_sensed(readings, actions, DECLARED, 0.02)
-        own = found.shared[COEFFICIENTS] + found.shared[SHARED:]
-        np.testing.assert_allclose(own, strengths, atol=0.2)
-        assert np.std(strengths) > 0.0 or np.std(own) < 0.1
+def test_actuators_differ_in_strength_where_readings_say_so() -> None:
+    strengths = [5.0, 8.0, 2.0]
+    readings, actions, _ = _drawn(REACTION, 3, 0.02, strengths)
+    with threadpool_limits(1):
+        found = fit_sensed(readings, actions, DECLARED, 0.02)
+    own = found.shared[COEFFICIENTS] + found.shared[SHARED:]
+    np.testing.assert_allclose(own, strengths, atol=0.2)
 
 
 def test_terms_beyond_the_first_ones_are_found_where_these_do_not_suffice() -> None:
     """Kuramoto and Sivashinsky's: long waves grow, short ones are damped by the fourth derivative."""
     equation = {(1, 2): -100.0, (1, 4): -3.0, (2, 1): -10.0}
-    readings, actions, _ = _drawn(equation, 4, 0.0, [10.0] * 3)
+    readings, actions, _ = _drawn(equation, 3, 0.0, [10.0] * 3)
     with threadpool_limits(1):
         found = fit_sensed(readings, actions, DECLARED)
     assert found.error < 1e-5
