@@ -46,8 +46,7 @@ def of_pairs(costs: Mapping[str, Array], base: str) -> dict[str, Evidence]:
     return evidence_of_rollouts(laws, base, seen)
 
 
-@pytest.mark.parametrize("pairs", [2, 3, 5, 8])
-@pytest.mark.parametrize("confidence", [1.0, 2.0])
+@pytest.mark.parametrize(("pairs", "confidence"), [(2, 1.0), (3, 2.0), (8, 1.0)])
 def test_pairs_without_a_difference_are_taken_for_one_at_the_level_however_few(
     pairs: int, confidence: float
 ) -> None:
@@ -78,8 +77,9 @@ def test_where_chance_explains_everything_no_control_is_kept_only_if_an_estimate
         assert (ALL_AGREE in found.reason) == better
 
 
-@pytest.mark.parametrize(("own", "others"), [(2, 2), (3, 12), (2, 40), (8, 8)])
-@pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
+@pytest.mark.parametrize(
+    ("own", "others", "ratio"), [(2, 2, 5.0), (3, 12, 0.2), (2, 40, 1.0), (8, 8, 1.0)]
+)
 def test_laws_of_one_cost_on_different_fields_are_told_apart_no_more_often_than_the_level(
     own: int, others: int, ratio: float
 ) -> None:
