@@ -15,7 +15,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.design.lqt import track_horizon
 from tests.support.recorded_here import record_run
-from tests.support.small import FEW_FITS, SMALL, same_bits
+from tests.support.small import FEW_FITS, FEW_STEPS, SMALL, same_bits
 
 N_Z, T = 32, 12
 SHIPPED = {"burgers": 6, "allen-cahn": 6, "kdv": 12}
@@ -164,7 +164,7 @@ def test_a_law_that_is_trained_for_it_costs_less_than_one_for_the_plain_cost(
     plant = general.plant(4)
     found = {}
     for which, own in (("general", general), ("plain", plain)):
-        run = pdeloop.train(own, rollouts=8, evaluation_fields=2)
+        run = pdeloop.train(own, rollouts=8, evaluation_fields=2, **FEW_STEPS)
         law = pdeloop.projected_law(plant, run.models[0].U, run.policies[0])
         found[which] = pdeloop.rollout(plant, law, [100, 101, 102, 103]).costs.mean.mean()
     none = pdeloop.rollout(plant, lambda k, z: np.zeros((4, plant.n_a)), [100, 101, 102, 103])

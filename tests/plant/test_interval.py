@@ -108,7 +108,7 @@ def test_a_reaction_saturates() -> None:
 
 
 def test_a_law_holds_what_grows_and_check_finds_nothing() -> None:
-    values = pdeloop.problem(plant=Interval(33)).values
+    values = pdeloop.problem(plant=Interval(17)).values
     found = {finding.name: finding for finding in check(values)}
     assert all(finding.good for finding in found.values()), found
     assert "halving" in found["integration step"].text
@@ -134,6 +134,7 @@ def test_it_is_shipped_by_name_and_trained(tmp_path: Path) -> None:
     problem.write_text(
         "/**: {ros__parameters: {plant: interval, "
         "physical: {points: 17, right: neumann, inputs: right, growth: 0.5}, "
+        "optimizer_settings: {iterations: 3, mixtures: 2}, "
         "field_model_settings: {folds: 2, largest_degree: 2}}}"
     )
     out = tmp_path / "run"
