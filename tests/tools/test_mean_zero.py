@@ -11,6 +11,7 @@ import pytest
 import pdeloop
 from controller_node.identification import DesignSettings, designed
 from pdeloop.identification import _identified
+from tests.support.small import FEW_STEPS
 
 
 class Pumps(pdeloop.Dynamics):
@@ -39,7 +40,7 @@ def test_a_model_in_innovation_form_knows_their_differences(explored: Any) -> No
     values = pdeloop.problem(plant=Pumps(), law="observer", identification="subspace").values
     rows = designed(explored, Pumps.target, DesignSettings.of(values)).rows
     np.testing.assert_allclose(rows.B.sum(axis=1), 0.0, atol=1e-9 * np.abs(rows.B).max())
-    run = pdeloop.train(plant=Pumps(), sensors=3, rollouts=12, evaluation_fields=4)
+    run = pdeloop.train(plant=Pumps(), sensors=3, rollouts=12, evaluation_fields=4, **FEW_STEPS)
     costs = {name: own.mean() for name, own in run.costs.items()}
     assert costs["adapted"] < 0.95 * costs["lqt"] < 0.9 * costs["none"]
 

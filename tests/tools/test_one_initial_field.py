@@ -8,6 +8,9 @@ import pytest
 
 import pdeloop
 from pdeloop.messages.arrays import Array
+from tests.support.small import FEW_STEPS
+
+FEW = {"evaluation_fields": 2, "identification": "regression", **FEW_STEPS}
 
 
 class Pendulums(pdeloop.Dynamics):
@@ -39,7 +42,7 @@ def roles(run: pdeloop.FinishedRun) -> list[int]:
 
 def test_each_law_is_rolled_out_once_and_it_ends_where_laws_about_the_target_gain_nothing() -> None:
     """They follow laws of models that gain nothing more; what is left then is told."""
-    run = pdeloop.train(plant=Pendulums(), seed=0, rollouts=20)
+    run = pdeloop.train(plant=Pendulums(), seed=0, rollouts=20, evaluation_fields=2)
     known = roles(run)
     assert known[0] == 4  # two explorations, and two of the first law, which are the same
     assert set(np.diff(known[:-1])) == {1}
@@ -64,7 +67,7 @@ class Moving(Pendulums):
 
 
 def test_other_weights_leave_no_rollout_either() -> None:
-    run = pdeloop.train(plant=Weighted(), seed=0, rollouts=14)
+    run = pdeloop.train(plant=Weighted(), seed=0, rollouts=14, **FEW)
     assert run.rollouts[0]["total"] == 14
     reasons = [str(row.get("reason", "")) for row in run.result["history"]]
     assert any("a law about the target follows" in reason for reason in reasons)
@@ -72,7 +75,7 @@ def test_other_weights_leave_no_rollout_either() -> None:
 
 def test_it_ends_where_no_other_law_is_to_be_tried() -> None:
     with pytest.warns(pdeloop.TrainingWarning, match="every episode begins alike"):
-        run = pdeloop.train(plant=Moving(), seed=0, rollouts=20)
+        run = pdeloop.train(plant=Moving(), seed=0, rollouts=20, **FEW)
     assert run.rollouts[0]["total"] == roles(run)[-1] < 20
 
 
@@ -81,6 +84,6 @@ def test_fields_that_differ_or_noise_are_rolled_out_as_ever() -> None:
         (Pendulums(0.1), {}, 5),
         (Pendulums(), {"process_noise": 1e-3}, 4),  # two of the first law, which differ
     ):
-        run = pdeloop.train(plant=plant, seed=0, rollouts=8, **settings)
+        run = pdeloop.train(plant=plant, seed=0, rollouts=8, **FEW, **settings)
         assert roles(run)[0] == first
         assert run.rollouts[0]["total"] == 8
