@@ -23,6 +23,9 @@ B = np.array([[0.1, 0.0], [0.02, 0.0], [0.0, 0.03], [0.0, 0.12]])
 K = -np.array([[2.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]])
 
 
+CASES: list[dict[str, Any]] = [{}, {"noise": 0.5}, {"held": 10}, {"noise": 0.0}]
+
+
 def logged(
     delays: tuple[int, int],
     *,
@@ -45,8 +48,14 @@ def logged(
     return z + noise * rng.normal(size=z.shape), a
 
 
-@pytest.mark.parametrize("delays", [(0, 0), (1, 1), (3, 3), (10, 10), (0, 3), (4, 1)])
-@pytest.mark.parametrize("case", [{}, {"noise": 0.5}, {"held": 10}, {"noise": 0.0}])
+@pytest.mark.parametrize(
+    ("delays", "case"),
+    [
+        *(((0, 0), case) for case in CASES),
+        *(((0, 3), case) for case in CASES),
+        *((delays, {}) for delays in ((1, 1), (3, 3), (10, 10), (4, 1))),
+    ],
+)
 def test_the_delay_of_each_input_is_found(delays: tuple[int, int], case: dict[str, Any]) -> None:
     z, a = logged(delays, **case)
     assert study_delays([(z, a)]).best == delays
@@ -54,8 +63,8 @@ def test_the_delay_of_each_input_is_found(delays: tuple[int, int], case: dict[st
     assert study_delays([(z[1:-1], a[:-2])]).best == tuple(n - 1 for n in delays)
 
 
-@pytest.mark.parametrize("late", [(1, 1), (2, 2), (3, 3), (6, 6), (0, 2), (2, 0), (1, 3)])
-@pytest.mark.parametrize("held", [1, 5, 10])
+@pytest.mark.parametrize("late", [(1, 1), (6, 6), (0, 2), (1, 3)])
+@pytest.mark.parametrize("held", [1, 10])
 def test_inputs_logged_some_rows_late_are_not_taken_for_feedback(
     late: tuple[int, int], held: int
 ) -> None:
@@ -68,7 +77,7 @@ def test_inputs_logged_some_rows_late_are_not_taken_for_feedback(
 
 @pytest.mark.parametrize("dither", [0.1, 1.0])
 @pytest.mark.parametrize("held", [1, 10])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_law_with_weak_excitation_is_not_logged_late(dither: float, held: int, seed: int) -> None:
     """The states say more of each input than the inputs do of them."""
     for noise in (0.0, 0.02):
@@ -86,7 +95,7 @@ def test_a_dead_time_beyond_the_range_is_looked_for_further_on_or_said_to_be_unc
     assert "at least 10 rows later" in text and "how many rows is not clear" in text
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_feedback_and_idle_inputs_are_no_delay(seed: int) -> None:
     for known in (
         logged((0, 0), process=10.0, feedback=1.0, seed=seed, steps=1000),
