@@ -14,7 +14,9 @@ import pytest
 from pdeloop.process.isolation import NETWORK
 from pdeloop.process.ros_environment import STEERING, steering, with_servers_there
 from pdeloop.process.start import BLAS_THREADS, OWN
-from tests.support.interpreter import ROOT
+from tests.support.interpreter import LIMIT, ROOT
+from tests.support.loop_harness import Processes
+from tests.support.small import SMALL
 
 
 def command(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -29,13 +31,12 @@ def command(folder: Path, *words: str, **environment: str) -> subprocess.Complet
     )
 
 
-@pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend_inline", "TkAgg", "none"])
-def test_figures_need_no_backend_of_another_program(tmp_path: Path, backend: str) -> None:
-    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfont.family: nowhere\n")
-    words = ("check", "allen-cahn", "--picture", "a.png")
-    ended = command(tmp_path, *words, MPLBACKEND=backend)
-    assert ended.returncode == 0, ended.stderr
-    assert (tmp_path / "a.png").read_bytes()[1:4] == b"PNG"
+def test_figures_need_no_backend_of_another_program(loop: Processes) -> None:
+    (loop.folder / "matplotlibrc").write_text("text.usetex: True\nfont.family: nowhere\n")
+    for backend in ("module://matplotlib_inline.backend_inline", "TkAgg", "none"):
+        loop.environment["MPLBACKEND"] = backend
+        loop.wait(loop.pdeloop("check", str(SMALL), "--picture", f"{backend[:3]}.png"), LIMIT)
+        assert (loop.folder / f"{backend[:3]}.png").read_bytes()[1:4] == b"PNG"
 
 
 def test_a_stream_that_cannot_write_a_character_ends_no_training(tmp_path: Path) -> None:
