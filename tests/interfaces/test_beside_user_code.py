@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-BASES = {"plant": "Dynamics", "equation": "Dynamics", "optimizer": "StepOptimizer", "law": "Law"}
+BASES = {"plant": "Dynamics", "law": "Law"}
 LOADED = """
 import sys
 from pdeloop.messages.own_code import OwnCode
