@@ -21,6 +21,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
@@ -98,6 +99,11 @@ def test_searches_of_nothing_find_it_wanting(
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # for tests that they run
     monkeypatch.setattr(sys, "argv", ["tool", *words])
+    # They have no work, which is all that processes, and what mutants need, would be there for.
+    if tool is mutants:
+        monkeypatch.setattr(tool, "prepare", lambda modules: None)
+    else:
+        monkeypatch.setattr(tool, "processes", lambda: ThreadPoolExecutor(1))
     assert tool.main() == 1
 
 
