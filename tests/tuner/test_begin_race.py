@@ -22,7 +22,7 @@ from tuner_node.run_folder import RunFolder, RunFolderError
 
 def test_of_two_processes_that_begin_in_one_folder_one_does_in_any_order():
     """A sample; `.ci/run` tries every order."""
-    words = (sys.executable, "-m", "tests.support.begin_race", "--every", "4")
+    words = (sys.executable, "-m", "tests.support.begin_race", "--every", "6")
     env = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     ended = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, timeout=LIMIT)
     assert ended.stdout, ended.stderr
