@@ -23,14 +23,14 @@ from pdeloop.environments import environment_id
 from pdeloop.environments.picture import Picture
 from pdeloop.frames import Frames
 from pdeloop.messages.grid import Axis, Grid
-from pdeloop.messages.problem import shipped_problems
 
 BURGERS = "pdeloop/Burgers-v0"
-GRID: dict[str, Any] = {"n_z": 32, "horizon": 4}
+GRID: dict[str, Any] = {"n_z": 32, "horizon": 2}
 
 
-@pytest.mark.parametrize("problem", shipped_problems())
-def test_a_frame_shows_the_field_of_each_problem(problem: str) -> None:
+@pytest.mark.parametrize("problem", ["burgers", "wave", "schrodinger"])
+def test_a_frame_shows_the_field_of_a_problem(problem: str) -> None:
+    """Of one component, of two, and of a complex one: the others have one of these."""
     env = gymnasium.make(environment_id(problem), render_mode="rgb_array", n_z=64)
     env.reset(seed=1)
     first = env.render()

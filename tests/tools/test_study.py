@@ -195,7 +195,7 @@ def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any
         Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
 
 
-@pytest.mark.usefixtures("forked_workers")
+@pytest.mark.usefixtures("forked_workers", "undrawn")
 def test_the_command_runs_continues_and_refuses_another_study(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
