@@ -184,7 +184,7 @@ def test_an_exact_model_tells_laws_apart_in_the_same_rollouts() -> None:
 
 def test_model_based_improves_a_law_of_few_readings_and_goes_on_with_the_same_bits() -> None:
     law = first_law()
-    start, few = 0.4 * law.theta_start, ModelBasedSettings(iterations=20)
+    start, few = 0.4 * law.theta_start, ModelBasedSettings(iterations=8)
 
     def made() -> ModelBased:
         kind = ModelBased.for_context(context())
