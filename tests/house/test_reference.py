@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-
 from tests.support.interpreter import ROOT
 
 NAMES = re.findall(r"^::: (\S+)$", (ROOT / "docs/reference/index.md").read_text(), re.MULTILINE)
