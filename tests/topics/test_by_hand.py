@@ -45,7 +45,8 @@ def test_the_three_terminals_train_and_say_where_the_results_are(
         for block in found:
             assert "export ROS_DOMAIN_ID=42" in block
             text = block.replace("ROS_DOMAIN_ID=42", f"ROS_DOMAIN_ID={domain}")
-            text = text.replace("out:=my_run", "out:=my_run -p rollouts:=9 -p optimizer:=two_point")
+            few = "out:=my_run -p rollouts:=9 -p optimizer:=two_point -p evaluation_fields:=1"
+            text = text.replace("out:=my_run", few)
             with (tmp_path / f"{len(started)}.log").open("wb") as log:
                 started.append(
                     subprocess.Popen(

@@ -28,7 +28,7 @@ QUICK: dict[str, Any] = {
     "rollouts": 6,
     "evaluation_fields": 1,
     "exploration_variance": 1.0,
-    "identification": "field",
+    "identification": "regression",
     "field_model_settings": {"folds": 2, "largest_degree": 3},
     "optimizer_settings": {"iterations": 1},
 }
