@@ -11,6 +11,7 @@ import pytest
 from pdeloop.bags.mcap_messages import Message
 from tests.support.made_once import made_once
 from tests.support.recorded_here import messages_of, record_run
+from tests.support.verified_bag import HORIZON
 
 
 @pytest.fixture(scope="session")
@@ -18,7 +19,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run with its bag."""
 
     def make(folder: Path) -> Path:
-        record_run(folder / "run")
+        record_run(folder / "run", horizon=HORIZON)
         return folder / "run"
 
     return made_once(tmp_path_factory, "verified", make)

@@ -18,7 +18,7 @@ from pdeloop.identification import identify_bag
 from pdeloop.messages.samples import clock_message
 from recorder_node.recording import PARAMETERS_TOPIC, source_of
 from tests.support.recorded_here import PART, change_metadata, episode_of, record_run, write
-from tests.support.verified_bag import EPISODES, by_episodes, verified, words_of
+from tests.support.verified_bag import EPISODES, HORIZON, by_episodes, verified, words_of
 
 
 def test_a_whole_run_is_verified_with_its_results(run, capsys):
@@ -192,7 +192,7 @@ RUN_FILES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], str]] = {
     "another horizon": (
         "run.json",
         lambda c: c["parameters"].update(horizon=31),
-        "parameter 'horizon' is 30 in the bag and 31 in",
+        f"parameter 'horizon' is {HORIZON} in the bag and 31 in",
     ),
     "no run": ("run.json", lambda c: c.pop("run"), "run.json cannot be read: it lacks 'run'"),
     "no costs": ("result.json", lambda c: c.pop("costs_by_field"), "result.json cannot be read"),

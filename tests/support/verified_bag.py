@@ -11,6 +11,8 @@ from pdeloop.cli import main
 from recorder_node.recording import CLOCK
 from tests.support.recorded_here import PART, episode_of
 
+HORIZON = 12
+"""As short as its model allows."""
 EPISODES = 1 + 1 + 3 + 4
 """Exploration, check, three steps of four rollouts, twelve of the evaluation and two repeated ones."""
 
