@@ -182,7 +182,7 @@ def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_thet
 ) -> None:
     made, network, _ = training(ANY_ACTION, own)
     first = network.first(RNG)
-    numbers, others = made.trained(50), np.stack([start(seed) for seed in range(20, 40)])
+    numbers, others = made.trained(25), np.stack([start(seed) for seed in range(20, 40)])
     before, after = (made.costs(each, others).mean() for each in (first, numbers))
     assert after < 0.97 * before
     theta = own.theta_of(own.theta_start, *network.folded(numbers))
@@ -203,7 +203,7 @@ def test_a_network_sees_the_declared_noise_and_plans_that_it_imitates_do_not() -
 
 def optimizer() -> ModelBasedNeural:
     """Of a plant that is the spectral model, judged by rollouts of it."""
-    made = planned(kind=Neural, constants=NeuralSettings(neurons=H, iterations=20))
+    made = planned(kind=Neural, constants=NeuralSettings(neurons=H, iterations=10))
     assert isinstance(made, ModelBasedNeural)
     return made
 
@@ -242,11 +242,11 @@ def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
 
 TRAINED = {
     "n_z": 32,
-    "horizon": 30,
+    "horizon": 25,
     "reduced_order": 8,
-    "rollouts": 15,
+    "rollouts": 12,
     "evaluation_fields": 4,
-    "law_settings": {"neurons": 16, "iterations": 120},
+    "law_settings": {"neurons": 8, "iterations": 40},
     **FEW_FITS,
 }
 
