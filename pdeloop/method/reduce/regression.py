@@ -444,14 +444,10 @@ def _held_out(
         return np.full(2, np.inf)
     total, (A, U) = np.zeros(2), (model.A, model.U)
     for states, actions in held:
-        inputs = actions @ model.B.T + model.d
-        rolled = np.empty((len(states), model.n_s))
-        rolled[0] = states[0] @ U
         with np.errstate(over="ignore", invalid="ignore"):
-            for k, forced in enumerate(inputs):
-                rolled[k + 1] = A @ rolled[k] + forced
-            once = states[:-1] @ U @ A.T + inputs
-            total += _squares(states[1:] - once @ U.T, states[1:] - rolled[1:] @ U.T)
+            rolled, _ = model.simulate(states[0], actions)
+            once = states[:-1] @ U @ A.T + actions @ model.B.T + model.d
+            total += _squares(states[1:] - once @ U.T, states[1:] - rolled[1:])
     return total
 
 
