@@ -50,7 +50,7 @@ from pdeloop.method.models.finite_difference import (
     fit_finite_difference,
 )
 from pdeloop.method.reduce.reduced_model import Samples, Trajectory, turns
-from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, driven, subspace_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,11 +318,8 @@ class ReadingsModel(LinearModel):
 
     def foreseen(self, first: Array, actions: Array) -> Array:
         """U^T y_k (L, r) from x_0, without innovations."""
-        x, found = first, []
-        for a in actions:
-            found.append(self.C @ x)
-            x = self.A @ x + self.B @ a + self.constant
-        return np.array(found)
+        x = driven(self.A, actions @ self.B.T + self.constant, first[:, None])[:-1, :, 0]
+        return np.asarray(x @ self.C.T)
 
 
 def fit_readings(
