@@ -17,7 +17,8 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured
 from pdeloop.method.models.base import errors, samples_of
 from pdeloop.method.models.linear import fit_linear
-from pdeloop.method.models.selection import NEAR_RIDGES, kinds_of
+from pdeloop.method.models.selection import FORMS, NEAR_RIDGES, kinds_of
+from pdeloop.method.models.spectral import fit_spectral
 from tests.support.fitted import fit_field_model
 from tests.support.plants import plant_of
 
@@ -114,6 +115,13 @@ def test_plants_that_are_no_periodic_equation_are_recovered(name, count, varianc
     rollouts, target = rolled_out(name, count, variance)
     fitted = fit_field_model(rollouts[:-1], target)
     assert errors(fitted.model, rollouts[-1:], target, 2.0)[0] < error
+
+
+def test_numbers_that_are_no_field_have_no_equation_on_a_ring():
+    rollouts, _ = rolled_out("RandomLinear", 3, 0.01)
+    samples = samples_of(rollouts)
+    with np.errstate(all="ignore"):
+        assert all(fit_spectral(samples, form, FieldModelSettings()) is None for form in FORMS)
 
 
 def test_a_linear_plant_of_two_fields_is_a_convolution():

@@ -22,7 +22,8 @@ suffice without an initial guess. B and c are free at every wavenumber and are p
 Symbols are, by their number of unknowns: polynomials of ik with real coefficients (`poly`, and `front`
 with fewer terms), compared on low wavenumbers only, where a steep front has no influence; with a fifth
 derivative in L (`fifth`), or the Hilbert transforms of the others (`nonlocal`); free at every
-wavenumber (`free`). The equation with the smallest residual of all passes is selected.
+wavenumber (`free`). The equation with the smallest residual of all passes is selected, if the first
+ones explain half of the change.
 
 References
 ----------
@@ -301,6 +302,8 @@ def all_free(data: Regression) -> Symbols:
 
 _SETTLED = 1e-3
 """Relative change of the one-step error at which the passes end."""
+_UNEXPLAINED = 0.5
+"""Share of the change that the first passes may leave unexplained: the plant is of another form."""
 
 _PASSES = 12
 """Number of times that an equation is refitted along the paths of the previous fit."""
@@ -315,19 +318,23 @@ SIZES = 48
 def fit_spectral(
     samples: Samples, form: Form, settings: FieldModelSettings
 ) -> SpectralModel | None:
-    """The equation of that form, or None where half of the samples overflow the first ones."""
+    """The equation of that form; None where it explains too little, or half of the samples overflow."""
     samples = samples.thinned(_SAMPLES)
     largest = float(np.abs(samples.before).max())
     model = nothing(form, samples.before.shape[1], samples.actions.shape[1], largest)
     # `tried` is what the pass is about: an equation that is kept, and from then on `model`, or not.
-    best, least, tried = None, np.inf, model
+    best, least, change, tried = None, np.inf, 0.0, model
     for turn in range(_PASSES + 1):
         data = _regression(tried, samples, form)
         if data is None and best is None:
             break
         settled = data is not None and abs(data.miss - least) <= _SETTLED * least
-        if data is not None and data.miss < least and turn:
+        if data is not None and not turn:
+            change = data.miss
+        elif data is not None and data.miss < least:
             best, least = tried, data.miss
+        if turn > len(form.shares) and least > _UNEXPLAINED * change:
+            return None
         if turn == _PASSES or (settled and turn > len(form.shares)):
             break
         if data is not None and (tried is best or turn <= len(form.shares)):
