@@ -66,7 +66,7 @@ def test_burgers_is_recovered_with_its_coefficients():
     equation = BurgersModes(viscosity=1e-2)
     rollouts, target = explored(equation, 0.05, 20, 3)
     fitted = fit_field_model(rollouts[:2], target)
-    assert fitted.error < 1e-5 and [kind for kind, _ in fitted.candidates] == ["poly2"]
+    assert fitted.error < 1e-5 and [kind for kind, _ in fitted.candidates] == ["linear", "poly2"]
     k = 2 * np.pi * WAVES
     low = slice(1, 8)
     linear, squares = fitted.model.symbols
@@ -122,6 +122,19 @@ def test_numbers_that_are_no_field_have_no_equation_on_a_ring():
     samples = samples_of(rollouts)
     with np.errstate(all="ignore"):
         assert all(fit_spectral(samples, form, FieldModelSettings()) is None for form in FORMS)
+
+
+def test_what_a_linear_model_reproduces_is_given_to_no_other_kind():
+    rng = np.random.default_rng(0)
+    A = 0.9 * np.linalg.qr(rng.normal(size=(16, 16)))[0]
+    rollouts = []
+    for _ in range(2):
+        actions, states = rng.normal(size=(60, 1)), [rng.normal(size=16)]
+        for a in actions:
+            states.append(A @ states[-1] + a)
+        rollouts.append(Measured(np.array(states), actions))
+    fitted = fit_field_model(rollouts, np.zeros(16))
+    assert [kind for kind, _ in fitted.candidates] == ["linear"]
 
 
 def test_a_linear_plant_of_two_fields_is_a_convolution():

@@ -5,9 +5,9 @@ Each kind is fitted to some of the rollouts and judged by the error E of its pre
 from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
 share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
 ten times its share of the states up to REPRODUCED_NOISY, is selected; if there is none, the one with
-the fewest unknowns that is not BETTER times worse than the best. Squares alone are selected at a
-hundredth of that E, or if cubes as well are not. It is then fitted to all rollouts. `kinds_of`
-lists the kinds in the order in which they are tried, with the number of their unknowns.
+the fewest unknowns that is not BETTER times worse than the best. A linear model is selected at a
+hundredth of that E, or if no other is, squares alone likewise. It is then fitted to all rollouts.
+`kinds_of` lists the kinds in the order in which they are tried, with the number of their unknowns.
 
 The model is that which predicts whole rollouts, where one is accepted, or else
 
@@ -99,8 +99,8 @@ _POINT_DEGREE = 3
 LINEAR = "linear"
 _LINEAR_RIDGE, _LINEAR_MODES = 1e-6, 64
 """Ridge of a linear model of the whole state; POD modes of one of a large state, at most."""
-SQUARES_ENOUGH = 0.01
-"""`enough` of an equation with squares alone, as cubes may be small where it was measured."""
+FIRST_ENOUGH = 0.01
+"""`enough` of a linear model, and of squares alone, as more may be small where it was measured."""
 SIMPLEST = 3
 """Forms of the fewest unknowns, the first ones."""
 ACCURATE, TRIED = 5e-3, "front2"
@@ -139,9 +139,14 @@ def kinds_of(
         return linear + _finite_difference(n_z // math.prod(shape), settings, shape=shape)
     last = list[Kind]()
     if n_z <= LARGEST_STATE:
-        last.append(Kind("polynomial", lambda own, _: fit_polynomial(own), (n_z + 1.0, 0)))
+        needed = settings.reproduced
+        last.append(
+            Kind("polynomial", lambda own, _: fit_polynomial(own), (n_z + 1.0, 0), needed=needed)
+        )
     if not line:
         return linear + last
+    # A linear one is soon judged, and tells which others are hopeless.
+    linear = [replace(kind, enough=FIRST_ENOUGH) for kind in linear]
     forms = FORMS if n_z >= _FEWEST_POINTS else ()
     spectral = [_spectral(own, settings) for own in forms if own.degree <= settings.largest_degree]
     several, near = list[Kind](), list[Kind]()
@@ -159,7 +164,7 @@ def kinds_of(
     # And equations of a high degree late, as that takes long.
     late = [kind for kind in spectral if kind.name == FORMS[-1].name]
     early = [kind for kind in spectral if kind.name != FORMS[-1].name]
-    return early + several + late + linear + near + last
+    return linear + early + several + late + near + last
 
 
 def _of_samples(
@@ -183,7 +188,7 @@ def _spectral(form: Form, settings: FieldModelSettings) -> Kind:
             return fit_noisy(rollouts, form, settings, noise)
         return fit_spectral(samples_of(rollouts), form, settings)
 
-    enough = SQUARES_ENOUGH if form is FORMS[0] else 1.0
+    enough = FIRST_ENOUGH if form is FORMS[0] else 1.0
     return Kind(form.name, fit, form.unknowns, not form.free, enough=enough)
 
 
@@ -412,7 +417,8 @@ class Selection:
                     tried[kind] = error
                     if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
                         break
-                    if kind.name == TRIED and min(tried.values()) <= ACCURATE:
+                    forms = [own for kind, own in tried.items() if kind.name != LINEAR]
+                    if kind.name == TRIED and min(forms) <= ACCURATE:
                         break
             least = min(tried.values(), default=np.inf)
             # One of fewer unknowns is no better than others where it is not accepted.
