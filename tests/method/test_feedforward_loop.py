@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
@@ -14,6 +15,7 @@ from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop
 from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
+from pdeloop.method.adapt.renewal import renew
 from pdeloop.method.design.lqt import track_horizon
 from pdeloop.method.laws.linear import FeedForward
 from pdeloop.method.models.linear import LinearModel
@@ -73,6 +75,26 @@ def test_the_descent_leads_to_the_tracking_law_of_one_initial_state() -> None:
     assert found.after == pytest.approx(best[0] / T, rel=1e-4)
     policy = closed.policy(found.theta, closed.law.theta_start)
     assert np.array_equal(closed.theta(policy), found.theta)
+
+
+def test_a_descent_begins_again_with_calm_gains_where_actuators_are_slow() -> None:
+    """They follow none of the large ones, and no gradient tells so; the best moves are searched for."""
+    rate, start = 0.2, np.random.default_rng(1).normal(size=(1, N))
+    closed = loop(action_set=ActionSet(N_A, rate=rate))
+    assert closed.regulator is not None
+    first = np.hstack([closed.regulator.K, np.tile(closed.regulator.b[:, None], T)])
+
+    def cost(moves: np.ndarray) -> tuple[float, np.ndarray]:
+        plan = np.hstack([np.zeros((N_A, N)), np.cumsum(moves.reshape(T, N_A), axis=0).T])
+        known, slope = closed.gradient(plan, start, np.ones(1))
+        return known, np.cumsum(slope[:, : N - 1 : -1], axis=1)[:, ::-1].T.ravel()
+
+    bounds = [(-rate, rate)] * (T * N_A)
+    best = minimize(cost, np.zeros(T * N_A), jac=True, bounds=bounds).fun
+    alone = improve(closed, first, start, np.ones(1), curvature_of(closed), ModelBasedSettings())
+    found = renew(closed, first, first, [], start, lambda own, most: own[:0], ModelBasedSettings())
+    assert alone is not None and found is not None
+    assert float(closed.costs(found.theta, start)[0]) < 1.01 * best < 0.95 * alone.after
 
 
 def test_a_replayed_rollout_costs_what_was_measured_whatever_the_model() -> None:

@@ -252,12 +252,14 @@ class ClosedLoop:
             return None
         return np.hstack([lqr.K @ self.U, np.tile(lqr.b[:, None], self.constants)])
 
-    def calmer(self, theta: Array, share: float) -> Array:
-        """The law with this share of the gains of its actions, and the same action at the target."""
-        changed, n_a, n_f = theta.copy(), self.model.n_a, theta.shape[1] - self.constants
-        at_target = theta[:n_a, :n_f] @ np.resize(self.s_r, n_f)
+    def calmer(self, theta: Array, share: float, fields: Array, weights: Array) -> Array:
+        """The law with this share of the gains of its actions, and the mean actions of its own way."""
+        simulation, n_a = self.simulate(theta, fields), self.model.n_a
+        n_f, changed = theta.shape[1] - self.constants, theta.copy()
         changed[:n_a, :n_f] *= share
-        changed[:n_a, n_f:] += (1.0 - share) * at_target[:, None]
+        b = simulation.actions - simulation.features[:, :, :-1] @ changed[:n_a, :n_f].T
+        of_steps = np.einsum("kfi,f->ik", b, weights)
+        changed[:n_a, n_f:] = of_steps if self.constants > 1 else of_steps.mean(axis=1)[:, None]
         return changed
 
     def moment(self, simulation: Simulation, weights: Array) -> Array:

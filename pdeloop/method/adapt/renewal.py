@@ -69,6 +69,8 @@ _CHAOTIC_CLEAR = 10.0
 """Multiple of the standard errors of the verdict at which such a gain is clear."""
 _CHAOTIC_CONFIRMED = 0.8
 """Share of its own gain that a law must reach on other states for few to suffice."""
+_CALMER = 0.1
+"""Share of the gains with which a descent begins again where actuators have rate limits."""
 _MEASURED_SHARE = 0.5
 """Weight of the measured fields, where there are drawn ones."""
 ALIKE = 1e-2
@@ -122,11 +124,13 @@ def renew(
     ) -> Improvement | None:
         """The law after a descent from the cheapest of some laws; most: fields to draw."""
         every, weights = weighted(fields, draw(fields, most))
-        starts = [*starts, *others]
-        if loop.action_set.rated:  # actuators cannot follow the law of the linear problem
-            starts = [loop.calmer(law, 0.5**i) for law in starts for i in range(6)]
-        start = cheapest(loop, starts, every, weights)
-        return improve(loop, start, every, weights, curvature, settings, least_gain)
+        start = cheapest(loop, [*starts, *others], every, weights)
+        found = improve(loop, start, every, weights, curvature, settings, least_gain)
+        if loop.action_set.rated and found:  # actuators follow no large gains
+            start = loop.calmer(found.theta, _CALMER, every, weights)
+            again = improve(loop, start, every, weights, curvature, settings, least_gain)
+            found = again if again and again.after < found.after else found
+        return found
 
     least_gain = settings.least_gain if final else FIRST_GAIN
     if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
