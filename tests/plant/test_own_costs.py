@@ -176,6 +176,9 @@ def test_a_moving_target_is_followed_by_default() -> None:
     assert cost["adapted"].mean() <= 1.03 * cost["best"].mean()
 
 
+FEW: dict[str, Any] = {"evaluation_fields": 20, "reduced_order": 2, **FEW_FITS}
+
+
 class Offset(pdeloop.Dynamics):
     """A plant that a constant disturbance moves away from its target of 0."""
 
@@ -206,7 +209,7 @@ class Offset(pdeloop.Dynamics):
 
 
 def test_a_constant_disturbance_is_met_at_a_target_of_0_by_default() -> None:
-    run = pdeloop.train(plant=Offset(), rollouts=12, evaluation_fields=20, reduced_order=2)
+    run = pdeloop.train(plant=Offset(), rollouts=9, **FEW)
     assert run.values["law"] == "feedforward"
     fields = DynamicsPlant(Offset()).reset(run.evaluation[0]).copy()
     least = Offset().least_cost(fields)
@@ -220,7 +223,7 @@ def test_actions_with_a_target_of_their_own_are_held_at_a_target_of_0_by_default
         action_target, action_weight = 1.5, 5.0
 
     own = Held(0.0)
-    run = pdeloop.train(plant=own, rollouts=12, evaluation_fields=20, reduced_order=2)
+    run = pdeloop.train(plant=own, rollouts=9, **FEW)
     assert run.values["law"] == "feedforward"
     plant = DynamicsPlant(own)
     best = track_horizon(own.A, own.B, plant.cost, np.eye(2))
@@ -390,7 +393,7 @@ def test_models_are_of_the_actions_that_actuators_apply() -> None:
 
 
 def test_a_law_of_bounded_actuators_asks_for_no_more_than_they_take() -> None:
-    run = pdeloop.train(plant=Heated(), rollouts=8, evaluation_fields=3)
+    run = pdeloop.train(plant=Heated(), rollouts=8, evaluation_fields=3, **FEW_FITS)
     plant = pdeloop.problem(plant=Heated()).plant()
     asked: list[np.ndarray] = []
     law = run.law()
