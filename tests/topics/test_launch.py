@@ -62,7 +62,7 @@ def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
     installed: Processes, workspace: Workspace, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    options = {"problem": SMALL, "iterations": 30, "real_time_factor": 10.0, "namespace": "lab"}
+    options = {"problem": SMALL, "iterations": 12, "real_time_factor": 10.0, "namespace": "lab"}
     options |= {"pairs": 2, "record": "true", "out": run}
     started = launch(installed, workspace, "train.launch.py", **options)
     for name in ("pde_sim_node", "tuner_node"):  # one of a pair, and the one that ends the training
@@ -71,7 +71,7 @@ def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
         os.kill(pids(installed, name)[0], signal.SIGKILL)
     said = installed.wait(started, LIMIT)
     assert said.count("exit code -9") == 2
-    assert_same_training(run, in_process(iterations=30))
+    assert_same_training(run, in_process(iterations=12))
     assert "lab.pair1.controller_node" in said
     assert "Traceback" not in said
     assert (run / "bag" / "metadata.yaml").is_file()
@@ -91,12 +91,12 @@ def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
         "-p",
         f"out:={tmp_path / 'run'}",
         "-p",
-        "iterations:=20",
+        "iterations:=6",
         "-p",
         "law:=feedforward",
     )
     installed.wait(tuner, LIMIT)
-    expected = train_here(parameters(law="feedforward", iterations=20))
+    expected = train_here(parameters(law="feedforward", iterations=6))
     assert_same_training(tmp_path / "run", expected)
     os.killpg(started.pid, signal.SIGINT)  # as Ctrl-C does: to launch and to the nodes
     said = installed.wait(started, LIMIT, code=0)
