@@ -55,15 +55,27 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
 
 
 def test_a_recorded_run_is_recomputed_with_its_noise(loop: Processes, tmp_path):
+    """What trainings with few sensors fit otherwise is recomputed in test_extended_kalman."""
     own = tmp_path / "own.yaml"
     small = [x for x in SMALL.read_text().splitlines() if x.strip().split(":")[0] not in OWN]
     own.write_text("\n".join([*small, *(f"    {name}: {value}" for name, value in OWN.items())]))
     out = tmp_path / "run"
-    words = ("train", str(own), "--rollouts", "12", "--record", "--optimizer", "model_based")
+    words = (
+        "train",
+        str(own),
+        "--rollouts",
+        "12",
+        "--record",
+        "--optimizer",
+        "model_based",
+        "--law",
+        "affine",
+    )
     loop.wait(loop.pdeloop(*words, "--out", str(out)), LIMIT)
     report = verify(out)
     assert (report.count, report.incomplete, report.notes) == (0, [], [])
     assert report.compared["steps"] == HORIZON * report.compared["costs"]
     assert report.compared["policies"] >= 11  # all but the exploration
-    values = resolve(str(own), {"rollouts": 12, "optimizer": "model_based"})
+    given = {"rollouts": 12, "optimizer": "model_based", "law": "affine"}
+    values = resolve(str(own), given)
     assert_same_training(out, train_here(values))
