@@ -25,7 +25,7 @@ from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.problem import load_parameters, read_problem
 from pdeloop.method.models import selection as kinds
 from tests.support.interpreter import ROOT, python
-from tests.support.small import FEW_FITS, same_bits
+from tests.support.small import FEW_STEPS, same_bits
 
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
@@ -234,7 +234,7 @@ def test_an_installed_package_offers_plants_by_name(
     ("name", "given", "method"),
     [
         (LINEAR, {"radius": 0.9}, {"identification": "regression", "optimizer": "two_point"}),
-        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, **FEW_FITS}),
+        (PLATE, {"nx": 6, "ny": 4}, {"horizon": 15, **FEW_STEPS}),
     ],
 )
 def test_python_and_the_command_line_train_to_the_same_bits(
