@@ -65,5 +65,7 @@ def test_another_chemistry_is_refused(module: Any) -> None:
 
 
 def test_a_law_charges_it(module: Any, tmp_path: Path) -> None:
-    run = pdeloop.train(plant=module.Cell(), rollouts=12, evaluation_fields=2, out=tmp_path / "run")
-    assert run.costs["lqt"].mean() < 0.1 * run.costs["none"].mean()
+    """By measured rollouts: no linear model of 60 samples knows limits that act on one side."""
+    run = pdeloop.train(plant=module.Cell(), evaluation_fields=2, out=tmp_path / "run")
+    none, first, adapted = (run.costs[name].mean() for name in ("none", "lqt", "adapted"))
+    assert adapted < 0.1 * none and adapted < first < none
