@@ -45,6 +45,8 @@ DRIFT = 50.0
 """Variances by which a trend in time lowers the squares of residuals, from which the plant drifts."""
 PAST = 4
 """Rows of states and inputs beside which that trend counts."""
+FOLLOWED = 0.8
+"""Share of changes that are regular, or follow an input, from which on they count as such."""
 UNLOGGED = 4.0
 """Ratio of squares that are not explained where an input stands still to those elsewhere."""
 OFFSET = 20.0
@@ -188,6 +190,7 @@ def findings(
     held = np.r_[True, (inputs[1:] == inputs[:-1]).all(axis=1)] | first
     found: dict[tuple[str, int, int], tuple[list[int], Flags]] = {}
     slow: dict[int, list[int]] = {}
+    straight: dict[int, list[int]] = {}
     for i, x in enumerate(states.T):
         if np.ptp(x[np.isfinite(x)]) == 0.0 if np.isfinite(x).any() else True:
             continue
@@ -195,6 +198,8 @@ def findings(
         period = _slow(runs)
         if period:
             slow.setdefault(period, []).append(i)
+        elif lines := _interpolated(x, first, inputs, ~held):
+            straight.setdefault(lines, []).append(i)
         kinds = {"spike": _spikes(x, inputs, first), "wrap": _wraps(x, first)}
         if not period:
             kinds |= {"saturated": _saturated(x, runs), "frozen": _frozen(x, runs, held)}
@@ -214,11 +219,9 @@ def findings(
         for (kind, _, _), (own, spoilt) in found.items()
     ]
     nothing = np.zeros(len(values), dtype=bool)
-    if (
-        sum(map(len, slow.values())) < n_z
-    ):  # the others are as fast as the log: what follows an input?
+    if sum(map(len, slow.values())) < n_z:  # the others are as fast as the log
         for x in inputs.T:
-            slow.pop(_slow(_Runs.of(x, first)), None)
+            slow.pop(_regular(_Runs.of(x, first)), None)
     for period, own in slow.items():
         names = listed([channels.state(i) for i in own])
         result.append(
@@ -226,6 +229,17 @@ def findings(
                 f"{names} {'changes' if len(own) == 1 else 'change'} in every "
                 f"{_ordinal(period)} row only, so the log is faster than the sensor (first in row "
                 f"{rows[min(period, len(rows) - 1)]}): give --resample {period * step:.6g}",
+                nothing,
+                period,
+            )
+        )
+    for period, own in straight.items():
+        names, lie = listed([channels.state(i) for i in own]), "lies" if len(own) == 1 else "lie"
+        result.append(
+            Finding(
+                f"{names} {lie} on straight lines of {period} rows, as where readings of a slower "
+                "sensor are interpolated, which no model of single rows describes: give --resample "
+                f"{period * step:.6g}",
                 nothing,
                 period,
             )
@@ -283,6 +297,44 @@ def _slow(runs: _Runs) -> int:
     if np.median(changes) < 3.0 * runs.resolution:  # a slow signal in coarse steps
         return 0
     return int(np.median(lengths))
+
+
+def _regular(runs: _Runs) -> int:
+    """The rows between two changes of an input, if they are always the same; or 0."""
+    period = _slow(runs)
+    rests = runs.begins[runs.whole] % max(period, 1)
+    return period if period and np.bincount(rests).max() > FOLLOWED * len(rests) else 0
+
+
+def _interpolated(x: Array, first: Flags, inputs: Array, moved: Flags) -> int:
+    """Rows of the straight lines of which a channel consists, if no input bends them; or 0.
+
+    moved (R,): the rows in which an input moves.
+    """
+    known = x[np.isfinite(x)]
+    written = [
+        Decimal(repr(value)).normalize().as_tuple() for value in known[: 100 * LEAST].tolist()
+    ]
+    places = max(len(value.digits) for value in written)
+    last = min(int(value.exponent) for value in written)
+    largest = float(np.abs(known).max())
+    rounded = RESTING * 10.0 ** max(last, np.floor(np.log10(max(largest, 1e-300))) - places + 1.0)
+    change = np.diff(x)
+    change[first[1:]] = np.nan
+    size, bend = np.abs(change), np.abs(np.diff(change))
+    moving = np.minimum(size[1:], size[:-1]) > 10.0 * rounded
+    bent = bend > rounded
+    if moving.sum() < LEAST or bent[moving].mean() > 0.6:
+        return 0
+    knots = np.flatnonzero(bent)
+    gaps = np.diff(knots)
+    if len(gaps) < 10 or np.median(bend[knots]) < 10.0 * rounded or (gaps == 1).mean() > 0.1:
+        return 0
+    period = int(np.median(gaps))
+    late = [moved[np.maximum(knots + 1 - lag, 0)].mean() for lag in range(-1, LATEST + 1)]
+    if max(late) > FOLLOWED > 2.0 * moved.mean():  # the plant keeps its direction between inputs
+        return 0
+    return 0 if period in [_regular(_Runs.of(u, first)) for u in inputs.T] else period
 
 
 def _spikes(x: Array, inputs: Array, first: Flags) -> Flags:

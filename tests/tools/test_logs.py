@@ -211,6 +211,31 @@ def test_a_sensor_slower_than_the_log_is_told_with_its_period(tmp_path: Path) ->
     np.testing.assert_allclose(actions, means, rtol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("read", "told"), [("held", "change in every 5th"), ("lines", "lie on str")]
+)
+def test_slow_sensors_among_others_are_told_though_inputs_move_as_seldom(
+    tmp_path: Path, read: str, told: str
+) -> None:
+    """Of interpolated readings a regression has a law that diverges on the plant."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0, 5, (ROWS, 2)), rng.integers(3, 8, ROWS), axis=0)[:ROWS]
+    z = np.zeros((ROWS, 3))
+    for k in range(ROWS - 1):
+        z[k + 1] = A @ z[k] + B @ u[k] + (Z[k + 1] - A @ Z[k] - B @ U[k])
+    whole, knots = z.copy(), np.arange(0, ROWS, 5)
+    for i in (1, 2):
+        z[:, i] = np.repeat(z[knots, i], 5) if read == "held" else np.interp(T, knots, z[knots, i])
+    (text,) = read_measurements(write(tmp_path / "own.csv", z, u)).remarks
+    assert text.startswith(f"z2 and z3 {told}") and text.endswith("give --resample 5")
+    assert read_measurements(write(tmp_path / "own.csv", z, u), resample=5.0).remarks == ()
+    assert read_measurements(write(tmp_path / "own.csv", whole, u)).remarks == ()
+    smooth = np.cumsum(np.cumsum(u[:, :1] - u[:, :1].mean(), axis=0), axis=0) @ np.ones((1, 3))
+    smooth[:, 1:] = np.cumsum(u - u.mean(axis=0), axis=0)  # straight until an input moves
+    remarks = read_measurements(write(tmp_path / "own.csv", smooth, u)).remarks
+    assert not any("straight" in text or "faster" in text for text in remarks)
+
+
 def test_jitter_is_told_and_resampled(tmp_path: Path) -> None:
     """Of a slow motion, linear interpolation loses what the jitter times the curvature is."""
     rng = np.random.default_rng(1)
