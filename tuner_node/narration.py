@@ -112,7 +112,9 @@ class Narration:
             told = f"  {who}: reduced model of order {orders}, spectral radius {radius}"
             if lost := sum(not row.get("stabilised", True) for row in rows):
                 count = "" if self._seeds == 1 else f" for {lost} of them"
-                told += f"; it has no stabilising gains{count}, so the first law is no control"
+                told += (
+                    f"; it has no stabilising gains{count}, so the training begins from no control"
+                )
             return [told]
         if event == "evaluated":
             costs = f"cost {cost('none')} without control, {cost('lqt')} with LQT, "

@@ -12,6 +12,7 @@ from pdeloop.messages.topics import MAX_GAIN
 from pdeloop.method.adapt import Rollout, Trajectory
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.registry import along
+from pdeloop.method.reduce.channels import listed
 from pdeloop.method.reduce.identifiability import examine_excitation
 from pdeloop.method.reduce.input_delay import study_delays
 from tuner_node.batch import BatchResult, ContradictionError
@@ -51,7 +52,8 @@ def check_excitation(
     found.require()
     remarks = [*found.remarks]
     delays = study_delays([(explored.states, actions)])
-    late = f"the actions act {' and '.join(map(str, dict.fromkeys(delays.best)))} steps late"
+    steps = [str(n) for n in (delays.best if len({*delays.best}) > 1 else delays.best[:1])]
+    late = f"the actions act {listed(steps)} steps late"
     acts_late = max(delays.best) > 0 and not sensors
     if acts_late and not law.filtered:
         remarks.append(

@@ -15,8 +15,11 @@ import numpy as np
 import pytest
 
 import pdeloop
+from pdeloop.method.adapt import Trajectory
+from pdeloop.method.laws import Observer
 from pdeloop.problem_check import Finding, check
 from tests.method.test_input_delay import A, B
+from tuner_node.result_checks import check_excitation
 
 DELAY, HORIZON, R = 3, 60, 0.01
 TARGET = np.array([2.0, 1.5, 1.5, 2.0])
@@ -134,6 +137,14 @@ def test_the_affine_law_is_told_of_the_dead_time() -> None:
         )
     assert "the actions act 3 steps late" in told.getvalue()
     assert "train with --law observer" in told.getvalue()
+
+
+def test_each_action_is_told_by_its_own_dead_time() -> None:
+    actions = np.random.default_rng(1).normal(size=(HORIZON, 2))
+    found = pdeloop.rollout(PartlyLate(), lambda k, z: actions[None, k], [0])
+    explored = Trajectory(found.states[:, 0], found.actions[:, 0])
+    (row,) = check_excitation(explored, 0, law=Observer)
+    assert row["remark"].startswith("the actions act 0 and 3 steps late")
 
 
 def test_the_check_of_a_problem_tells_what_a_training_would() -> None:
