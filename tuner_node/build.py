@@ -285,6 +285,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
         n_z=values["n_z"],
     )
     action_set = ActionSet.of(values)
+    own = values["exploration_variance"] or action_set.exploration_variance
+    if np.isfinite(action_set.high - action_set.low).any():  # more is clipped, and tells no more
+        variance = min(variance, WIDER * action_set.exploration_variance)
     # The published readings are scaled (docs/robustness.md).
     scale = math.sqrt(values["n_z"] / measured_size(values))
     grid = Grid.parse(values["grid"]) if values["grid"] else None
@@ -297,9 +300,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "law": law,
         "cost": measured_cost(values),
         "action_set": action_set,
-        "exploration_variance": max(
-            values["exploration_variance"] or action_set.exploration_variance, variance
-        ),
+        "exploration_variance": max(own, variance),
         "sensors": sensors,
         "actuator_positions": centres,
         "actuator_widths": widths,
@@ -339,6 +340,8 @@ def build_dispatcher(
     )
 
 
+WIDER = 4.0
+"""Variance of explorations with noise between two bounds, relative to that without, at most."""
 ACCURACY = 0.045
 """Standard error of an entry of B, relative to the norm of its column, that exploration aims at."""
 

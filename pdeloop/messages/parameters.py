@@ -150,9 +150,9 @@ PROBLEM = _section(
         "order n_s for the identification dmdc; 0: reduced_order"
     ),
     Spec("exploration_variance", 0.0, 0.0, 1e300, nodes="T").means(
-        "variance of exploratory actions, raised as measurement_noise requires; with action_bounds "
-        "that of the widest range, and others in proportion; 0: 0.1, or the square of a quarter of "
-        "half the range, less near a bound"
+        "variance of exploratory actions, raised as measurement_noise requires, between two bounds to "
+        "four times at most; with action_bounds that of the widest range, and others in proportion; 0: "
+        "0.1, or the square of a quarter of half the range, less near a bound"
     ),
     Spec("exploration_mean", [], -1e300, 1e300, nodes="CT").means(
         "operating point around which actions are explored, one number for each actuator; empty: with "

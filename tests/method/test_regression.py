@@ -10,7 +10,8 @@ from threadpoolctl import threadpool_limits
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.regression import exact_regression
 from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
-from tuner_node.build import least_variance
+from tests.support.small import parameters
+from tuner_node.build import build_training, least_variance
 
 N_S, N_A, STEPS = 4, 2, 60
 
@@ -164,3 +165,18 @@ def test_the_variance_for_noise_gives_the_error_of_the_inputs_that_it_promises()
         errors.append(model.B[:, 0] - model.U.T @ B[:, 0])
     found = np.sqrt(np.mean(np.square(errors))) / np.linalg.norm(B)
     assert found == pytest.approx(accuracy, rel=0.15)
+
+
+def test_noise_asks_for_no_exploration_that_bounds_would_clip() -> None:
+    """In short steps it asked for so much that every action was at a bound."""
+    short, bounds = (
+        {"sample_time": 0.005, "exploration_variance": 0.0},
+        {"action_bounds": [-1.0] * 4 + [1.0] * 4 + [0.0]},
+    )
+
+    def variance(**own: float | list[float]) -> float:
+        return build_training(parameters(**short, **own)).settings.exploration_variance
+
+    quiet = variance(**bounds)
+    assert variance(**bounds, measurement_noise=0.3) == 4.0 * quiet
+    assert variance(measurement_noise=0.3) > 100.0 * quiet
