@@ -75,6 +75,20 @@ class Finding:
     step: int = 0
 
 
+def _last_digits(values: Array, column: Array) -> Array:
+    """That of each value in a column of as many decimals and digits as its longest numbers have."""
+    written = [
+        Decimal(repr(value)).normalize().as_tuple()
+        for value in column[np.isfinite(column)].tolist()
+    ]
+    places = max(len(value.digits) for value in written)
+    last = min(int(value.exponent) for value in written)
+    with np.errstate(divide="ignore"):  # of 0
+        first = np.floor(np.log10(np.abs(values)))
+    found: Array = 10.0 ** np.maximum(last, first - places + 1)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _Runs:
     """Equal values in a row, of one channel: first row, length, the changes before and after.
@@ -102,12 +116,7 @@ class _Runs:
         grain = np.full(len(begins), resolution)
         if (lengths >= 3).any():
             own = x[begins]
-            written = [Decimal(repr(value)).normalize() for value in own[np.isfinite(own)].tolist()]
-            places = max(len(value.as_tuple().digits) for value in written)
-            last = min(int(value.as_tuple().exponent) for value in written)
-            with np.errstate(divide="ignore"):  # of 0
-                first_digits = np.floor(np.log10(np.abs(own)))
-            grain = np.maximum(resolution, 10.0 ** np.maximum(last, first_digits - places + 1))
+            grain = np.maximum(resolution, _last_digits(own, own))
         return _Runs(begins, lengths, change, np.r_[change[1:], 0.0], resolution, grain)
 
     @property
@@ -191,6 +200,8 @@ def findings(
     found: dict[tuple[str, int, int], tuple[list[int], Flags]] = {}
     slow: dict[int, list[int]] = {}
     straight: dict[int, list[int]] = {}
+    moves = [_Runs.of(u, first) for u in inputs.T]
+    regular = [_regular(runs) for runs in moves]
     for i, x in enumerate(states.T):
         if np.ptp(x[np.isfinite(x)]) == 0.0 if np.isfinite(x).any() else True:
             continue
@@ -198,7 +209,7 @@ def findings(
         period = _slow(runs)
         if period:
             slow.setdefault(period, []).append(i)
-        elif lines := _interpolated(x, first, inputs, ~held):
+        elif lines := _interpolated(x, first, ~held, regular):
             straight.setdefault(lines, []).append(i)
         kinds = {"spike": _spikes(x, inputs, first), "wrap": _wraps(x, first)}
         if not period:
@@ -220,8 +231,8 @@ def findings(
     ]
     nothing = np.zeros(len(values), dtype=bool)
     if sum(map(len, slow.values())) < n_z:  # the others are as fast as the log
-        for x in inputs.T:
-            slow.pop(_regular(_Runs.of(x, first)), None)
+        for period in regular:
+            slow.pop(period, None)
     for period, own in slow.items():
         names = listed([channels.state(i) for i in own])
         result.append(
@@ -247,7 +258,7 @@ def findings(
     result += [Finding(text, nothing) for text in _offsets(values, channels)]
     result += [Finding(text, nothing) for text in _twins(values, rows, channels)]
     result += [Finding(text, nothing) for text in _drifts(states, inputs, first, channels)]
-    return result + _stuck(states, inputs, first, rows, channels)
+    return result + _stuck(states, inputs, moves, first, rows, channels)
 
 
 def _sentence(
@@ -302,23 +313,17 @@ def _slow(runs: _Runs) -> int:
 def _regular(runs: _Runs) -> int:
     """The rows between two changes of an input, if they are always the same; or 0."""
     period = _slow(runs)
-    rests = runs.begins[runs.whole] % max(period, 1)
-    return period if period and np.bincount(rests).max() > FOLLOWED * len(rests) else 0
+    return period if period and (runs.lengths[runs.whole] % period == 0).mean() > FOLLOWED else 0
 
 
-def _interpolated(x: Array, first: Flags, inputs: Array, moved: Flags) -> int:
+def _interpolated(x: Array, first: Flags, moved: Flags, regular: Sequence[int]) -> int:
     """Rows of the straight lines of which a channel consists, if no input bends them; or 0.
 
-    moved (R,): the rows in which an input moves.
+    moved (R,): the rows in which an input moves; regular: those between two moves of each.
     """
     known = x[np.isfinite(x)]
-    written = [
-        Decimal(repr(value)).normalize().as_tuple() for value in known[: 100 * LEAST].tolist()
-    ]
-    places = max(len(value.digits) for value in written)
-    last = min(int(value.exponent) for value in written)
-    largest = float(np.abs(known).max())
-    rounded = RESTING * 10.0 ** max(last, np.floor(np.log10(max(largest, 1e-300))) - places + 1.0)
+    largest = np.abs(known).max(keepdims=True)
+    rounded = RESTING * float(_last_digits(largest, known[: 100 * LEAST])[0])
     change = np.diff(x)
     change[first[1:]] = np.nan
     size, bend = np.abs(change), np.abs(np.diff(change))
@@ -334,7 +339,7 @@ def _interpolated(x: Array, first: Flags, inputs: Array, moved: Flags) -> int:
     late = [moved[np.maximum(knots + 1 - lag, 0)].mean() for lag in range(-1, LATEST + 1)]
     if max(late) > FOLLOWED > 2.0 * moved.mean():  # the plant keeps its direction between inputs
         return 0
-    return 0 if period in [_regular(_Runs.of(u, first)) for u in inputs.T] else period
+    return 0 if period in regular else period
 
 
 def _spikes(x: Array, inputs: Array, first: Flags) -> Flags:
@@ -427,11 +432,17 @@ def _drifts(states: Array, inputs: Array, first: Flags, channels: Channels) -> l
 
 
 def _stuck(
-    states: Array, inputs: Array, first: Flags, rows: NDArray[np.int64], channels: Channels
+    states: Array,
+    inputs: Array,
+    moves: Sequence[_Runs],
+    first: Flags,
+    rows: NDArray[np.int64],
+    channels: Channels,
 ) -> list[Finding]:
     """Inputs that stand still in the log for long, while the states move as by one that does not.
 
-    Steps are explained by linear regressions on two rows, of those rows and of the others apart.
+    moves: the runs of each input. Steps are explained by linear regressions on two rows, of those rows
+    and of the others apart.
     """
     pair = np.flatnonzero(~(first[2:] | first[1:-1]))
     known = np.hstack(
@@ -442,8 +453,7 @@ def _stuck(
     if len(pair) < 2 * least or not (np.isfinite(known).all() and np.isfinite(step).all()):
         return []
     found = []
-    for j, u in enumerate(inputs.T):
-        runs = _Runs.of(u, first)
+    for j, runs in enumerate(moves):
         longest = int(np.argmax(runs.lengths))
         begin, length = int(runs.begins[longest]), int(runs.lengths[longest])
         own = (pair >= begin) & (pair + 1 < begin + length)
@@ -462,7 +472,7 @@ def _stuck(
             names = listed([channels.state(i) for i in moved.tolist()])
             found.append(
                 Finding(
-                    f"{channels.input(j)} stands at {u[begin]:.6g} in {length} rows, from row "
+                    f"{channels.input(j)} stands at {inputs[begin, j]:.6g} in {length} rows, from row "
                     f"{rows[begin]} on, while {names} {'moves' if moved.size == 1 else 'move'} as by "
                     "an input that is not in the log: leave them out with --cut",
                     spoilt,

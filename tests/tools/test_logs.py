@@ -236,6 +236,19 @@ def test_slow_sensors_among_others_are_told_though_inputs_move_as_seldom(
     assert not any("straight" in text or "faster" in text for text in remarks)
 
 
+def test_a_state_that_follows_a_held_input_is_no_slow_sensor_in_any_trajectory(
+    tmp_path: Path,
+) -> None:
+    """The second one begins in the middle of what would be a hold of the first."""
+    z, u = Z.copy(), np.repeat(U[::4], 4, axis=0)
+    u[103:] = np.repeat(U[::4], 4, axis=0)[: ROWS - 103]
+    z[:, 2] = np.r_[0.0, u[:-1, 1]]  # beside others that are as fast as the log
+    t = np.r_[T[:103], T[: ROWS - 103]]
+    assert not any(
+        "faster" in text for text in read_measurements(write(tmp_path / "own.csv", z, u, t)).remarks
+    )
+
+
 def test_jitter_is_told_and_resampled(tmp_path: Path) -> None:
     """Of a slow motion, linear interpolation loses what the jitter times the curvature is."""
     rng = np.random.default_rng(1)
