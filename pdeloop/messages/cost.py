@@ -119,16 +119,16 @@ class Cost:
 
     def deviations(self) -> Cost:
         """The same about the mean of a moving target, and the target of the actions."""
-        found = self._with(self.n_z, self.target - self._mean, self.output)
-        found.action_target[:] = 0.0
-        return found
+        return self._with(self.n_z, self.target - self._mean, self.output, 0.0)
 
     def through(self, matrix: Array, target: Array | None = None) -> Cost:
         """The same of x (n,) with z = matrix x; target: in place of its own."""
         output = matrix if self.output is None else self.output @ matrix
         return self._with(matrix.shape[1], self.target if target is None else target, output)
 
-    def _with(self, n_z: int, target: Array, output: Array | None) -> Cost:
+    def _with(
+        self, n_z: int, target: Array, output: Array | None, action_target: float | None = None
+    ) -> Cost:
         return Cost(
             n_z,
             self.n_a,
@@ -137,7 +137,7 @@ class Cost:
             action_weight=self.action_weight,
             target=target,
             output=output,
-            action_target=self.action_target,
+            action_target=self.action_target if action_target is None else action_target,
             terminal_weight=self.terminal_weight,
         )
 
