@@ -77,7 +77,7 @@ def test_the_descent_leads_to_the_tracking_law_of_one_initial_state() -> None:
     assert np.array_equal(closed.theta(policy), found.theta)
 
 
-def test_a_descent_begins_again_with_calm_gains_where_actuators_are_slow() -> None:
+def test_a_descent_begins_again_with_small_gains_where_actuators_are_slow() -> None:
     """They follow none of the large ones, and no gradient tells so; the best moves are searched for."""
     rate, start = 0.2, np.random.default_rng(1).normal(size=(1, N))
     closed = loop(action_set=ActionSet(N_A, rate=rate))

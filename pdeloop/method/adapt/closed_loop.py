@@ -252,7 +252,7 @@ class ClosedLoop:
             return None
         return np.hstack([lqr.K @ self.U, np.tile(lqr.b[:, None], self.constants)])
 
-    def calmer(self, theta: Array, share: float, fields: Array, weights: Array) -> Array:
+    def detuned(self, theta: Array, share: float, fields: Array, weights: Array) -> Array:
         """The law with this share of the gains of its actions, and the mean actions of its own way."""
         simulation, n_a = self.simulate(theta, fields), self.model.n_a
         n_f, changed = theta.shape[1] - self.constants, theta.copy()

@@ -69,7 +69,7 @@ _CHAOTIC_CLEAR = 10.0
 """Multiple of the standard errors of the verdict at which such a gain is clear."""
 _CHAOTIC_CONFIRMED = 0.8
 """Share of its own gain that a law must reach on other states for few to suffice."""
-_CALMER = 0.1
+_DETUNED = 0.1
 """Share of the gains with which a descent begins again where actuators have rate limits."""
 _MEASURED_SHARE = 0.5
 """Weight of the measured fields, where there are drawn ones."""
@@ -127,7 +127,7 @@ def renew(
         start = cheapest(loop, [*starts, *others], every, weights)
         found = improve(loop, start, every, weights, curvature, settings, least_gain)
         if loop.action_set.rated and found:  # actuators follow no large gains
-            start = loop.calmer(found.theta, _CALMER, every, weights)
+            start = loop.detuned(found.theta, _DETUNED, every, weights)
             again = improve(loop, start, every, weights, curvature, settings, least_gain)
             found = again if again and again.after < found.after else found
         return found
