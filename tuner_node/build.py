@@ -285,8 +285,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         n_z=values["n_z"],
     )
     action_set = ActionSet.of(values)
-    own = values["exploration_variance"] or action_set.exploration_variance
-    if np.isfinite(action_set.high - action_set.low).any():  # more is clipped, and tells no more
+    if np.isfinite(action_set.high - action_set.low).all():  # more is clipped, and tells no more
         variance = min(variance, WIDER * action_set.exploration_variance)
     # The published readings are scaled (docs/robustness.md).
     scale = math.sqrt(values["n_z"] / measured_size(values))
@@ -300,7 +299,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "law": law,
         "cost": measured_cost(values),
         "action_set": action_set,
-        "exploration_variance": max(own, variance),
+        "exploration_variance": max(
+            values["exploration_variance"] or action_set.exploration_variance, variance
+        ),
         "sensors": sensors,
         "actuator_positions": centres,
         "actuator_widths": widths,
