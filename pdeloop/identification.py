@@ -29,7 +29,7 @@ from pdeloop.messages.parameters import as_recorded, model_order, recorded_value
 from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED, CostColumn, episode_name
 from pdeloop.method.reduce import regression
-from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, followed_the_state
+from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, followed_the_state, listed
 from pdeloop.method.reduce.identifiability import (
     Identifiability,
     NotIdentifiableError,
@@ -59,6 +59,8 @@ FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""
 ASIDE = 0.05
 """Distance from a target of 0 at which a law comes to rest, relative to the variation, that is told."""
+OFFSET = 20.0
+"""Standard deviations between 0 and the mean of a state that has a large offset."""
 UNLIKE = 1e3
 """Ratio of the variations of two states of which one has no say in the cost."""
 DEAD = 1e-12
@@ -123,7 +125,15 @@ class Identified:
                 "left: the actuators hardly reach it, or the model is wrong; take a target that they "
                 "reach, a lower action_weight, or a log that comes nearer to the target"
             )
-        spread = self.trajectory[0].std(axis=0)
+        mean, spread = self.trajectory[0].mean(axis=0), self.trajectory[0].std(axis=0)
+        set_off = (np.abs(mean) > OFFSET * spread) & (spread > 0.0)
+        if not np.any(d) and self.channels.states and set_off.mean() >= 0.5:
+            names = listed([self.channels.state(i) for i in np.flatnonzero(set_off).tolist()])
+            found.append(
+                f"{names}: the variation is below {1 / OFFSET:.0%} of the mean, which a model without "
+                "a constant term takes for a mode that stays; leave out --identification dmdc, or give "
+                "deviations from a rest"
+            )
         most, least = int(spread.argmax()), int(np.where(spread > 0.0, spread, np.inf).argmin())
         if (
             loop is not None

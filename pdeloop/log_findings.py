@@ -49,8 +49,6 @@ FOLLOWED = 0.8
 """Share of changes that are regular, or follow an input, from which on they count as such."""
 UNLOGGED = 4.0
 """Ratio of squares that are not explained where an input stands still to those elsewhere."""
-OFFSET = 20.0
-"""Standard deviations between 0 and the mean of a channel with a large offset."""
 ONE = 1e-7
 """Standard deviation of the difference of two channels that are one, relative to their own."""
 LEAST = 20
@@ -255,7 +253,6 @@ def findings(
                 period,
             )
         )
-    result += [Finding(text, nothing) for text in _offsets(values, channels)]
     result += [Finding(text, nothing) for text in _twins(values, rows, channels)]
     result += [Finding(text, nothing) for text in _drifts(states, inputs, first, channels)]
     return result + _stuck(states, inputs, moves, first, rows, channels)
@@ -505,22 +502,6 @@ def _saturated(x: Array, runs: _Runs) -> Flags:
         if enough and runs.abrupt[own].mean() >= 0.5 and rows / count >= 3.0 * usual:
             found |= x == end
     return found
-
-
-def _offsets(values: Array, channels: Channels) -> list[str]:
-    """States that vary little about a large value, if most do: of a field some points may."""
-    known = [x[np.isfinite(x)] for x in values.T[: len(channels.states)]]
-    mean = np.array([x.mean() if x.size else 0.0 for x in known])
-    spread = np.array([x.std() if x.size else 0.0 for x in known])
-    own = np.flatnonzero((np.abs(mean) > OFFSET * spread) & (spread > 0.0)).tolist()
-    if len(own) < 0.5 * len(known):
-        return []
-    worst = max(own, key=lambda i: abs(mean[i]) / spread[i])
-    return [
-        f"{listed([channels.state(i) for i in own])} {'varies' if len(own) == 1 else 'vary'} little "
-        f"about a large offset ({channels.state(worst)} by {spread[worst]:.3g} about "
-        f"{mean[worst]:.5g}), which a model without a constant term takes for a mode that stays"
-    ]
 
 
 def _twins(values: Array, rows: NDArray[np.int64], channels: Channels) -> list[str]:

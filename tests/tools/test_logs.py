@@ -17,6 +17,7 @@ from scipy import io
 import pdeloop
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import Measurements, read_measurements
+from pdeloop.identification import identify_data
 from pdeloop.log import in_seconds
 
 A = np.array([[0.95, 0.05, 0.0], [0.02, 0.9, 0.05], [0.0, 0.1, 0.8]])
@@ -404,10 +405,13 @@ def test_two_channels_that_are_one_are_told_with_factor_and_offset(tmp_path: Pat
     assert text.startswith("a1 is z4 in every row") and text.endswith("leave one out of --inputs")
 
 
-def test_an_offset_large_against_the_variation_is_told(tmp_path: Path) -> None:
-    z = Z / 50.0 + [300.0, 20.0, 0.0]
-    (text,) = read_measurements(write(tmp_path / "own.csv", z)).remarks
-    assert text.startswith("z1 and z2 vary little about a large offset (z1 by ")
+def test_a_large_offset_is_told_only_where_the_model_has_no_constant_term(tmp_path: Path) -> None:
+    path = write(tmp_path / "own.csv", Z / 50.0 + [300.0, 20.0, 0.0])
+    found = identify_data(read_measurements(path), {})
+    assert found.model.d is not None and not any("below 5% of" in text for text in found.warnings)
+    given = {"identification": "dmdc", "dmdc_rank": 5, "reduced_order": 3}
+    told = identify_data(read_measurements(path), given).warnings
+    assert any(text.startswith("z1 and z2: the variation is below 5% of") for text in told)
 
 
 def step_test() -> tuple[np.ndarray, np.ndarray]:
