@@ -65,6 +65,11 @@ def without_effect(plant: Plant, states: Array, actions: Array) -> str:
     if not idle:
         return ""
     every = len(idle) == plant.n_a
+    if every and np.array_equal(plant.evaluate(states, 0.0 * actions)[0], states):
+        return (
+            "step returns the state it is given, or what is not finite or beyond divergence_bound, "
+            "which ends a rollout, whatever the actions"
+        )
     if set(idle) - set(idle_actuators(plant, states, MORE * actions)):
         which = "no explored action moves" if every else f"explored actions of {idle} do not move"
         return (

@@ -175,8 +175,8 @@ class Grid:
         object.__setattr__(self, "components", named)
         if other := [axis for axis in axes if not isinstance(axis, Axis)]:
             raise ValueError(
-                f"the axes of a grid must be of the class Axis, got {shown(other[0])}; an axis has a name, "
-                "a length and points, as in Axis('x', 1.0, 12)"
+                f"the axes of a grid must be of the class Axis, got {shown(other[0])}; an axis has a "
+                "name, a length and points, as in Axis('x', 1.0, 12)"
             )
         object.__setattr__(self, "numbers", operator.index(self.numbers))  # NumPy's is not JSON
         if not self.components:

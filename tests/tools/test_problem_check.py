@@ -132,6 +132,13 @@ class Numb(Deaf):
         return 0.9 * z
 
 
+class Undefined(Around):
+    """The same, with a step that divides 0 by 0."""
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return np.full(4, np.nan)
+
+
 class Dear(Around):
     """The same, with inputs that cost more than they save."""
 
@@ -153,6 +160,8 @@ def test_inputs_without_effect_are_named() -> None:
     )
     good, text = findings_of(Numb())["actuators"]
     assert not good and text.startswith("no action moves the state")
+    good, text = findings_of(Undefined())["actuators"]
+    assert not good and "what is not finite" in text
 
 
 class Sticky(Around):
