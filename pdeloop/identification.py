@@ -42,6 +42,7 @@ from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
     Residuals,
+    disproportionate,
     fit_percent,
     largest_pole,
     residuals,
@@ -359,6 +360,8 @@ def identify_data(
             "operating points in one log; identify from a part where the plant is one"
         )
         found = replace(found, remarks=(*found.remarks, text))
+    elif bend := disproportionate(seen):
+        found = replace(found, remarks=(*found.remarks, bend.text(found.channels)))
     constant = regression.has_offset(seen)
 
     def by(own: Mapping[str, Any], *, simulations: bool = False) -> Identified:

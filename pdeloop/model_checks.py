@@ -58,6 +58,11 @@ CHANGED = 2.0
 which on the plant changed there."""
 PLACES = 20
 """Rows at which this is looked for, beside the beginnings of trajectories."""
+BENT = 1.3
+"""Residuals of a model linear in an input relative to those of one piecewise linear in it, as squares,
+from which on the states do not follow it in proportion."""
+KNOTS = 0.1, 0.25, 0.5, 0.75, 0.9
+"""Where the pieces end: quantiles of the input."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +219,76 @@ def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, floa
             if ratio > best[2]:
                 best = int(rows[place, 0]), int(rows[place, 1]), ratio
     return None if best[2] == CHANGED else best
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A state that does not follow an input in proportion.
+
+    ratio: of squares that a linear and a piecewise linear model miss; most, least: the effect of a unit
+    of the input in a step where it is largest and smallest in magnitude, with the ends of that piece.
+    """
+
+    state: int
+    input: int
+    ratio: float
+    most: tuple[float, float, float]
+    least: tuple[float, float, float]
+
+    def text(self, channels: Channels) -> str:
+        """One sentence."""
+        z, a = channels.state(self.state), channels.input(self.input)
+        (most, low, high), (least, other_low, other_high) = self.most, self.least
+        return (
+            f"{z} does not follow {a} in proportion (a linear model misses {self.ratio:.3g} times the "
+            f"squares of a piecewise linear one): in a step it moves by {most:.2g} per unit between "
+            f"{low:.4g} and {high:.4g}, and by {least:.2g} between {other_low:.4g} and "
+            f"{other_high:.4g}, as where an actuator saturates or has a dead band: log what it applies "
+            "or identify from rows in which it follows"
+        )
+
+
+def disproportionate(trajectories: Sequence[Trajectory]) -> Bend | None:
+    """The state and the input that a piecewise linear effect of the input explains best, if any.
+
+    Residuals of steps by regressions on two rows, with and without max(a - knot, 0); inputs of few
+    values do not tell.
+    """
+    known, n_z = [(z, a) for z, a in trajectories if len(a) > 1], trajectories[0][0].shape[1]
+    parts = [np.hstack([z[1:-1], z[:-2], a[1:], a[:-1]]) for z, a in known]
+    if not parts:
+        return None
+    X, after = np.concatenate(parts), np.concatenate([z[2:] for z, _ in known])
+    inputs = np.concatenate([a[1:] for _, a in known])
+    width = X.shape[1] + 1 + len(KNOTS)
+    if len(X) < LEAST * width:
+        return None
+    mean, unit = X.mean(axis=0), X.std(axis=0)
+    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
+    linear = np.hstack([np.ones((len(X), 1)), (X - mean) / unit])
+    rounding = len(X) * (ROUNDED * after.std(axis=0)) ** 2
+
+    def fitted(bends: Array) -> tuple[Array, Array]:
+        own = linalg.lstsq(np.hstack([linear, bends]), after, cond=1e-10)[0]
+        missed = after - linear @ own[: linear.shape[1]] - bends @ own[linear.shape[1] :]
+        return own, np.maximum(np.sum(missed**2, axis=0), rounding)
+
+    one, found = fitted(np.zeros((len(X), 0)))[1], None
+    for j, a in enumerate(inputs.T):
+        if len(np.unique(a)) < 2 * len(KNOTS):
+            continue
+        knots = np.unique(np.quantile(a, KNOTS))
+        own, two = fitted(np.maximum(a[:, None] - knots, 0.0) / unit[2 * n_z + j])
+        ratio = one / np.maximum(two, 1e-300) * (len(X) - width) / (len(X) - linear.shape[1])
+        i = int(ratio.argmax())
+        if ratio[i] > (found.ratio if found else BENT):
+            ends = np.r_[a.min(), knots, a.max()]
+            sizes = np.r_[own[1 + 2 * n_z + j, i], own[linear.shape[1] :, i]].cumsum()
+            sizes /= unit[2 * n_z + j]
+            pieces = list(zip(sizes.tolist(), ends.tolist(), ends[1:].tolist(), strict=False))
+            least, *_, most = sorted(pieces, key=lambda piece: abs(piece[0]))
+            found = Bend(i, j, float(ratio[i]), most, least)
+    return found
 
 
 def stability(low: float, high: float) -> str:

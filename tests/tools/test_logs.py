@@ -414,6 +414,20 @@ def test_a_large_offset_is_told_only_where_the_model_has_no_constant_term(tmp_pa
     assert any(text.startswith("z1 and z2: the variation is below 5% of") for text in told)
 
 
+def test_an_actuator_that_saturates_beyond_the_log_is_told(tmp_path: Path) -> None:
+    told = "does not follow"
+    plain = identify_data(read_measurements(write(tmp_path / "own.csv")), {})
+    assert not any(told in text for text in plain.warnings)
+    band = 2.5 + np.sign(U - 2.5) * np.maximum(np.abs(U - 2.5) - [0.0, 1.0], 0.0)
+    for applied in (np.minimum(U, [5.0, 2.5]), band):
+        z, noise = Z.copy(), np.random.default_rng(3).standard_normal(Z.shape)
+        for k in range(ROWS - 1):
+            z[k + 1] = A @ z[k] + B @ applied[k] + 0.01 * noise[k]
+        found = identify_data(read_measurements(write(tmp_path / "own.csv", z)), {})
+        (text,) = [one for one in found.warnings if told in one]
+        assert text.startswith("z3 does not follow a2 in proportion")
+
+
 def step_test() -> tuple[np.ndarray, np.ndarray]:
     """From rest, without noise, and at rest again in the end."""
     u = np.zeros((ROWS, 2))
