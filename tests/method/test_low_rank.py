@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from pdeloop.method.models import Measured
 from pdeloop.method.models.base import model_of
@@ -37,12 +36,3 @@ def test_a_planted_model_of_a_large_field_on_two_axes_is_recovered() -> None:
     np.testing.assert_allclose(fitted.model.step(z, a), PLANTED.step(z, a), atol=1e-6)
     again = model_of(fitted.model.arrays())
     assert np.array_equal(again.step(z, a), fitted.model.step(z, a))
-
-
-def test_the_pull_back_is_the_transpose() -> None:
-    z, a = RNG.standard_normal((3, N_Z)), RNG.standard_normal((3, N_A))
-    y = RNG.standard_normal((3, N_Z))
-    on_z, on_a = PLANTED.pull_back(z, a, y)
-    origin = PLANTED.step(np.zeros((3, N_Z)), np.zeros((3, N_A)))
-    forward = np.sum((PLANTED.step(z, a) - origin) * y)
-    assert np.sum(on_z * z) + np.sum(on_a * a) == pytest.approx(forward, rel=1e-11)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pdeloop.method.models import Measured
-from pdeloop.method.models.base import model_of
 from pdeloop.method.models.polynomial import PolynomialModel, fit_polynomial
 from tests.support.fitted import fit_field_model
 
@@ -74,41 +73,6 @@ def test_units_change_nothing() -> None:
     rng = np.random.default_rng(0)
     z, a = rng.normal(size=(4, N_Z)), rng.normal(size=(4, N_A))
     np.testing.assert_allclose(scaled.step(z * units, a), plain.step(z, a) * units, rtol=1e-6)
-
-
-def test_the_derivative_agrees_with_differences() -> None:
-    model = fitted()
-    rng = np.random.default_rng(1)
-    z, a, y = (rng.normal(size=(3, n)) for n in (N_Z, N_A, N_Z))
-    dz, da = 1e-6 * rng.normal(size=z.shape), 1e-6 * rng.normal(size=a.shape)
-    on_z, on_a = model.pull_back(z, a, y)
-    moved = 0.5 * (model.step(z + dz, a + da) - model.step(z - dz, a - da))
-    np.testing.assert_allclose(
-        (on_z * dz).sum(1) + (on_a * da).sum(1), (y * moved).sum(1), rtol=1e-6
-    )
-
-
-def test_rows_do_not_depend_on_each_other_and_a_file_gives_the_same_bits() -> None:
-    model = fitted()
-    again = model_of(model.arrays())
-    rng = np.random.default_rng(2)
-    z, a = rng.normal(size=(7, N_Z)), rng.normal(size=(7, N_A))
-    whole = model.step(z, a)
-    for i in range(7):
-        assert again.step(z[i : i + 1], a[i : i + 1]).tobytes() == whole[i : i + 1].tobytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("products", np.array([[0, 99]])),
-        ("action_scale", np.zeros(N_A)),
-        ("coefficients", np.zeros((2, N_Z))),
-    ],
-)
-def test_arrays_of_something_else_are_refused(name: str, value: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r".+"):
-        model_of(fitted().arrays() | {name: value})
 
 
 @pytest.mark.filterwarnings("error")

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.models.base import DEFAULTS, model_of
+from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     EQUATION,
@@ -112,30 +112,6 @@ def test_a_size_that_is_none_leaves_steps_that_can_be_made(largest: float) -> No
         replace(model, substeps=0, fewer=np.empty((0, 2))).step(*_batch(model))
 
 
-def test_derivatives_of_a_step_are_its_slopes() -> None:
-    model, rng = _model(VARYING), np.random.default_rng(0)
-    fields, actions = _batch(model)
-    y, dz = rng.standard_normal((2, *fields.shape))
-    da, h = rng.standard_normal(actions.shape), 1e-6
-    on_z, on_a = model.pull_back(fields, actions, y)
-    ahead, behind = (model.step(fields + s * h * dz, actions + s * h * da) for s in (1.0, -1.0))
-    expected = np.sum(y * (ahead - behind), axis=1) / (2 * h)
-    np.testing.assert_allclose(
-        np.sum(on_z * dz, axis=1) + np.sum(on_a * da, axis=1), expected, rtol=1e-6
-    )
-
-
-def test_a_model_with_them_comes_back_from_its_arrays() -> None:
-    model = _model(VARYING)
-    again = model_of(model.arrays())
-    assert isinstance(again, SensedModel) and same_bits(again.shared, model.shared)
-    batch = _batch(model)
-    assert same_bits(again.step(*batch), model.step(*batch))
-    assert "coefficients" not in _model({}).arrays()
-    with pytest.raises(ValueError, match="coefficients"):
-        model_of({**model.arrays(), "coefficients": np.zeros((3, 2, model.n_z))})
-
-
 def test_large_fields_and_short_waves_are_damped_at_every_x() -> None:
     shared = _unknowns({(1, 2, 1, True): 9.0, (1, 2, 2, True): 9.0, (3, 0, 1, False): -0.5})
     found = well_posed(shared)
@@ -158,17 +134,6 @@ def test_a_power_that_damps_more_leaves_the_third_free() -> None:
     shared = _unknowns({(3, 0, 1, False): 0.5})
     shared[[TERMS.index((3, 0)), TERMS.index((7, 0))]] = 1.0, -1.0
     assert same_bits(well_posed(shared), shared)
-
-
-def test_a_cut_field_has_the_derivatives_of_one() -> None:
-    model, rng = replace(_model(VARYING), clip=0.7), np.random.default_rng(1)
-    fields, actions = _batch(model)
-    y, dz, h = *rng.standard_normal((2, *fields.shape)), 1e-6
-    ahead, behind = (model.step(fields + s * h * dz, actions) for s in (1.0, -1.0))
-    expected = np.sum(y * (ahead - behind), axis=1) / (2 * h)
-    found = np.sum(model.pull_back(fields, actions, y)[0] * dz, axis=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-    assert np.abs(model.step(fields, actions) - _model(VARYING).step(fields, actions)).max() > 1e-3
 
 
 def _fitted(varying: dict[tuple[int, int, int, bool], float], count: int, sigma: float) -> Fitted:

@@ -8,10 +8,8 @@ import pytest
 
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.models import Measured, linear
-from pdeloop.method.models.base import model_of
 from pdeloop.method.models.finite_difference import (
     Feature,
-    FiniteDifferenceModel,
     features_of,
     of_features,
 )
@@ -21,21 +19,6 @@ from tests.support.fitted import fit_field_model
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX
 RNG = np.random.default_rng(0)
-
-
-def model(components: int = 1, scale: float = 0.05) -> FiniteDifferenceModel:
-    features = features_of(components, axes=2)
-    numbers = [
-        scale * RNG.standard_normal((len(features), components, N_Z)),
-        RNG.standard_normal((components * N_Z, N_A)),
-        scale * RNG.standard_normal(components * N_Z),
-    ]
-    return of_features("x1e-5", features, *numbers, 3, SHAPE)
-
-
-def coarse() -> ProjectedModel:
-    points = np.sort(RNG.choice(2 * N_Z, N_Z, replace=False))
-    return ProjectedModel(model(), np.eye(2 * N_Z)[points], RNG.standard_normal((2 * N_Z, N_Z)) / 7)
 
 
 @pytest.mark.parametrize("order", range(5))
@@ -52,33 +35,6 @@ def test_a_difference_is_along_one_axis_of_a_ring(order: int) -> None:
     up, down = np.roll(z, -1, axis), np.roll(z, 1, axis)
     expected = z if order == 0 else 0.5 * (up - down) if order % 2 else up - 2.0 * z + down
     np.testing.assert_allclose((after - z) / size, expected, atol=1e-4)
-
-
-@pytest.mark.parametrize("made", [model, lambda: model(2), coarse], ids=["one", "two", "coarse"])
-def test_the_pull_back_is_the_transposed_derivative(made: type) -> None:
-    own = made()
-    z, a = 0.3 * RNG.standard_normal((3, own.n_z)), RNG.standard_normal((3, N_A))
-    dz, da = RNG.standard_normal(z.shape), RNG.standard_normal(a.shape)
-    y, h = RNG.standard_normal(z.shape), 1e-6
-    on_z, on_a = own.pull_back(z, a, y)
-    slope = (own.step(z + h * dz, a + h * da) - own.step(z - h * dz, a - h * da)) / (2.0 * h)
-    wanted = np.sum(slope * y, axis=1)
-    found = np.sum(on_z * dz, axis=1) + np.sum(on_a * da, axis=1)
-    np.testing.assert_allclose(found, wanted, rtol=1e-6)
-    alone = own.step(z[1:2], a[1:2])
-    assert np.array_equal(alone, own.step(z, a)[1:2])
-
-
-@pytest.mark.parametrize("made", [model, coarse], ids=["all points", "coarse"])
-def test_a_model_comes_back_from_its_arrays_or_is_refused(made: type) -> None:
-    own = made()
-    again = model_of(own.arrays())
-    z, a = RNG.standard_normal((2, own.n_z)), RNG.standard_normal((2, N_A))
-    assert again.kind == "x1e-5" and np.array_equal(again.step(z, a), own.step(z, a))
-    prefix = "inner." if isinstance(own, ProjectedModel) else ""
-    for shape in ((NY, NX + 1), (N_Z,), (-NY, -NX), (NY, 0)):
-        with pytest.raises(ValueError, match="axes"):
-            model_of(own.arrays() | {f"{prefix}axes": np.array(shape)})
 
 
 def plate(ny: int, nx: int, count: int) -> list[Measured]:
