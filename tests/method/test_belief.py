@@ -7,9 +7,7 @@ import pytest
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Context, Record, Trajectory
 from pdeloop.method.adapt.belief import believe
-from pdeloop.method.models import Measured
-from pdeloop.method.models.base import FieldModelSettings, errors
-from pdeloop.method.models.linear import LinearModel
+from pdeloop.method.models.base import FieldModelSettings
 
 N_Z, N_A, STEPS = 9, 2, 20
 
@@ -51,23 +49,3 @@ def test_numbers_that_cost_nothing_have_no_say_in_the_choice_of_a_model(level: f
     missed = belief.model.step(before, actions) - after
     change = after - before
     assert np.sum(missed[:, :8] ** 2) < 1e-4 * np.sum(change[:, :8] ** 2)
-
-
-def test_errors_are_the_same_in_other_units() -> None:
-    """Q in other units is that of the same cost."""
-    rng = np.random.default_rng(1)
-    model = LinearModel("linear", 0.5 * np.eye(2), np.ones((2, 1)), np.zeros(2))
-    rollout = Measured(rng.standard_normal((6, 2)), rng.standard_normal((5, 1)))
-    units = np.array([1e3, 1e-1])
-    other = LinearModel("linear", 0.5 * np.eye(2), units[:, None] * model.B, np.zeros(2))
-    moved = Measured(rollout.states * units, rollout.actions)
-    target, q = np.array([0.3, -0.2]), np.array([2.0, 5.0])
-    expected = errors(model, [rollout], target, 9.0, weights=np.sqrt(q))
-    for weight in (q / units**2, np.diag(q / units**2)):
-        cost = Cost(2, 1, 5, state_weight=weight)
-        found = errors(other, [moved], target * units, 9.0, weights=cost.state_weights)
-        assert found == pytest.approx(expected, rel=1e-9)
-    output = Cost(2, 1, 5, output=np.sqrt(q) / units * np.eye(2))
-    found = errors(other, [moved], target * units, 9.0, weights=output.state_weights)
-    assert found == pytest.approx(expected, rel=1e-9)
-    assert Cost(2, 1, 5, state_weight=4.0).state_weights is None

@@ -104,23 +104,16 @@ def test_a_law_is_improved_on_a_model_of_pieces_from_measured_states(
 ) -> None:
     plant = Plant()
     in_pieces(plant, monkeypatch)
-    optimizer = make(plant)
-    rows = finished(plant, optimizer)
+    optimizer, again = make(plant), make(plant)
+    rows = [optimizer.tell(measured(plant, optimizer))]
+    again.restore(optimizer.state())
+    rows += finished(plant, optimizer)
+    assert finished(plant, again) == rows[1:] and same_bits(optimizer.policy, again.policy)
     # Of a linear-quadratic problem the law is best from every state.
     assert plant.cost(optimizer.policy) <= 1.01 * plant.cost(plant.best)
     improved = [row for row in rows if "model" in row]
     assert len(improved) == 2 and all(row["chaotic"] for row in improved)
     assert rows[-1]["chosen"] == "adapted"
-
-
-def test_it_goes_on_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    plant = Plant()
-    in_pieces(plant, monkeypatch)
-    optimizer, again = make(plant), make(plant)
-    optimizer.tell(measured(plant, optimizer))
-    again.restore(optimizer.state())
-    rows = [finished(plant, own) for own in (optimizer, again)]
-    assert rows[0] == rows[1] and same_bits(optimizer.policy, again.policy)
 
 
 class Costs:

@@ -26,7 +26,7 @@ from pdeloop.method.adapt.verdict import (
     mean_of,
 )
 
-DRAWS = 4000
+DRAWS = 2000
 
 
 def upper(rate: float, draws: int = DRAWS) -> float:

@@ -199,13 +199,6 @@ def test_the_less_a_law_is_trusted_to_move_the_less_it_does() -> None:
     assert costs[0] < costs[1] < costs[2] < found[0].before
 
 
-def test_the_same_improvement_has_the_same_bits() -> None:
-    arguments = fields(3), np.full(3, 1 / 3), np.eye(N_A), ModelBasedSettings(iterations=5)
-    one, other = (improve(loop(), np.zeros((N_A, N_S + 1)), *arguments) for _ in range(2))
-    assert one is not None and other is not None and one.steps == other.steps <= 5
-    assert one.theta.tobytes() == other.theta.tobytes()
-
-
 def test_units_of_actions_and_states_do_not_change_an_improvement() -> None:
     """A plant in other units takes the same steps: x has none."""
     closed, start = loop(), fields(3)

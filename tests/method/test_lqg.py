@@ -76,8 +76,8 @@ def simulated(sigma: float, steps: int = 4000) -> tuple[np.ndarray, np.ndarray]:
     rng, s = np.random.default_rng(5), np.zeros(N)
     stable = A / 1.3
     states, actions = [s], rng.standard_normal((steps, N_A))
-    for a in actions:
-        s = stable @ s + B @ a + rng.multivariate_normal(np.zeros(N), W)
+    for a, w in zip(actions, rng.multivariate_normal(np.zeros(N), W, steps), strict=True):
+        s = stable @ s + B @ a + w
         states.append(s)
     return np.array(states) + sigma * rng.standard_normal((steps + 1, N)), actions
 

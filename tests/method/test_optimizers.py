@@ -136,13 +136,6 @@ def test_an_overflowing_step_stays_out_of_the_policy() -> None:
     assert np.array_equal(optimizer.policy, POLICY)
 
 
-def test_only_divergence_never_moves_the_policy() -> None:
-    optimizer = two_point()
-    while not optimizer.done:
-        optimizer.tell([RolloutResult(np.nan, diverged=True)] * len(optimizer.ask()))
-    assert np.array_equal(optimizer.policy, POLICY)
-
-
 def through_file(optimizer: Optimizer) -> dict[str, np.ndarray]:
     buffer = io.BytesIO()
     np.savez(buffer, **optimizer.state())

@@ -261,19 +261,10 @@ def test_a_fit_goes_on_from_an_earlier_equation() -> None:
     assert again.error == pytest.approx(first.error, abs=1e-3)
 
 
-def test_actuators_differ_in_strength_where_readings_say_so() -> None:
-    strengths = [5.0, 8.0, 2.0]
-    readings, actions, _ = _drawn(REACTION, 3, 0.02, strengths)
-    with threadpool_limits(1):
-        found = fit_sensed(readings, actions, DECLARED, 0.02)
-    own = found.shared[COEFFICIENTS] + found.shared[SHARED:]
-    np.testing.assert_allclose(own, strengths, atol=0.2)
-
-
 def test_terms_beyond_the_first_ones_are_found_where_these_do_not_suffice() -> None:
     """Kuramoto and Sivashinsky's: long waves grow, short ones are damped by the fourth derivative."""
     equation = {(1, 2): -100.0, (1, 4): -3.0, (2, 1): -10.0}
-    readings, actions, _ = _drawn(equation, 4, 0.0, [10.0] * 3, steps=15)
+    readings, actions, _ = _drawn(equation, 3, 0.0, [10.0] * 3, steps=10)
     with threadpool_limits(1):
         found = fit_sensed(readings, actions, DECLARED)
     assert found.error < 1e-5

@@ -58,6 +58,8 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     with threadpool_limits(1):
         found = fit_sensed(readings, list(actions), actuators)
     assert found.error < 1e-4
+    strengths = found.shared[COEFFICIENTS] + found.shared[SHARED:]
+    np.testing.assert_allclose(strengths, [5.0, -5.0, 0.0], atol=0.3)
     B = sensed_model(found.shared, SENSORS, actuators, 4.0).B
     assert np.linalg.norm(B - model.B) < 0.15 * np.linalg.norm(model.B)
 

@@ -39,25 +39,6 @@ def test_field_seeds_fit_a_float_and_are_their_own_stream() -> None:
     assert field_seed(1, 0) != shared
 
 
-def test_estimates_of_a_linear_cost_average_to_its_gradient_and_a_step_descends_along_it() -> None:
-    """J = <G, pi>: J(pi - eta G) = J(pi) - eta |G|^2."""
-    G = np.random.default_rng(1).standard_normal(SHAPE)
-    policy, radius = np.arange(12.0).reshape(SHAPE), 0.1
-
-    def cost(pi: np.ndarray) -> float:
-        return float(np.sum(G * pi))
-
-    directions = np.linalg.qr(np.random.default_rng(0).standard_normal((G.size, G.size)))[0]
-    directions = directions.reshape(-1, *SHAPE)
-    estimates = [
-        gradient(cost(policy + radius * d), cost(policy - radius * d), d, radius)
-        for d in directions
-    ]
-    np.testing.assert_allclose(np.mean(estimates, axis=0), G, rtol=1e-9)
-    stepped = policy - 1e-2 * G
-    assert cost(stepped) == pytest.approx(cost(policy) - 1e-2 * np.sum(G * G), rel=1e-12)
-
-
 def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     half = rng.standard_normal((12, 12))

@@ -118,23 +118,6 @@ def test_the_first_law_is_preferred_unless_the_evidence_says_otherwise(
     assert np.isfinite([verdict.change, verdict.deviation]).all()
 
 
-@pytest.mark.parametrize("base", [FIRST, NONE])
-@pytest.mark.parametrize(("held_out", "excess"), [(-2.0, 1.0), (-2.0, 3.0), (0.5, -2.0)])
-def test_no_control_is_not_kept_for_chance_alone(base: str, held_out: float, excess: float) -> None:
-    """A law takes its place where model and measurements favour it; the first law stays."""
-    loop: Any = Costs(lambda x, i: 10.0 + i)
-    laws = {base: np.zeros((1, 1)), ADAPTED: np.ones((1, 1))}
-    fields = np.arange(6.0)[:, None]
-    seen = [  # by chance much more or less than on the model
-        Record(laws[ADAPTED], 10.0 + i + excess + 9.0 * (-1.0) ** i, fields[i : i + 1], fields[:0])
-        for i in range(4)
-    ]
-    known = evidence_of(loop, laws, base, seen, fields, Estimate(held_out, 0.1, 20.0))
-    assert known is not None
-    favoured = held_out < 0.0 and held_out + excess < 0.0
-    assert choose(known, base, 1.0).chosen == (ADAPTED if favoured and base == NONE else base)
-
-
 @pytest.mark.parametrize("order", [(FIRST, ADAPTED, NONE), (FIRST, NONE, ADAPTED)])
 def test_where_the_first_law_always_diverges_the_cheapest_of_the_others_is_taken(
     order: tuple[str, ...],
@@ -189,13 +172,3 @@ def test_the_reason_says_by_how_much() -> None:
     # "Adapted" is what the outcome calls the law that is returned, which is not this one.
     told = ": the last law costs 1 (standard error 2) less than the first law"
     assert chance.reason.endswith(told)
-
-
-def test_equal_laws_are_told_apart_by_chance_no_more_often_than_the_confidence_says() -> None:
-    """Two laws of one cost, measured with noise: the other one is taken in one case of six."""
-    rng, wrong = np.random.default_rng(11), 0
-    for _ in range(2000):
-        first = Evidence(ZERO, rng.standard_normal(12))
-        other = Evidence(ZERO, rng.standard_normal(12))
-        wrong += choose({FIRST: first, ADAPTED: other}, FIRST, 1.0).chosen == ADAPTED
-    assert wrong / 2000 < 0.2
