@@ -29,6 +29,7 @@ from tests.support.forked_workers import fork_workers
 from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
 from tests.support.small import RECORDED, REPRODUCED, SMALL
+from tests.support.undrawn import undraw
 
 LONG = (
     "test_soak",
@@ -240,10 +241,8 @@ def reproduction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports have their pages and files, of which PNGs hold no picture: most of what they cost."""
-    from pdeloop.report import page
-
-    monkeypatch.setattr(page, "_draw", lambda figure, png: png.write(b"a picture"))
+    """Reports have their pages and files, which hold no pictures: most of what they cost."""
+    undraw(monkeypatch.setattr)
 
 
 @pytest.fixture(scope="session")

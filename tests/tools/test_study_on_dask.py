@@ -92,7 +92,8 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
 ):
     older = another_version("numpy", tmp_path / "packages")
     file, out = tmp_path / "study.yaml", str(tmp_path / "out")
-    file.write_text(json.dumps({**CONTENT, "seeds": 1}))
+    content = {**CONTENT, "variants": {"two-point": {}}}
+    file.write_text(json.dumps({**content, "seeds": 1}))
     with dask_cluster(tmp_path / "dask", 1, worker=older) as dask:
         dask.start_worker()
         dask.await_workers(2)
@@ -110,7 +111,7 @@ def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
     numpy = json.loads(contents(Path(out))["small/two-point/0/result.json"])["environment"]["numpy"]
     assert numpy == "1.0"
     assert "instead of" not in capsys.readouterr().out
-    file.write_text(json.dumps(CONTENT))
+    file.write_text(json.dumps(content))
     (tmp_path / "out/study.json").unlink()  # more seeds of the same study
     assert main(["study", str(file), "--out", out, "--processes", "1"]) == 1
     assert f"a worker has numpy {np.__version__} instead of {numpy}" in capsys.readouterr().err
