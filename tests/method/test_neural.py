@@ -37,7 +37,7 @@ from tests.method.test_predictive import (
 from tests.method.test_predictive import (
     optimizer as planned,
 )
-from tests.support.small import FEW_FITS
+from tests.support.planned import PROBLEM, trained
 from tests.tools.test_law_gradients import SEEDS, Cubic
 from tests.tools.test_law_gradients import law_of as law_of_cubic
 from tuner_node.narration import closing_lines
@@ -240,28 +240,17 @@ def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
 
 
-TRAINED = {
-    "n_z": 32,
-    "horizon": 25,
-    "reduced_order": 8,
-    "rollouts": 12,
-    "evaluation_fields": 4,
-    "law_settings": {"neurons": 8, "iterations": 40},
-    **FEW_FITS,
-}
-
-
 def test_it_is_trained_evaluated_and_exported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, out = "kuramoto-sivashinsky-22", tmp_path / "run"
-    run = pdeloop.train(problem, **TRAINED, law="neural", out=out)
+    out = trained(tmp_path_factory, "neural")
+    run = pdeloop.load_run(out)
     *_, before, last = run.result["history"]
     assert last["chosen"] == "neural" and before["network_saves"] > 0.0
     assert run.costs["adapted"].mean() < run.costs["lqt"].mean()
-    costs = evaluate(pdeloop.load_run(out), fields=4, seed=run.values["evaluation_seed"])
+    costs = evaluate(run, fields=2, seed=run.values["evaluation_seed"])
     assert np.array_equal(costs["adapted"], run.costs["adapted"])
-    closing = "\n".join(closing_lines(problem, run.result, out))
+    closing = "\n".join(closing_lines(PROBLEM, run.result, out))
     assert "the law that acts is neural (the law with a network costs" in closing
     states = RNG.standard_normal((5, 32))
     expected = actions_in_loop(run.laws[0], run.policies[0], ANY_ACTION, states)

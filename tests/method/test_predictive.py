@@ -35,6 +35,7 @@ from pdeloop.method.models.base import FieldModelSettings
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.settings import Settings
 from tests.method.test_plans import N_A, N_Z, T, general_cost, spectral
+from tests.support.planned import FEW_STARTS, PROBLEM, trained
 from tests.support.small import FEW_FITS
 from tuner_node.narration import closing_lines
 
@@ -231,8 +232,6 @@ LINEAR = {
     "evaluation_fields": 2,
     **FEW_FITS,
 }
-CHAOTIC = LINEAR | {"n_z": 32, "reduced_order": 8}
-FEW_STARTS = {"first_iterations": 20, "starts": 2}
 
 
 def test_auto_is_the_affine_law_to_the_bit_where_the_model_has_no_more_to_give(
@@ -279,9 +278,9 @@ def test_auto_is_the_default_law_where_it_does_not_plan(tmp_path: Path) -> None:
     assert any("the law that acts is feedforward" in line for line in closing)
 
 
-def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
-    problem, out = "kuramoto-sivashinsky-22", tmp_path / "auto"
-    auto = pdeloop.train(problem, **CHAOTIC, law="auto", law_settings=FEW_STARTS, out=out)
+def test_auto_plans_on_a_chaotic_plant(tmp_path_factory: pytest.TempPathFactory) -> None:
+    out = trained(tmp_path_factory, "auto")
+    auto = pdeloop.load_run(out)
     *_, last = auto.result["history"]
     assert last["rollouts"] == 15 and last["chosen"] == "predictive" and not auto.affine
     shares = [row["could_save"] for row in auto.result["history"] if "could_save" in row]
@@ -291,10 +290,10 @@ def test_auto_plans_on_a_chaotic_plant(tmp_path: Path) -> None:
     assert np.array_equal(both.laws[0].parts(both.policies[0])["K_a"], auto.models[0].K_a)
     assert not both.policies[0, auto.warm.shape[1] :].any()
     line = next(
-        line for line in closing_lines(problem, auto.result, out) if "the law that acts" in line
+        line for line in closing_lines(PROBLEM, auto.result, out) if "the law that acts" in line
     )
     assert "predictive (the law that plans costs" in line and "ms" in line
-    costs = evaluate(pdeloop.load_run(out), fields=2, seed=auto.values["evaluation_seed"])
+    costs = evaluate(auto, fields=2, seed=auto.values["evaluation_seed"])
     assert np.array_equal(costs["adapted"], auto.costs["adapted"])
 
 

@@ -9,30 +9,26 @@ import pytest
 
 import pdeloop
 from tests.support.loop_harness import Processes
+from tests.support.planned import PLANNED, PROBLEM, trained
 from tests.support.small import same_bits
 from tests.support.small_loop import LIMIT
 from tests.tools.test_own_law import policies
 
 pytestmark = pytest.mark.topics
 
-PARAMETERS = {"n_z": 32, "reduced_order": 8, "evaluation_fields": 2}
-SIZES = {"auto": {"horizon": 40, "rollouts": 15}, "neural": {"horizon": 25, "rollouts": 12}}
-LAWS = {"auto": {"first_iterations": 20, "starts": 2}, "neural": {"neurons": 8, "iterations": 40}}
 
-
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", PLANNED)
 def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_from_a_bag(
-    loop: Processes, tmp_path: Path, law: str
+    loop: Processes, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, law: str
 ) -> None:
-    out = tmp_path / "run"
-    given = {**PARAMETERS, **SIZES[law], "law": law}
+    out, given = tmp_path / "run", {**PLANNED[law], "law": law}
+    constants = given.pop("law_settings")
     words = [f"{name}={value}" for name, value in given.items()]
-    words += [f"law_settings.{name}={value}" for name, value in LAWS[law].items()]
+    words += [f"law_settings.{name}={value}" for name, value in constants.items()]
     flags = [word for setting in words for word in ("--set", setting)]
-    problem = "kuramoto-sivashinsky-22"
     record = ["--record"] * (law == "auto")  # the same training is recomputed from a bag of either
-    loop.wait(loop.pdeloop("train", problem, *flags, *record, "--out", str(out)), LIMIT)
-    here = pdeloop.train(problem, **given, law_settings=LAWS[law])
+    loop.wait(loop.pdeloop("train", PROBLEM, *flags, *record, "--out", str(out)), LIMIT)
+    here = pdeloop.load_run(trained(tmp_path_factory, law))
     assert here.result["history"][-1]["role"] == "judging"
     assert here.result["acting"][0]["law"] in ("predictive", "neural")
     assert same_bits(policies(out), here.policies)
