@@ -64,9 +64,10 @@ audit: setup
 run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
-# Five workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own.
+# Four workers for two cores: tests over topics spend part of their time waiting. Each has a ROS domain of its own,
+# and takes ten seconds of a core to import and collect the tests.
 # Further threads of linear algebra would spin in every process.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 5 --dist worksteal
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist worksteal
 
 # All tests, each of them once; with COVERAGE=1, those without topics are run by `coverage`.
 test: setup packages $(if $(COVERAGE),coverage)

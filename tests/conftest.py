@@ -76,7 +76,7 @@ def _nothing_left(temporary_folder: Path, request: pytest.FixtureRequest) -> Ite
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Linear algebra in one thread: with as many as cores, most of them spin while five workers run."""
+    """Linear algebra in one thread: with as many as cores, most of them spin while four workers run."""
     with threadpool_limits(limits=1):
         yield
 

@@ -112,21 +112,26 @@ def dotted(function: ast.expr) -> str:
 
 
 @cache
-def checks(node: ast.AST) -> bool:
-    """True if something in it compares or fails by itself."""
-    return any(
-        isinstance(part, ast.Assert | ast.Raise)
-        or (isinstance(part, ast.Call) and CHECKS.match(dotted(part.func)))
-        for part in ast.walk(node)
-    )
-
-
-@cache
-def called(node: ast.AST) -> set[str]:
-    """The names of functions and methods that it calls, or enters as a context, or asks for."""
-    names = {dotted(c.func).split(".")[-1] for c in ast.walk(node) if isinstance(c, ast.Call)}
+def looked_through(node: ast.AST) -> tuple[bool, set[str]]:
+    """Whether something in it compares or fails by itself, and what it calls, enters or asks for."""
+    checked, names = False, set()
+    for part in ast.walk(node):
+        if isinstance(part, ast.Call):
+            function = dotted(part.func)
+            names.add(function.split(".")[-1])
+            checked = checked or CHECKS.match(function) is not None
+        elif isinstance(part, ast.Assert | ast.Raise):
+            checked = True
     arguments = node.args.args if isinstance(node, Function) else []
-    return names | {argument.arg for argument in arguments}
+    return checked, names | {argument.arg for argument in arguments}
+
+
+def checks(node: ast.AST) -> bool:
+    return looked_through(node)[0]
+
+
+def called(node: ast.AST) -> set[str]:
+    return looked_through(node)[1]
 
 
 def helpers() -> dict[str, bool]:

@@ -13,7 +13,7 @@ import pytest
 
 from pdeloop.process.isolation import NETWORK
 from pdeloop.process.ros_environment import STEERING, steering, with_servers_there
-from pdeloop.process.start import BLAS_THREADS, OWN
+from pdeloop.process.start import BLAS_THREADS, OWN, what_to_install
 from tests.support.interpreter import LIMIT, ROOT
 from tests.support.loop_harness import Processes
 from tests.support.small import SMALL
@@ -57,11 +57,15 @@ def test_a_stream_that_cannot_write_a_character_ends_no_training(tmp_path: Path)
     assert "gr\\xf6\\xdfe" in ended.stdout and (folder / "result.json").exists()
 
 
-@pytest.mark.parametrize("missing", ["ModuleNotFoundError", "ImportError"])
-def test_the_rclpy_of_another_python_is_named_with_its_place(tmp_path: Path, missing: str) -> None:
+def test_the_rclpy_of_another_python_is_named_with_its_place(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign" / "rclpy"
     foreign.mkdir(parents=True)
-    (foreign / "__init__.py").write_text(f"raise {missing}('_rclpy_pybind11', name='_rclpy')\n")
+    for missing in ("ImportError", "ModuleNotFoundError"):
+        text = f"raise {missing}('_rclpy_pybind11', name='_rclpy')\n"
+        (foreign / "__init__.py").write_text(text)
+        with pytest.raises(ImportError) as raised:
+            exec(compile(text, str(foreign / "__init__.py"), "exec"))
+        assert f"rclpy in {foreign.parent} cannot be loaded" in str(what_to_install(raised.value))
     words = ("train", "allen-cahn", "--rollouts", "6")
     path = os.pathsep.join([str(foreign.parent), str(ROOT)])
     ended = command(tmp_path, *words, PYTHONPATH=path, ROS_LOG_DIR=str(tmp_path))

@@ -66,28 +66,20 @@ def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) 
         truncated_dmdc([(states @ lift(20, N_S).T, actions)], p=p, n_s=n_s)
 
 
-def test_refuses_a_trajectory_shorter_than_p() -> None:
+def test_refuses_short_and_malformed_trajectories() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
-    with pytest.raises(ValueError, match="= 4, but p is 5"):
-        truncated_dmdc([(states[:5], actions[:4])], p=5, n_s=3)
-
-
-def test_refuses_malformed_trajectories() -> None:
-    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
-    with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
-        truncated_dmdc([(states[:-1], actions)], p=5, n_s=3)
-    with pytest.raises(ValueError, match="non-empty matrix"):
-        truncated_dmdc([(states[0], actions)], p=5, n_s=3)
-    with pytest.raises(ValueError, match="non-empty matrix"):
-        truncated_dmdc([(states[:1], actions[:0])], p=5, n_s=3)
-    broken = states.copy()
-    broken[7, 1] = np.nan
-    with pytest.raises(ValueError, match="row 7"):
-        truncated_dmdc([(broken, actions)], p=5, n_s=3)
-    broken = actions.copy()
-    broken[3, 0] = np.inf
-    with pytest.raises(ValueError, match="actions must be finite, but row 3"):
-        truncated_dmdc([(states, broken)], p=5, n_s=3)
+    lost, lost_actions = states.copy(), actions.copy()
+    lost[7, 1], lost_actions[3, 0] = np.nan, np.inf
+    for known, message in (
+        ((states[:5], actions[:4]), "= 4, but p is 5"),
+        ((states[:-1], actions), "40 actions belong to 41 states, but 40"),
+        ((states[0], actions), "non-empty matrix"),
+        ((states[:1], actions[:0]), "non-empty matrix"),
+        ((lost, actions), "row 7"),
+        ((states, lost_actions), "actions must be finite, but row 3"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            truncated_dmdc([known], p=5, n_s=3)
 
 
 def test_reduced_model_checks_itself_and_is_read_only() -> None:

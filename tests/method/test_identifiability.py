@@ -256,10 +256,6 @@ def test_the_state_is_told_by_channel() -> None:
             exact_regression([(measured, actions)], n_s=N_Z)
         model = exact_regression([(measured, actions)], n_s=2)
         assert any(words in remark for remark in examine([(measured, actions)], model.U).remarks)
-
-
-def test_the_states_channels_are_told_by_name() -> None:
-    states, actions = experiment(white)
     names = Channels(states=["T1", "T2", "p", "x", "v"])
     with pytest.raises(ValueError, match="p never moved"):
         exact_regression([(states * [1, 1, 0, 1, 1], actions)], n_s=N_Z, channels=names)

@@ -97,15 +97,6 @@ def test_a_cost_is_the_mean_stage_cost_along_the_model() -> None:
     assert closed.costs(theta, fields(1))[0] == pytest.approx(total / T, rel=1e-13)
 
 
-def test_a_policy_and_its_law_act_alike() -> None:
-    closed = loop()
-    policy = np.random.default_rng(4).normal(size=(N_A, 2 * N_S))
-    theta = closed.theta(policy)
-    np.testing.assert_array_equal(closed.policy(theta, policy), policy)
-    moved = closed.policy(theta + 1.0, policy)
-    np.testing.assert_allclose(closed.theta(moved), theta + 1.0, rtol=1e-12)
-
-
 def test_without_a_target_in_the_basis_a_law_has_no_constant_part() -> None:
     closed = replace(loop(), cost=Cost(N_Z, N_A, T, state_weight=1.5, action_weight=0.4))
     theta = np.ones((N_A, N_S + 1))

@@ -38,26 +38,13 @@ def test_is_the_projected_least_squares_solution() -> None:
     np.testing.assert_allclose(model.U @ model.U.T, left @ left.T, atol=1e-12)
 
 
-@pytest.mark.parametrize("scale", [1e-9, 3.0, 1e9])
-def test_does_not_depend_on_the_unit_of_the_inputs(scale: float) -> None:
-    rng = np.random.default_rng(4)
+@pytest.mark.parametrize("units", [1e-9, 3.0, 1e9, [1.0, 1e-9], [1.0, 1e9]])
+def test_does_not_depend_on_the_units_of_inputs(units: float | list[float]) -> None:
+    rng, scale = np.random.default_rng(4), np.array(units)
     states, actions = rng.standard_normal((STEPS + 1, 20)), rng.standard_normal((STEPS, N_A))
-    model, other = (
-        exact_regression([(states, actions)], n_s=6),
-        exact_regression([(states, scale * actions)], n_s=6),
-    )
+    model, other = (exact_regression([(states, c * actions)], n_s=6) for c in (1.0, scale))
     np.testing.assert_allclose(other.A, model.A, atol=1e-12)
     np.testing.assert_allclose(scale * other.B, model.B, atol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [1e-9, 1e9])
-def test_does_not_depend_on_the_unit_of_one_input(scale: float) -> None:
-    rng = np.random.default_rng(4)
-    states, actions = rng.standard_normal((STEPS + 1, 20)), rng.standard_normal((STEPS, N_A))
-    units = np.array([1.0, scale])
-    model, other = (exact_regression([(states, c * actions)], n_s=6) for c in (1.0, units))
-    np.testing.assert_allclose(other.A, model.A, atol=1e-12)
-    np.testing.assert_allclose(units * other.B, model.B, atol=1e-12)
 
 
 def test_truncated_dmdc_is_the_same_at_full_rank() -> None:
