@@ -34,10 +34,10 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
     states = plant().reset(np.array([1]))
     for run in range(100, 106):
         responder.start(start(1, (1, 2, 0.1, 0), run=run))
-        for k in range(2000):
+        for k in range(600):
             assert len(responder.state(Frame(run, 1, k, 0.0, states + k))) == 1
         assert sum(known.nbytes for known in responder._runs.values()) <= 100_000
-    (failure,) = responder.cost(Frame(105, 1, 1999, 1.0, COSTS))
+    (failure,) = responder.cost(Frame(105, 1, 599, 1.0, COSTS))
     assert isinstance(failure, ModelFailure) and not failure.retry
     assert "more than 100000 bytes; explore fewer seeds at once" in failure.reason
     with pytest.raises(FrameError, match="expected fewer than 100000 bytes for all runs"):
