@@ -152,7 +152,6 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
             # fish only sorts YAML files before others; bash and zsh leave the others out.
             ("pdeloop train zzz" + "-ow" * (shell == "fish"), "pdeloop train zzz-own.yaml "),
             ("pdeloop bag ver", "pdeloop bag verify "),
-            ("pdeloop bag ver", "pdeloop bag verify "),
             ("pdeloop train --optimizer model", "--optimizer model_based "),
             ("pdeloop evaluate ru", "pdeloop evaluate runs/"),
         ):
