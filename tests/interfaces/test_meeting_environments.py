@@ -52,6 +52,7 @@ def test_a_stream_that_cannot_write_a_character_ends_no_training(tmp_path: Path)
     )
     folder = tmp_path / "größe"
     words = ("train", "--plant", f"{plant}:Plant", "--in-process", "--rollouts", "6")
+    words += ("--optimizer", "two_point")
     ended = command(tmp_path, *words, "--out", str(folder), PYTHONIOENCODING="ascii")
     assert ended.returncode in (0, 3), ended.stderr  # 3: the law of few rollouts costs more
     assert "gr\\xf6\\xdfe" in ended.stdout and (folder / "result.json").exists()

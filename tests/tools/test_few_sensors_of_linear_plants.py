@@ -39,7 +39,7 @@ class Rod(pdeloop.Dynamics):
 
 def test_the_order_is_that_of_the_state_and_not_the_number_of_sensors() -> None:
     """LQG of the true model, which weighs the whole state, costs 0.82; of the readings 1.18."""
-    run = pdeloop.train(plant=Rod(), sensors=3, rollouts=6, evaluation_fields=5)
+    run = pdeloop.train(plant=Rod(), sensors=3, rollouts=6, evaluation_fields=5, **FEW_STEPS)
     assert len(run.models[0].A) > 3
     assert run.costs["lqt"].mean() < 1.3 < 1.9 < run.costs["none"].mean()
     assert run.costs["adapted"].mean() < 1.3
@@ -75,7 +75,7 @@ class Chain(pdeloop.Dynamics):
 
 def test_a_model_that_is_exact_on_held_out_readings_is_the_one_that_is_chosen() -> None:
     """Where there is no noise, a filter forgets a wrong initial state slowly: no model is to blame."""
-    run = pdeloop.train(plant=Chain(), sensors=3, rollouts=6, evaluation_fields=5)
+    run = pdeloop.train(plant=Chain(), sensors=3, rollouts=6, evaluation_fields=5, **FEW_STEPS)
     assert len(run.models[0].A) == 12
     poles = np.abs(np.linalg.eigvals(run.models[0].A))
     np.testing.assert_allclose(poles, np.abs(np.linalg.eigvals(Chain().A)), rtol=1e-3)

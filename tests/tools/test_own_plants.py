@@ -403,7 +403,8 @@ def test_a_script_trains_its_own_class_and_names_its_file(tmp_path: Path) -> Non
     script = tmp_path / "own.py"
     script.write_text(
         OWN + "\nif __name__ == '__main__':\n"
-        "    run = pdeloop.train(plant=Rod(loss=0.2), rollouts=9, reduced_order=2)\n"
+        "    few = {'rollouts': 9, 'reduced_order': 2, 'optimizer': 'two_point'}\n"
+        "    run = pdeloop.train(plant=Rod(loss=0.2), **few)\n"
         "    print(run.values['plant'], run.values['physical.loss'], run.result['plant'])\n"
     )
     name, loss, number = python(str(script)).stdout.split()

@@ -21,7 +21,7 @@ from pdeloop.method.reduce.regression import study_orders
 from pdeloop.report.data import gather, of_run
 from pdeloop.report.figures import bars
 from pdeloop.report.style import BACK, FIELD_MAP, INK, STYLE, darken
-from tests.support.small import SMALL, parameters
+from tests.support.small import FEW_STEPS, SMALL, parameters
 from tuner_node.build import build_training
 
 
@@ -117,6 +117,7 @@ def test_the_orders_shown_are_those_of_the_exploration_that_the_model_is_from(tm
 
     words = ["train", str(SMALL), "--in-process", "--rollouts", "10", "--optimizer", "model_based"]
     words += ["--reduced-order", "0", "--set", f"identification_settings.order_share={share}"]
+    words += [word for own in FEW_STEPS.items() for word in ("--set", "{}={}".format(*own))]
     assert main([*words, "--out", str(tmp_path / "run")]) == 0
     values = parameters(rollouts=10, optimizer="model_based")
     batch = build_training(values).next_batch()
