@@ -283,18 +283,6 @@ def test_the_invariant_share_is_that_of_its_definition() -> None:
     assert invariant_share(measured) == pytest.approx(min(expected, 1.0), rel=1e-10)
 
 
-def test_fields_that_look_alike_everywhere_are_told_from_those_that_do_not() -> None:
-    rng, x = np.random.default_rng(10), 2 * np.pi * np.arange(64) / 64
-    waves = [sum(rng.normal() * np.cos(j * x) + rng.normal() * np.sin(j * x) for j in (1, 2, 3))]
-    waves += [
-        sum(rng.normal() * np.cos(j * x) + rng.normal() * np.sin(j * x) for j in (1, 2, 3))
-        for _ in range(19)
-    ]
-    bumps = rng.uniform(0.9, 1.1, size=(20, 1)) * np.exp(-((x - np.pi) ** 2) * 20.0)
-    assert invariant_share(np.array(waves)) > 0.4
-    assert invariant_share(bumps) < 0.1
-
-
 def renewed(measured: np.ndarray, **constants: int) -> tuple[Renewal, float]:
     """The law made from a few fields, and its cost on many others."""
     closed = loop()

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A model in POD modes recovers a planted one; its pull-back is the transpose; it is written whole."""
+"""A model in POD modes recovers a planted one, and is written whole."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from pdeloop.method.design.lqt import DesignError, _steady_state_map, track
+from pdeloop.method.design.lqt import DesignError, track
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
 N_Z, N_S, N_A = 10, 4, 2
@@ -128,13 +128,6 @@ def test_accepts_a_stable_mode_that_no_actuator_reaches() -> None:
     gains = track(diagonal_model([0.99, 1.2], [[0.0], [1.0]]), state_weight=1.0, action_weight=1.0)
     assert gains.K_a[0, 0] == pytest.approx(0.0, abs=1e-12)
     assert abs(1.2 + gains.K_a[0, 1]) < 1.0
-
-
-def test_refuses_a_closed_loop_without_steady_state() -> None:
-    with pytest.raises(DesignError, match="singular"):
-        _steady_state_map(np.diag([1.0, 0.5]))
-    with pytest.raises(DesignError, match="singular"):
-        _steady_state_map(np.eye(2))
 
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, np.nan, np.inf])

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from typing import Any
 
@@ -71,23 +70,6 @@ def test_no_control_is_measured_where_it_may_stay_and_the_last_law_on_its_fields
     judged = own.ask()
     assert own._progress.stage == JUDGING and all(each.policy.any() for each in judged)
     assert {each.field_seed for each in judged} == {each.field_seed for each in asked}
-
-
-def test_a_law_that_measured_better_than_the_last_one_is_kept() -> None:
-    own, *_ = told(better=True, rollouts=7, judging=3)
-    before, final = own._first + 1e-6, own._first + 2e-6
-    own._progress.policy = final
-    asked = [Rollout(law, seed) for law in (before, final) for seed in (1, 2, 3)]
-    results = [measured(each) for each in asked]
-    for more, best in ((0.1, final), (10.0, before)):
-        again, row = copy.deepcopy(own), {}
-        for each, result in zip(asked, results, strict=True):
-            # That of the first law on the same field, or of one that runs away.
-            known = again._records.all()[int(each.field_seed) - 1].cost
-            cost = known * (more if np.array_equal(each.policy, final) else 0.1)
-            again._records.add([each], [replace(result, cost=cost)])
-        again._judge(row)
-        assert same_bits(again.policy, best) and row["chosen"] == "adapted"
 
 
 @pytest.mark.parametrize("more", [0.5, 2.0])

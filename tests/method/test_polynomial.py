@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The polynomial model: products of state and action, units, its derivative, its file."""
+"""The polynomial model: products of state and action, units, noise, and a state that rests."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from pdeloop.method.design.lqt import DesignError, track_outputs
 from pdeloop.method.laws import Observer
 from pdeloop.method.reduce.channels import Channels
 from pdeloop.method.reduce.identifiability import NotIdentifiableError
-from pdeloop.method.reduce.subspace import InnovationModel, _triangle, driven, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, driven, subspace_model
 
 N, N_A, N_Y = 4, 2, 3
 RNG = np.random.default_rng(2)
@@ -200,14 +200,3 @@ def test_steps_in_blocks_are_those_one_after_the_other(count: int) -> None:
         np.testing.assert_allclose(found[k], x, rtol=1e-12, atol=1e-12)
         x = A @ x
         x[:, -1] += w[k] if k < count else 0.0
-
-
-@pytest.mark.parametrize("apart", [1.0, 1e-9, 0.0])
-@pytest.mark.parametrize("rows", [3, 500])
-def test_a_triangle_has_the_squares_and_the_small_singular_values(apart: float, rows: int) -> None:
-    X = np.random.default_rng(0).standard_normal((rows, 5))
-    X[:, 4] = 1e3 * (X[:, 0] - X[:, 1] + apart * X[:, 4])
-    R = _triangle(X)
-    np.testing.assert_allclose(R.T @ R, X.T @ X, rtol=1e-12, atol=1e-9)
-    found, known = linalg.svdvals(R)[: min(rows, 5)], linalg.svdvals(X)
-    np.testing.assert_allclose(found, known, rtol=1e-6, atol=1e-10)
