@@ -100,49 +100,45 @@ def test_one_of_another_package_trains_with_what_it_declares(installed: Path) ->
     assert training_parameters("burgers", {"optimizer": "halved"})["identification"] == "field"
 
 
-def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
-    assert training_parameters("burgers", {"optimizer": "two-point"})["identification"] == "dmdc"
-    given = {"optimizer": "two_point", "identification": "regression"}
-    assert training_parameters("burgers", given)["identification"] == "regression"
-    assert training_parameters("burgers", {})["identification"] == "field"
+FEW = {"sensors": 16}
+OBSERVER = {"law": "observer"}
 
 
-def test_few_sensors_get_an_estimate_of_the_field_unless_a_law_is_given() -> None:
-    few = {"sensors": 16}
-    found = training_parameters("burgers", few)
-    assert (found["law"], found["identification"]) == ("extended_kalman", "subspace")
-    others: list[dict[str, object]] = [
-        {"sensors": 0},
-        {"sensor_delays": 4},  # a memory of another kind
-        {"sensors": 128},  # every point
-        {"law": "affine"},
-        {"optimizer": "two_point"},  # which cannot improve it
-    ]
-    for other in others:
-        assert training_parameters("burgers", {**few, **other})["law"] == "affine", other
-
-
-def test_an_observer_of_few_sensors_is_identified_from_readings() -> None:
-    few = {"law": "observer", "sensors": 16}
-    assert training_parameters("burgers", few)["identification"] == "subspace"
-    assert training_parameters("burgers", {"law": "observer"})["identification"] == "field"
-    affine = {"sensors": 16, "law": "affine"}
-    assert training_parameters("burgers", affine)["identification"] == "field"
-    assert (
-        training_parameters("burgers", {**few, "identification": "dmdc"})["identification"]
-        == "dmdc"
-    )
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, {"identification": "field"}),
+        ({"optimizer": "two-point"}, {"identification": "dmdc"}),
+        (
+            {"optimizer": "two_point", "identification": "regression"},
+            {"identification": "regression"},
+        ),
+        (FEW, {"law": "extended_kalman", "identification": "subspace"}),
+        ({**FEW, "sensor_delays": 4}, {"law": "affine"}),  # a memory of another kind
+        ({"sensors": 128}, {"law": "affine"}),  # every point
+        ({"sensors": 0}, {"law": "affine"}),
+        ({**FEW, "law": "affine"}, {"law": "affine", "identification": "field"}),
+        ({**FEW, "optimizer": "two_point"}, {"law": "affine"}),  # which cannot improve it
+        ({**FEW, **OBSERVER}, {"identification": "subspace"}),
+        (OBSERVER, {"identification": "field"}),
+        ({**FEW, **OBSERVER, "identification": "dmdc"}, {"identification": "dmdc"}),
+    ],
+)
+def test_defaults_are_those_of_the_optimiser_and_the_sensors_and_override_nothing(
+    given: dict[str, object], expected: dict[str, str]
+) -> None:
+    found = training_parameters("burgers", given)
+    assert {name: found[name] for name in expected} == expected
 
 
 def test_a_model_of_few_readings_is_not_that_of_the_file_for_the_whole_state() -> None:
-    few = {"sensors": 16}
-    wave = problem_values("wave", few)[1]
+    wave = problem_values("wave", FEW)[1]
     assert (wave["identification"], wave["reduced_order"]) == ("subspace", 0)
     for given, order in (
         ({"sensors": 0}, 30),
-        ({**few, "reduced_order": 12}, 12),
-        ({**few, "law": "affine"}, 30),
-        ({**few, "identification": "field"}, 30),
+        ({**FEW, "reduced_order": 12}, 12),
+        ({**FEW, "law": "affine"}, 30),
+        ({**FEW, "identification": "field"}, 30),
     ):
         values = problem_values("wave", given)[1]
         assert values["reduced_order"] == order
