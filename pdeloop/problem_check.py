@@ -22,6 +22,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import MEAN_FIELD, Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pdeloop.episode import EpisodeRecord, Law, rollout
+from pdeloop.exploration_scale import FAR, LITTLE, Responses
 from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
@@ -35,7 +36,7 @@ from tuner_node.build import build_training, few_sensors, remarks_on
 from tuner_node.optimizer_parameters import kind_of
 from tuner_node.result_checks import check_excitation
 
-LITTLE = 0.02
+SLIGHT = 0.02
 """Share of the cost without control; a law that changes it by less does next to nothing."""
 SMALL = 1e-6
 """Size of actions, relative to the explored ones, within any bounds."""
@@ -111,7 +112,7 @@ def judged(none: float, law: float, *, compared: bool = False) -> tuple[bool, st
             "there is nothing to control, as these fields are at the target; draw others, or set "
             "another target"
         )
-    if abs(none - law) < LITTLE * none:
+    if abs(none - law) < SLIGHT * none:
         return law < none or compared, (
             "the law has almost no effect: its actions hardly move the states, are expensive "
             "(lower action_weight), or cannot reach the target"
@@ -157,6 +158,7 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
         if plant.settable and (text := without_effect(plant, *_some_steps(explored))):
             yield Finding("actuators", False, text)
     yield _halving(plant, values, explored)
+    yield from _responses(plant, values)
     yield _actuators(plant)
     if sensors := few_sensors(values):
         yield _sensors(plant, sensors)
@@ -296,6 +298,31 @@ def _repeated(plant: Plant, explored: EpisodeRecord) -> Finding:
             "its beginning must set everything, and random numbers come only from the seed"
         )
     return Finding("repeatability", good, told)
+
+
+def _responses(plant: Plant, values: Mapping[str, Any]) -> Iterator[Finding]:
+    """The inputs without two bounds that change the state by far too little or too much."""
+    default, scale = ActionSet.of({**values, "exploration_scale": []}), values["exploration_scale"]
+    if not plant.quadratic:
+        return
+    sizes = np.sqrt(_variance(values)) * ActionSet.of(values).exploration_scale
+    own = np.sqrt(default.exploration_variance) * default.exploration_scale if scale else sizes
+    responses = Responses(plant, default)
+    for j in np.flatnonzero(~np.isfinite(default.high - default.low)).tolist():
+        share, _ = responses.share(j, own[j])
+        if not share or LITTLE <= share <= FAR:
+            continue
+        does = f"changes the state by {share:.1g} of its distance from the target"
+        told = (
+            f"an action of {own[j]:.3g} of actuator {j} "
+            f"{does if np.isfinite(share) else 'makes the plant diverge'}: "
+        )
+        told += (
+            f"it is explored with {sizes[j]:.3g}"
+            if sizes[j] != own[j]
+            else "write the input in another unit, or set exploration_scale"
+        )
+        yield Finding("exploration", True, told, note=True)
 
 
 def _actuators(plant: Plant) -> Finding:

@@ -11,6 +11,7 @@ import numpy as np
 from pde_sim_node.build import complete
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pdeloop.exploration_scale import scaled_exploration
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.own_code import OwnCodeError
@@ -42,8 +43,14 @@ def problem_values(name: str, options: Mapping[str, Any]) -> tuple[Plant, dict[s
         values |= late
     resting, limits = plant.cost.action_target, (plant.action_set.low, plant.action_set.high)
     limited = any(np.isfinite(limit).any() for limit in limits)
-    if limited and resting.any() and not values["exploration_mean"]:
+    around = limited and resting.any() and not values["exploration_mean"]
+    if around:
         values["exploration_mean"] = plant.action_set.inside(resting).tolist()
+    if scaled := scaled_exploration(plant, values):
+        values |= scaled
+        if around:
+            within = ActionSet.of({**values, "exploration_mean": []}).inside(resting)
+            values["exploration_mean"] = within.tolist()
     if _is_order_sought(name, given, plant, values):
         values["reduced_order"] = 0
     return plant, values

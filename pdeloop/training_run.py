@@ -26,6 +26,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import announced, own_domain
+from pdeloop.exploration_scale import scale_remark
 from pdeloop.given_model import FILE as GIVEN
 from pdeloop.given_model import file_of_gains, with_gains
 from pdeloop.in_process import LocalPair, train
@@ -262,6 +263,8 @@ def carry_out(
     """
     for remark in remarks_on(values):
         display.warn(remark)
+    if told := scale_remark(values):
+        display.line(told)
     if transport.in_process:
         _train_here(folder, values, display, check, advice)
     else:

@@ -278,7 +278,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values
     }
     variance = least_variance(
-        noise=values["measurement_noise"],
+        noise=values["measurement_noise"] * (not values["plant"]),  # see pdeloop.exploration_scale
         steps=values["horizon"],
         sample_time=values["sample_time"],
         width=values["actuator_width"],

@@ -16,10 +16,9 @@ and a_{-1} is the middle between two bounds, otherwise the point nearest to 0 th
 
 Explorations are drawn around an operating point within the bounds, P(m + D x) with x ~ N(0, v I): m is
 the middle between two bounds, and otherwise the point nearest to 0 that is two standard deviations from
-the bound. D is the size of each actuator's standard deviation relative to the largest: a quarter of
-half the range between two bounds, and sqrt(0.1) otherwise; about a given m it is half the distance from
-the nearest bound where that is less, but no less than half of that. Without declared bounds m = 0 and
-D = I.
+the bound. D is the size of each actuator's standard deviation relative to the largest: unless given, a
+quarter of half the range between two bounds, and sqrt(0.1) otherwise; about a given m it is half the
+distance from the nearest bound where that is less, but no less than half of that.
 
 References
 ----------
@@ -29,6 +28,7 @@ Programming 112, 2008.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -65,6 +65,8 @@ class ActionSet:
         Largest change of an action from one step to the next; infinite, or None, where there is none.
     exploration_mean : (n_a,) array, optional
         m, the operating point; in place of the one above.
+    exploration_scale : (n_a,) array, optional
+        Standard deviations of exploratory actions; in place of those above.
 
     Attributes
     ----------
@@ -80,7 +82,7 @@ class ActionSet:
         Whether there is an action that is not in it.
     signed : (n,) array
         What signatures are of (`pdeloop.messages.protocol`): the parameters `action_limit`,
-        `action_bounds` and `exploration_mean`.
+        `action_bounds`, `exploration_mean` and `exploration_scale`.
     exploration_mean, exploration_scale : (n_a,) array, or () for any number
         m, and the diagonal of D.
     exploration_variance : float
@@ -102,6 +104,7 @@ class ActionSet:
         limit: float = 0.0,
         rate: ArrayLike | None = np.inf,
         exploration_mean: ArrayLike = (),
+        exploration_scale: ArrayLike = (),
     ) -> None:
         own = [_bound(name, values, n_a) for name, values in (("low", low), ("high", high))]
         self.rate = _bound("rate", rate, n_a)
@@ -133,20 +136,25 @@ class ActionSet:
                 f"exploration_mean must be {n_a} numbers that are an admissible action, got "
                 f"{mean.tolist()}"
             )
-        self.signed = np.array([limit, *self.bounds, *mean])
+        scale = float_array("exploration_scale", exploration_scale)
+        if scale.size and not (scale.shape == (n_a,) and (scale > 0.0).all()):
+            raise ValueError(
+                f"exploration_scale must be {n_a} positive numbers, got {scale.tolist()}"
+            )
+        self.signed = np.array([limit, *self.bounds, *mean, *scale])
         self.exploration_variance, self.exploration_scale = (
             UNBOUNDED_VARIANCE,
             np.ones_like(self.low),
         )
         self.start = np.zeros_like(self.low)
         self.exploration_mean = mean if mean.size else self.start
-        self._moved = bool(self.bounds or mean.size)
-        if self.bounds:
-            self._set_exploration(given=bool(mean.size))
+        self._moved = bool(self.bounds or mean.size or scale.size)
+        if self.bounds or scale.size:
+            self._set_exploration(mean, scale)
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> ActionSet:
-        """The set of the parameters `action_limit`, `action_bounds` and `exploration_mean`.
+        """The set of `action_limit`, `action_bounds`, `exploration_mean` and `exploration_scale`.
 
         Examples
         --------
@@ -157,7 +165,7 @@ class ActionSet:
         n_a, bounds = values["n_a"], np.array(values.get("action_bounds") or [])
         others: dict[str, Any] = {
             "limit": values["action_limit"],
-            "exploration_mean": values.get("exploration_mean") or [],
+            **{name: values.get(name) or [] for name in ("exploration_mean", "exploration_scale")},
         }
         try:
             if not bounds.size:
@@ -173,7 +181,8 @@ class ActionSet:
             others["rate"] = rate if rate.size else np.inf
             return ActionSet(n_a, low, high, bool(bounds[2 * n_a]), **others)
         except ValueError as error:
-            name = "exploration_mean" if "exploration_mean" in str(error) else "action_bounds"
+            told = re.match("exploration_[a-z]+", str(error))
+            name = told[0] if told else "action_bounds"
             raise ParameterError(f"parameter '{name}': {error}") from error
 
     def inside(self, a: Array) -> Array:
@@ -191,21 +200,27 @@ class ActionSet:
         moved = np.clip(a, self.low + 2.0 * own, self.high - 2.0 * own)
         return self.project(np.where(near, moved, a))
 
-    def _set_exploration(self, *, given: bool) -> None:
+    def _set_exploration(self, mean: Array, scale: Array) -> None:
         two, most = np.isfinite(self.high - self.low), np.sqrt(UNBOUNDED_VARIANCE)
         with np.errstate(invalid="ignore"):
             own = np.where(two, 0.5 * EXPLORED * (self.high - self.low), most)
             middle = np.where(two, 0.5 * (self.low + self.high), 0.0)
-            inside = np.clip(middle, self.low + 2.0 * own, self.high - 2.0 * own)
-        if given:
-            free = np.minimum(self.exploration_mean - self.low, self.high - self.exploration_mean)
+        self.start = self._inside(middle, own)
+        if scale.size:
+            own = scale
+        elif mean.size:
+            free = np.minimum(mean - self.low, self.high - mean)
             own = np.clip(0.5 * free, 0.5 * own, own)
-        if two.any():
+        if not mean.size:
+            self.exploration_mean = self._inside(middle, own)
+        if two.any() or scale.size:
             self.exploration_variance = float(own.max()) ** 2
         self.exploration_scale = own / max(float(own.max()), 1e-300)
-        self.start = self.project(inside) if inside.ndim else inside * (not self.zero_mean)
-        if not given:
-            self.exploration_mean = self.start
+
+    def _inside(self, middle: Array, own: Array) -> Array:
+        """The point next to the middle that is two standard deviations from all bounds."""
+        inside: Array = np.clip(middle, self.low + 2.0 * own, self.high - 2.0 * own)
+        return self.project(inside) if inside.ndim else inside * (not self.zero_mean)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ActionSet) and np.array_equal(self.signed, other.signed)

@@ -151,13 +151,18 @@ PROBLEM = _section(
     ),
     Spec("exploration_variance", 0.0, 0.0, 1e300, nodes="T").means(
         "variance of exploratory actions, raised as measurement_noise requires, between two bounds to "
-        "four times at most; with action_bounds that of the widest range, and others in proportion; 0: "
+        "four times at most; of several the largest, and others in proportion to exploration_scale; 0: "
         "0.1, or the square of a quarter of half the range, less near a bound"
     ),
     Spec("exploration_mean", [], -1e300, 1e300, nodes="CT").means(
         "operating point around which actions are explored, one number for each actuator; empty: with "
         "action_bounds the cost's a_r if it is not 0, or their middle, two standard deviations inside "
         "if it is not one; without, 0"
+    ),
+    Spec("exploration_scale", [], 0.0, 1e300, nodes="CT").means(
+        "standard deviations of exploratory actions, one for each actuator; empty: those of "
+        "exploration_variance 0, and of a plant of your own in proportion to what its inputs do, "
+        "where those move its state too little, too far, or less than measurement_noise"
     ),
     Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
         "step size eta of two_point from the LQT warm start"

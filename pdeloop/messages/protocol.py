@@ -12,10 +12,10 @@ action comes from a controller that has the tuner's policy, model and target:
     s = -h(D, h(the parameters DESIGN))            in that of `model/identified`, as `time`
 
 with h the first 53 bits of BLAKE2b over the numbers as little-endian float64, and bounds the
-parameters action_limit, action_bounds and exploration_mean. Where the controller explores there is
-neither policy nor model. A simulated time is never negative, so a controller that echoes the state's
-time, or sends 0, differs from one that signs. It does not protect against an attacker who reads the
-messages and copies the number.
+parameters action_limit, action_bounds, exploration_mean and exploration_scale. Where the controller
+explores there is neither policy nor model. A simulated time is never negative, so a controller that
+echoes the state's time, or sends 0, differs from one that signs. It does not protect against an
+attacker who reads the messages and copies the number.
 """
 
 from __future__ import annotations
