@@ -99,20 +99,15 @@ def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | No
     columns = columns - mean
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale[:n_z] = np.sqrt(np.mean(scale[:n_z] ** 2))
-    found = _ridged(columns, change - moved, scale, ridge)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    columns = columns / scale
+    gram = columns.T @ columns / len(columns) + ridge * np.eye(len(scale))
+    moment = columns.T @ (change - moved) / len(columns)
+    found = np.linalg.solve(gram, moment) / scale[:, None]
     if not np.isfinite(found).all():
         return None
     A, B, constant = np.eye(n_z) + found[:n_z].T, found[n_z:].T, moved - mean @ found
     return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))
-
-
-def _ridged(columns: Array, values: Array, scale: Array, ridge: float) -> Array:
-    """The coefficients of columns, divided by their scales, that explain values best."""
-    scale = np.where(scale > 0.0, scale, 1.0)
-    columns = columns / scale
-    gram = columns.T @ columns / len(columns) + ridge * np.eye(len(scale))
-    found: Array = np.linalg.solve(gram, columns.T @ values / len(columns)) / scale[:, None]
-    return found
 
 
 def fit_convolution(
@@ -234,14 +229,9 @@ def fit_low_rank(samples: Samples, *, kind: str, most: int) -> ProjectedModel | 
     if not kept:
         return None
     V = np.linalg.qr(few.T @ mixtures[:, : min(kept, largest)])[0]
-    x, after = samples.before @ V, samples.after @ V
-    columns = np.hstack([x, samples.actions, np.ones((len(x), 1))])
-    found = _ridged(columns, after, np.sqrt(np.mean(columns**2, axis=0)), _LOW_RANK_RIDGE)
-    if not np.isfinite(found).all():
-        return None
-    r = V.shape[1]
-    parts = (found[:r].T, found[r : r + n_a].T, found[-1])
-    return ProjectedModel(LinearModel(kind, *map(np.ascontiguousarray, parts)), V.T, V)
+    steps = Samples(samples.before @ V, samples.actions, samples.after @ V)
+    inner = fit_linear(steps, kind=kind, ridge=_LOW_RANK_RIDGE)
+    return None if inner is None else ProjectedModel(inner, V.T, V)
 
 
 def fit_coarse(
