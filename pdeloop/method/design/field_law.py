@@ -177,28 +177,6 @@ def _cost(cost: float) -> str:
     return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
 
 
-def best_model(selection: Selection, trajectories: Sequence[Trajectory]) -> FittedModel | None:
-    """The model of the whole field that predicts trajectories best; None where there is none.
-
-    A target far outside of the data makes every error small, so a model that does not reproduce what
-    the data do is chosen again by that. The work grows with the third power of the size of the state,
-    so there is a largest one.
-    """
-    if len(selection.target) > LARGEST:
-        return None
-    known = [Measured(z, a) for z, a in trajectories]
-    folds = selection.settings.folds
-    found = selection.select([part for own in known for part in _spread(own, folds)])
-    if found is None or found.noise or found.near is not None:
-        return found
-    if found.error <= selection.accepted < found.own.simulated:
-        scale = scale_of([states for states, _ in trajectories])
-        again = selection.fit(found.rollouts, scale, by_scale=True)
-        if again is not None and again.own.simulated < found.own.simulated:
-            return replace(again, whole=found.whole)
-    return found
-
-
 def _spread(rollout: Measured, count: int) -> list[Measured]:
     """The rollout, or pieces that are spread over a long one evenly, of `_FIELD_STEPS` steps in all."""
     if len(rollout.actions) <= _FIELD_STEPS:
@@ -255,7 +233,9 @@ def field_law(
         shape=() if line or len(target) % math.prod(axes) else axes,
         weights=weights,
     )
-    fitted = best_model(selection, trajectories)
+    # The work grows with the third power of the size of the state, so there is a largest one.
+    parts = [part for z, a in trajectories for part in _spread(Measured(z, a), models.folds)]
+    fitted = selection.select(parts) if len(target) <= LARGEST else None
     if fitted is None or fitted.noise:
         return FieldLaw(fitted, noise=fitted.noise if fitted else 0.0)
     n_s, scale = other.U.shape[1], scale_of([states for states, _ in trajectories])

@@ -378,15 +378,13 @@ class Selection:
         first: str = "",
         *,
         linear: bool = False,
-        by_scale: bool = False,
         knows_noise: bool = False,
     ) -> FittedModel | None:
         """The model that predicts these rollouts, or None where none can be fitted.
 
         scale: of the errors `own` of the result, always of rollouts or pieces that it was not fitted
-        to, and with `by_scale` of E, in place of the distance to the target; first: kind to be tried
-        first, that of the last choice; linear, knows_noise: only linear models, or kinds that are
-        fitted for noise.
+        to; first: kind to be tried first, that of the last choice; linear, knows_noise: only linear
+        models, or kinds that are fitted for noise.
         """
         target, noise, settings, given = self.target, self.noise, self.settings, rollouts
         rollouts = [limited(rollout, self.action_set) for rollout in rollouts]
@@ -413,7 +411,6 @@ class Selection:
                 found = self.judged(kind, rollouts, least, settings, scale)
                 if found is not None:
                     error, own[kind] = found
-                    error = own[kind].simulated if by_scale else error
                     tried[kind] = error
                     if error <= settings.reproduced * (1.0 if kind.name == first else kind.enough):
                         break
