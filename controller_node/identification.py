@@ -198,9 +198,9 @@ def designed(
     trajectories: (states (N + 1, n_z), actions (N, n_a)) each; target (n_z,): z_r; settings: the order
     is lowered to the size of the state where that is smaller; further: other trajectories, for a model
     of the whole field alone: POD modes of several fields together are those of none; or_no_control:
-    gains of 0 where there are no stabilising ones; constant: whether regression and subspace models
-    have a constant term, None: as `needs_constant` says; innovations: the model of "subspace", where it
-    is known.
+    gains of 0 where there are no stabilising ones, or none that surely save anything; constant: whether
+    regression and subspace models have a constant term, None: as `needs_constant` says; innovations:
+    the model of "subspace", where it is known.
 
     ValueError where the data allow or determine no model of this order, or the model no stabilising
     gains and, for "field", that of the whole field no law.
@@ -305,6 +305,9 @@ def designed(
         if not (found.better or or_no_control):
             raise unsolved
     chosen = found.rows if found.better and found.rows else rows
+    if found.doubtful and or_no_control:
+        K_a = np.zeros(chosen.K_a.shape)
+        chosen = replace(chosen, K_a=K_a, K_b=K_a, b=None)
     return Designed(
         lqg.with_filter(chosen, trajectories, settings=settings.method) if filtered else chosen,
         found,

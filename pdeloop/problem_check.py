@@ -456,8 +456,8 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
             return
         if not rows.K_a.any():
             told = (
-                f"the model of order {len(rows.A)} has no stabilising gains: a training explores "
-                "again, or begins from no control"
+                f"the model of order {len(rows.A)} has no stabilising gains, or none that surely "
+                "save anything: a training explores again, or begins from no control"
             )
             yield Finding("first law", compared, told, note=compared)
             return

@@ -113,7 +113,8 @@ class Narration:
             if lost := sum(not row.get("stabilised", True) for row in rows):
                 count = "" if self._seeds == 1 else f" for {lost} of them"
                 told += (
-                    f"; it has no stabilising gains{count}, so the training begins from no control"
+                    f"; it has no stabilising gains, or none that surely save anything{count}, so the "
+                    "training begins from no control"
                 )
             return [told]
         if event == "evaluated":

@@ -21,7 +21,7 @@ from pdeloop.method.design.field_law import (
     states_under,
 )
 from pdeloop.method.design.lqt import DesignError, regulator
-from pdeloop.method.models import affine_law
+from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.finite_difference import features_of, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, FittedModel
@@ -136,6 +136,31 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     )
     rows, plain = (designed(noisy, target, how).rows for how in (field, settings("regression")))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
+
+
+@pytest.mark.parametrize(("strength", "error"), [(1.0, 0.2), (0.001, 0.2), (1.0, 1.0)])
+def test_a_saving_within_the_error_of_a_model_is_none(
+    strength: float, error: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The saving of a model that is not accepted, the more accurate of two that nothing else judges."""
+    true, target = plant(), np.zeros(N_Z)
+    model, noisy = replace(true, B=strength * true.B), [episode(true, noise=0.1)]
+    fitted = FittedModel(
+        model,
+        error,
+        [],
+        Accuracy(0.5, 0.5),
+        [Measured(*noisy[0])],
+        IdentificationSettings().field_error,
+    )
+    monkeypatch.setattr("pdeloop.method.design.field_law.best_model", lambda *_: fitted)
+    field = settings("field", **FEW_FITS)
+    begun, plain = (designed(noisy, target, field, or_no_control=own) for own in (True, False))
+    assert begun.field is not None and begun.field.judges == (model.kind,)
+    doubtful = (strength, error) != (1.0, 0.2)
+    assert begun.field.doubtful is begun.field.summary()["doubtful"] is doubtful
+    assert ("begins from no control" in begun.field.text()[-1]) is doubtful
+    assert begun.rows.policy.any() is not doubtful and plain.rows.policy.any()
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

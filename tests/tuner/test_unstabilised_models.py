@@ -44,7 +44,7 @@ def test_it_is_checked_as_no_control_and_explored_again(monkeypatch: pytest.Monk
     assert [row.get("stabilised") for row in rows] == [False, None, True, None]
     assert rows[1]["none"] == rows[1]["lqt"] and rows[1]["again"]
     (told,) = Narration(0, 1).lines(rows[0])
-    assert told.endswith("it has no stabilising gains, so the training begins from no control")
+    assert told.endswith("surely save anything, so the training begins from no control")
     assert "gains" not in Narration(0, 1).lines(rows[2])[0]
 
 

@@ -17,7 +17,8 @@ No model is the only judge of its own law. The model of the whole field and the 
 by their errors on parts of the data that they were not fitted to, relative to the variation of the data
 and to the error of the other one. Every accepted model predicts the cost of both laws, and the law with
 the lower of their worst predictions is used. Where neither is accepted, the model of the whole field is
-if it is the more accurate one. All errors are of numbers in units of their own variation.
+if it is the more accurate one, but what a law saves against no control may then be its error up to
+sqrt(E) of that cost. All errors are of numbers in units of their own variation.
 
 References
 ----------
@@ -92,7 +93,8 @@ class FieldLaw:
     of its law and of the law to compare with; infinite where there is none, or it diverges. regression:
     its accuracy, to compare with `fitted.own`. judges: the models that were accepted. remark: where the
     model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
-    where those are the first ones of trajectories alone; 0: all.
+    where those are the first ones of trajectories alone; 0: all. doubtful: whether the saving against no
+    control may be the error of a model that was not accepted.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
     declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
@@ -108,6 +110,7 @@ class FieldLaw:
     judges: tuple[str, ...] = ()
     remark: str = ""
     part: int = 0
+    doubtful: bool = False
 
     @property
     def better(self) -> bool:
@@ -131,6 +134,7 @@ class FieldLaw:
             "noise": self.noise,
             "predicted_cost": _number(self.cost),
             "predicted_cost_of_regression": _number(self.other_cost),
+            "doubtful": self.doubtful,
             "law": "field" if self.better else "regression",
         }
 
@@ -166,7 +170,13 @@ class FieldLaw:
             f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
         )
         by = f" by {' and '.join(self.judges)}, the worse one," if len(self.judges) > 1 else ""
-        return [*lines, f"  predicted mean stage cost{by} {costs}: {taken}"]
+        lines.append(f"  predicted mean stage cost{by} {costs}: {taken}")
+        if self.doubtful:
+            lines.append(
+                "  what it saves against no control may be the model's error: a training begins from "
+                "no control"
+            )
+        return lines
 
 
 def _number(cost: float) -> float | None:
@@ -252,7 +262,8 @@ def field_law(
     model, own = fitted.model, fitted.own
     accepted = _accepted([(model, own), (_whole(other), regression)], fitted.most)
     predicts = own.simulated < min(1.0, regression.simulated) and own.one_step < regression.one_step
-    if not accepted and predicts:  # more than nothing, and all of it better than the other one does
+    # More than nothing, and all of it better than the other one does.
+    if alone := not accepted and predicts:
         accepted = [model]
     elif fitted.error > fitted.most or (part and not predicts):
         accepted = [judge for judge in accepted if judge is not model]
@@ -291,8 +302,14 @@ def field_law(
             total += float(cost.at_end(states[-1:])[0][0])
         return total / (ahead * len(fields))
 
-    worst = [max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other)]
-    return replace(report, rows=rows, cost=worst[0], other_cost=worst[1], remark=remark)
+    still = replace(rows, K_a=0.0 * K_a, K_b=0.0 * rows.K_b)
+    mine, others, idle = (
+        max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other, still)
+    )
+    doubtful = alone and min(mine, others) >= (1.0 - math.sqrt(fitted.error)) * idle
+    return replace(
+        report, rows=rows, cost=mine, other_cost=others, remark=remark, doubtful=doubtful
+    )
 
 
 def _accepted(models: Sequence[tuple[FieldModel, Accuracy]], most: float) -> list[FieldModel]:
