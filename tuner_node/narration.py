@@ -157,16 +157,7 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         f"  mean stage cost with LQT         {cost('lqt')}",
         f"  mean stage cost after adaptation {cost('adapted')}",
     ]
-    none, lqt, adapted = (sum(summary["costs"][name]) for name in ("none", "lqt", "adapted"))
-    if comparable and not diverged["none"] and lqt >= none > 0:
-        share = 100 * (1 - adapted / none)
-        against = f"{abs(share):.1f} % {'less' if share >= 0 else 'more'} than"
-        if adapted == none:
-            against = "as much as"
-        lines.append(
-            "  the LQT law costs at least as much as no control; the adapted one costs "
-            f"{against} no control"
-        )
+    none, adapted = (sum(summary["costs"][name]) for name in ("none", "adapted"))
     if comparable and not diverged["none"] and 0 < none - adapted < LITTLE * none:
         share = f"{100 * (1 - adapted / none):.2g}"
         lines.append(
@@ -223,6 +214,21 @@ def _acting(summary: Row) -> list[str]:
     return lines
 
 
+def poor_laws(summary: Row) -> list[str]:
+    """First laws that cost more than no control, beyond chance, and what becomes of them."""
+    lines, costs = [], summary["costs"]
+    for m, own in enumerate(summary.get("outcome", [])):
+        known, none = own.get("lqt_against_none"), costs["none"][m]
+        if known and known["low"] > 0 and none > 0:
+            who = f"seed {summary['seed'] + m}: " if summary["seeds"] > 1 else ""
+            first, last = (f"{costs[name][m] / none:.3g}" for name in ("lqt", "adapted"))
+            lines.append(
+                f"{who}the first law costs {first} times what no control does, the returned one {last} "
+                "times"
+            )
+    return lines
+
+
 def mispredicted(summary: Row) -> list[str]:
     """What the model predicted of the last law and what was measured, where they are far apart."""
     lines, first, several = [], summary["seed"], summary["seeds"] > 1
@@ -241,7 +247,7 @@ def mispredicted(summary: Row) -> list[str]:
 
 
 def reasons(summary: Row) -> list[str]:
-    """Why seeds kept their first law, have no control, left rollouts over or were predicted wrongly."""
+    """Why seeds kept their first law or left rollouts over, and what first laws or models did badly."""
     kept: dict[str, list[int]] = {}
     early: dict[str, list[int]] = {}
     for m, (own, changed) in enumerate(
@@ -256,7 +262,7 @@ def reasons(summary: Row) -> list[str]:
         f"  {f'seed {_listed(seeds)}: ' if several else alone}{reason}"
         for alone, seeds_of in (("the optimiser says: ", kept), ("", early))
         for reason, seeds in seeds_of.items()
-    ] + [f"  {text}" for text in mispredicted(summary)]
+    ] + [f"  {text}" for text in (*poor_laws(summary), *mispredicted(summary))]
 
 
 def against_lqt(reduction: float) -> str:

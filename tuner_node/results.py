@@ -99,10 +99,13 @@ def _outcome(own: Mapping[str, Any]) -> bool:
     texts = own.get("verdict"), own.get("reason"), own.get("early", "")
     if not all(isinstance(text, str) for text in texts):
         return False
-    known = own.get("against_lqt")
-    return known is None or (
-        isinstance(known, dict)
-        and all(isinstance(known.get(name), int | float) for name in DIFFERENCE)
+    return all(
+        known is None
+        or (
+            isinstance(known, dict)
+            and all(isinstance(known.get(name), int | float) for name in DIFFERENCE)
+        )
+        for known in (own.get("against_lqt"), own.get("lqt_against_none"))
     )
 
 
@@ -159,7 +162,7 @@ def summarise(training: Training) -> dict[str, Any]:
     one it began with; noise: the measurement noise that was declared, what each optimiser found in its
     place, 0 where nothing else, and what readings seem to have where it found none; outcome: what came
     of each seed, and why, as its optimiser says, also why it left rollouts over; its difference from
-    LQT only if no rollout of either diverged, as the cost of such a one is a penalty.
+    LQT, and LQT's from no control, if no rollout of either diverged, as that has a penalty for a cost.
     """
     assert training.evaluation is not None and training.ended is not None
     lost = training.ended != COMPLETED
@@ -204,6 +207,9 @@ def summarise(training: Training) -> dict[str, Any]:
                     difference(costs[m, LQT], costs[m, ADAPTED])
                     if moved and comparable[m]
                     else None
+                ),
+                "lqt_against_none": (
+                    None if lost[m, :ADAPTED].any() else difference(costs[m, 0], costs[m, LQT])
                 ),
             }
             for m, moved in enumerate(changed)

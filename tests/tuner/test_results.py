@@ -18,12 +18,15 @@ def test_a_rollout_that_diverged_is_compared_with_nothing() -> None:
     training = build_training(values)
     train(training, LocalPair(values), lambda row: None)
     assert training.ended is not None and training.evaluation is not None
-    assert summarise(training)["outcome"][0]["against_lqt"] is not None
-    for name in ("lqt", "adapted"):
-        i = EVALUATED.index(name)
+    pairs = {"against_lqt": ("lqt", "adapted"), "lqt_against_none": ("none", "lqt")}
+    own = summarise(training)["outcome"][0]
+    none, lqt = (training.evaluation[0, EVALUATED.index(name)] for name in ("none", "lqt"))
+    assert own["lqt_against_none"] == difference(none, lqt) and own["against_lqt"] is not None
+    for i, name in enumerate(EVALUATED):
         before = training.ended[0, i, 0]
         training.ended[0, i, 0] = 7  # the step at which it did
-        assert summarise(training)["outcome"][0]["against_lqt"] is None
+        own = summarise(training)["outcome"][0]
+        assert {of: own[of] is None for of in pairs} == {of: name in pairs[of] for of in pairs}
         training.ended[0, i, 0] = before
 
 
