@@ -13,7 +13,7 @@ COSTLIER = 3
 LITTLE = 0.05
 """Share of the cost without control; a law that saves less of it hardly controls."""
 FAR_OFF = 0.2
-"""Difference of a predicted cost from the measured one, relative to that, which is told."""
+"""Error of predicted costs, relative to the mean of measured ones, which is told."""
 REPEATS = 1e-6
 """Relative difference of the costs of one law on the same fields that is no rounding."""
 IDLE = (
@@ -236,14 +236,20 @@ def mispredicted(summary: Row) -> list[str]:
         rows = [row for row in summary.get("history", []) if row.get("seed") == seed]
         judged = [row for row in rows if row.get("role") == "judging"] or [{}]
         cost, predicted = judged[-1].get("cost"), judged[-1].get("predicted")
-        if cost and predicted and abs(predicted - cost) > FAR_OFF * cost:
+        if cost and predicted and (off := _missed(judged[-1]) / cost) > FAR_OFF:
             who = f"seed {seed}: " if several else ""
             lines.append(
-                f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g}: "
-                "the model does not hold where that law leads; train with more rollouts, and declare "
-                "measurement_noise if there is noise"
+                f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g} "
+                f"(rollouts are missed by {100 * off:.2g} % of that): the model does not hold where it "
+                "leads; train with more rollouts, and declare measurement_noise if there is noise"
             )
     return lines
+
+
+def _missed(row: Row) -> float:
+    """By how much a model missed costs: each one, or, of a chaotic plant, their mean."""
+    off: float = row.get("missed", abs(row["predicted"] - row["cost"]))
+    return off
 
 
 def reasons(summary: Row) -> list[str]:

@@ -134,6 +134,27 @@ def test_the_known_optimum_of_a_linear_quadratic_plant_is_reached() -> None:
         assert row["predicted"] == pytest.approx(row["cost"], rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("costs", "missed"), [((1.0, 1.0, 1.0), 0.0), ((0.8, 0.8, 0.8), 0.25), ((0.7, 1.3, 1.0), 0.25)]
+)
+def test_a_law_is_renewed_at_once_where_its_costs_were_mispredicted(
+    costs: tuple[float, ...], missed: float
+) -> None:
+    """Whether they are lower, or only their mean is as predicted."""
+    plant = Plant()
+    optimizer = make(plant)
+    optimizer.tell(measured(plant, optimizer))
+    mean = np.mean([result.cost for result in measured(plant, optimizer)])
+    row = optimizer.tell(
+        [
+            replace(result, cost=result.cost + (share - 1.0) * mean)
+            for result, share in zip(measured(plant, optimizer), costs, strict=True)
+        ]
+    )
+    assert row["missed"] / row["cost"] == pytest.approx(missed, abs=0.01)
+    assert ("fraction" in row) is bool(missed)
+
+
 def test_the_best_law_is_kept() -> None:
     plant = Plant()
     optimizer = make(plant, share=1.0)

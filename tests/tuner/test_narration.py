@@ -230,11 +230,15 @@ def test_a_law_that_costs_more_than_its_model_predicts_is_said() -> None:
     own = {"verdict": "better", "reason": "it is better"}
     earlier = judged | {"role": "renewing", "predicted": 1.0}
     alone = summary(seed=7, seeds=1, changed=[True], outcome=[own], history=[earlier, judged])
-    told = "of the last law the model predicts 303, the plant shows 3044"
+    told = "of the last law the model predicts 303, the plant shows 3044 (rollouts are missed by"
     assert any(line.startswith(f"  {told}") for line in closing_lines("kdv", alone, ""))
     both = summary(seed=7, changed=[True, True], outcome=[own, own], history=[judged, right])
     lines = [line for line in closing_lines("kdv", both, "") if "the plant shows" in line]
     assert len(lines) == 1 and lines[0].startswith(f"  seed 7: {told}")
+    single = {"cost": 28.61, "predicted": 23.46, "missed": 6.7}  # though the means differ by less
+    alone = summary(seed=7, seeds=1, changed=[True], outcome=[own], history=[judged | single])
+    told = "predicts 23.46, the plant shows 28.61 (rollouts are missed by 23 % of that)"
+    assert any(told in line for line in closing_lines("kdv", alone, ""))
     fine = summary(seed=8, seeds=1, changed=[True], outcome=[own], history=[earlier, right])
     assert not any("the plant shows" in line for line in closing_lines("kdv", fine, ""))
 

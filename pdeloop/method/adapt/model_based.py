@@ -70,7 +70,7 @@ _REACH = 3.0
 _NONE_ROLLOUTS = 2
 """Rollouts without control on fields of the first law, where no model tells what they cost."""
 _FAR_OFF = 0.1
-"""Share of a measured cost by which it exceeds the predicted one where the law is renewed at once."""
+"""Share of measured costs by which predicted ones miss them where the law is renewed at once."""
 _REPEATS = 1e-9
 """Relative difference of the costs of one law up to which its rollouts are the same one."""
 _TRIES = 8
@@ -366,17 +366,13 @@ class ModelBased(Optimizer):
             row = self._measured(added)
             if self._progress.stage != RENEWING:
                 self._judge(row)
-            elif (
-                self._progress.replayed
-                or self._records.count >= due
-                or _is_worse_than_predicted(row)
-            ):
+            elif self._progress.replayed or self._records.count >= due or _is_mispredicted(row):
                 self._renew(row)
         diverged = sum(not result.usable for result in results)
         return row | {"rollouts": self._records.count, "diverged": diverged}
 
     def _next_renewal(self) -> int:
-        """Own rollouts after which the law is renewed next, unless it costs more than predicted."""
+        """Own rollouts after which the law is renewed next, unless its costs were mispredicted."""
         own, known = self._records.count, self._measurements()
         if self._repeats:
             return min(own + 1, self._schedule.last)
@@ -432,7 +428,10 @@ class ModelBased(Optimizer):
         return Rollout(policy.copy(), field_seed(self._seed, number))
 
     def _measured(self, added: Sequence[Record]) -> Row:
-        """The mean cost of some rollouts, and the model's earlier prediction of it."""
+        """The mean cost of some rollouts, and the model's earlier prediction of it.
+
+        And the root mean square by which it missed each of them, unless the plant is chaotic.
+        """
         row: Row = {"role": self._progress.stage}
         if self._progress.replayed:
             added = of_law(added, self._progress.policy)
@@ -441,6 +440,9 @@ class ModelBased(Optimizer):
         predicted = self._predicted(added)
         if predicted and np.isfinite(predicted).all():
             row["predicted"] = float(np.mean(predicted))
+            if "cost" in row and not self._is_chaotic:
+                missed = np.array([record.cost for record in added]) - predicted
+                row["missed"] = float(np.sqrt(np.mean(missed**2)))
         return row
 
     def _predicted(self, added: Sequence[Record]) -> list[float]:
@@ -449,6 +451,14 @@ class ModelBased(Optimizer):
             return []
         loop = self._progress.belief.loop(self._context)
         return [loop.predicted(record) for record in added]
+
+    @property
+    def _is_chaotic(self) -> bool:
+        """True if the model predicts no single cost."""
+        belief = self._progress.belief
+        if belief is None or not belief.whole:
+            return True
+        return renewal.is_chaotic(belief.loop(self._context), self.fields)
 
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""
@@ -676,7 +686,8 @@ class ModelBased(Optimizer):
         self._records.restore(state, *sizes, shape)
 
 
-def _is_worse_than_predicted(row: Row) -> bool:
-    """True if rollouts diverged, or cost far more than the model said."""
+def _is_mispredicted(row: Row) -> bool:
+    """True if rollouts diverged, or cost far else than the model said; of a chaotic plant, far more."""
     cost = float(row.get("cost", np.inf))
-    return not cost - float(row.get("predicted", cost)) <= _FAR_OFF * abs(cost)
+    off = float(row.get("missed", cost - float(row.get("predicted", cost))))
+    return not off <= _FAR_OFF * abs(cost)

@@ -93,8 +93,8 @@ class FieldLaw:
     of its law and of the law to compare with; infinite where there is none, or it diverges. regression:
     its accuracy, to compare with `fitted.own`. judges: the models that were accepted. remark: where the
     model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
-    where those are the first ones of trajectories alone; 0: all. doubtful: whether the saving against no
-    control may be the error of a model that was not accepted.
+    where those are the first ones of trajectories alone; 0: all. doubtful: whether what it saves
+    against no control may be the error of a model that was not accepted.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
     declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
