@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from typing import Any
@@ -314,6 +315,11 @@ def designed(
     )
 
 
+def _unpredicted(made: Designed) -> float:
+    """The error of its regression on parts of the data that were held out."""
+    return made.field.regression.simulated if made.field else np.inf
+
+
 def design_each(
     states: NDArray[np.float64],
     actions: NDArray[np.float64],
@@ -326,7 +332,8 @@ def design_each(
     Environments of one model have one design in common. A model without stabilising gains has gains of
     0: a training can explore again, or begin from no control. Where the actions act late
     (`study_delays`), a law with a filter has the last ones in its state; the identification "subspace"
-    knows them anyway. A small state is not reduced unless an order is asked for.
+    knows them anyway. A small state is not reduced unless an order is asked for, or no model is
+    accepted and the one of the suggested order predicts better.
 
     states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
     to.
@@ -349,8 +356,11 @@ def design_each(
             first, *further = [(states[:, m], actions[:, m]) for m in own]
             design = partial(designed, [first], target, further=further, or_no_control=True)
             try:
-                rows = design(whole).rows
+                made = design(whole)
             except ValueError:  # the data do not determine all of a small state
-                rows = design(settings).rows
-            found[number] = pack(rows)
+                made = design(settings)
+            if whole is not settings and made.field and not made.field.judges:
+                with suppress(ValueError):  # that of fewer modes may predict better
+                    made = min(made, design(settings), key=_unpredicted)
+            found[number] = pack(made.rows)
     return np.stack([found[number] for number in numbers])

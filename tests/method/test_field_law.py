@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.identification import DesignSettings, design_each, designed
+from controller_node.identification import Designed, DesignSettings, design_each, designed
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows, unpack
@@ -310,6 +310,29 @@ def test_a_law_of_the_suggested_order_senses_what_all_actuators_need() -> None:
     for _ in range(200):
         rest = ROD @ rest + HEATERS @ (best.K_a @ rest + best.K_b @ target[:4])
     np.testing.assert_allclose(z[:4], rest, atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("judges", "whole", "reduced", "order"),
+    [((), 0.83, 0.74, 2), ((), 0.81, 0.94, 3), (("linear",), 0.83, 0.74, 3)],
+)
+def test_a_small_state_is_reduced_where_no_model_is_accepted_and_that_predicts_better(
+    judges: tuple[str, ...],
+    whole: float,
+    reduced: float,
+    order: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def made(_: object, target: Array, known: DesignSettings, **__: object) -> Designed:
+        n_s, own = (3, whole) if known.reduced_order else (2, reduced)
+        basis, gains = np.eye(3)[:, :n_s], np.ones((1, n_s))
+        rows = ModelRows(np.eye(n_s), gains.T, basis, gains, gains, gains[0])
+        return Designed(rows, FieldLaw(None, regression=Accuracy(own, own), judges=judges))
+
+    monkeypatch.setattr("controller_node.identification.designed", made)
+    known = replace(settings("field"), n_a=1, reduced_order=0)
+    rows = design_each(np.zeros((5, 1, 3)), np.zeros((4, 1, 1)), [0], np.zeros(3), known)
+    assert rows.shape[2] == order
 
 
 def test_what_costs_nothing_is_linearised_where_it_was_measured() -> None:
