@@ -24,7 +24,7 @@ from pdeloop.method.design.lqt import DesignError, regulator
 from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.finite_difference import features_of, of_features
 from pdeloop.method.models.linear import LinearModel
-from pdeloop.method.models.selection import Accuracy, FittedModel
+from pdeloop.method.models.selection import Accuracy, FittedModel, Selection
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import IdentificationSettings, ReducedModel
 from tests.support.small import FEW_FITS
@@ -153,7 +153,7 @@ def test_a_saving_within_the_error_of_a_model_is_none(
         [Measured(*noisy[0])],
         IdentificationSettings().field_error,
     )
-    monkeypatch.setattr("pdeloop.method.design.field_law.best_model", lambda *_: fitted)
+    monkeypatch.setattr(Selection, "select", lambda *_: fitted)
     field = settings("field", **FEW_FITS)
     begun, plain = (designed(noisy, target, field, or_no_control=own) for own in (True, False))
     assert begun.field is not None and begun.field.judges == (model.kind,)
