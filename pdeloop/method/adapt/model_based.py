@@ -430,7 +430,7 @@ class ModelBased(Optimizer):
     def _measured(self, added: Sequence[Record]) -> Row:
         """The mean cost of some rollouts, and the model's earlier prediction of it.
 
-        And the root mean square by which it missed each of them, unless the plant is chaotic.
+        And the root mean square by which it missed each of them, if it predicts them.
         """
         row: Row = {"role": self._progress.stage}
         if self._progress.replayed:
@@ -440,7 +440,7 @@ class ModelBased(Optimizer):
         predicted = self._predicted(added)
         if predicted and np.isfinite(predicted).all():
             row["predicted"] = float(np.mean(predicted))
-            if "cost" in row and not self._is_chaotic:
+            if "cost" in row and not self._predicts_means:
                 missed = np.array([record.cost for record in added]) - predicted
                 row["missed"] = float(np.sqrt(np.mean(missed**2)))
         return row
@@ -453,10 +453,10 @@ class ModelBased(Optimizer):
         return [loop.predicted(record) for record in added]
 
     @property
-    def _is_chaotic(self) -> bool:
-        """True if the model predicts no single cost."""
+    def _predicts_means(self) -> bool:
+        """True if the model predicts no single costs: the plant is chaotic, or readings are few."""
         belief = self._progress.belief
-        if belief is None or not belief.whole:
+        if belief is None or not belief.whole or self._context.of_readings:
             return True
         return renewal.is_chaotic(belief.loop(self._context), self.fields)
 
@@ -687,7 +687,7 @@ class ModelBased(Optimizer):
 
 
 def _is_mispredicted(row: Row) -> bool:
-    """True if rollouts diverged, or cost far else than the model said; of a chaotic plant, far more."""
+    """True if rollouts diverged, or cost far else than the model said, or more, of means."""
     cost = float(row.get("cost", np.inf))
     off = float(row.get("missed", cost - float(row.get("predicted", cost))))
     return not off <= _FAR_OFF * abs(cost)
