@@ -359,7 +359,8 @@ def design_each(
                 made = design(whole)
             except ValueError:  # the data do not determine all of a small state
                 made = design(settings)
-            if whole is not settings and made.field and not made.field.judges:
+            unknown = made.field is not None and not made.field.judges and not settings.sensors
+            if whole is not settings and unknown:
                 with suppress(ValueError):  # that of fewer modes may predict better
                     made = min(made, design(settings), key=_unpredicted)
             found[number] = pack(made.rows)
