@@ -326,23 +326,23 @@ def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: flo
 
 
 def least_trusting(
-    loop: SensedLoop, best: Array, fields: Array, settings: ModelBasedSettings
-) -> Array:
+    loop: SensedLoop, best: Array, costs: Array, fields: Array, settings: ModelBasedSettings
+) -> tuple[Array, Array]:
     """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
-    Simulated plants follow the filter's equation: what trusts it looks too good.
+    With its costs. Simulated plants follow the filter's equation: what trusts it looks too good.
     """
-    law, costs = loop.kalman, loop.costs(best, fields)
-    known = np.isfinite(costs)
+    law, known = loop.kalman, np.isfinite(costs)
     if not known.any():
-        return best
+        return best, costs
     most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
         noise = np.array([noise_of_filter(loop.model, settings, times)])
         other = law.vector({**law.parts(best), "noise": noise})
-        if loop.costs(other, fields)[known].mean() <= most:
-            return other
-    return best
+        found = loop.costs(other, fields)
+        if found[known].mean() <= most:
+            return other, found
+    return best, costs
 
 
 def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:
