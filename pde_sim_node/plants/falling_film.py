@@ -104,13 +104,6 @@ class FallingFilm(Dynamics):
         self.supports[n : 2 * n] = self.shapes
         self._start: Array | None = None
 
-    def readings(self, z: Array) -> Array:
-        """q at the ten points x_j - 10 .. x_j - 1 before each jet, (M, n, 10)."""
-        before = np.round(np.arange(10, 0, -1) / self.dx).astype(int)
-        places = np.array(self.first)[:, None] - before
-        found: Array = z[:, self.points + places]
-        return found
-
     def mean_state(self) -> Array:
         """The film whose waves have developed without jets."""
         if self._start is None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.tasks.falling_film import proportional, seen
 from pde_sim_node.plants.falling_film import FallingFilm, fall
 
 
@@ -74,7 +75,15 @@ def test_noise_is_that_of_the_state_and_an_episode_of_its_seed() -> None:
     pair = np.stack([first, other])
     stepped = plant.step(pair, np.zeros((2, 5)))
     assert np.array_equal(stepped[:1], plant.step(pair[:1], _none(plant)))
-    assert plant.readings(pair).shape == (2, 5, 10)
+
+
+def test_a_training_sees_the_flow_rates_before_each_jet_and_behind_the_last() -> None:
+    film = FallingFilm()
+    z = np.zeros((1, film.n_z))
+    z[0, film.points : 2 * film.points] = film.dx * np.arange(film.points)
+    q = seen(z)
+    assert np.allclose(q[0], np.arange(140, 200))
+    assert np.allclose(proportional(2.0, 3)(0, q), 2.0 * (np.arange(147, 197, 10) - 1.0))
 
 
 def test_unusable_arguments_are_named() -> None:
