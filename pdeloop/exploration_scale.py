@@ -34,8 +34,9 @@ LITTLE, MODERATE, FAR = 0.01, 0.3, 10.0
 """Shares: too small to explore with, that of a scaled input, too large."""
 SHORT = 10
 """Steps after which an input that changes the state enough is known to do so."""
-TRIALS, MOST = 6, 1e3
-"""Sizes of an input that are tried, and the largest factor from one to the next."""
+TRIALS, MOST, DEAD = 10, 1e3, 30.0
+"""Sizes of an input that are tried, the largest factor from one to the next, and the factor where
+nothing moves: it may be a dead band."""
 RESTS = 1e-9
 """Distance of a state from the target, in units of the divergence bound, that rounding explains."""
 
@@ -89,22 +90,27 @@ class Responses:
         weights = np.diag(self._plant.cost.action_matrix)
         widest = np.where(self._two, WIDER * admissible.exploration_variance, np.inf) ** 0.5
         for j in np.flatnonzero(free | bool(noise)).tolist():
-            low, high = LITTLE, FAR
+            low, high, dead = LITTLE, FAR, 0.0
             for _ in range(TRIALS):
                 share, distance = self.share(j, found[j])
                 most = distance / np.sqrt(weights[j])
-                if not free[j] or not share or low <= share <= high:
+                if not free[j] or np.isnan(share) or low <= share <= high:
                     break
-                if share < LITTLE and most * share < LITTLE * found[j]:  # no law would use it
-                    found[j] = own[j]
-                    break
-                factor = 0.1 if np.isinf(share) else np.clip(MODERATE / share, 1.0 / MOST, MOST)
-                found[j] = min(factor * found[j], most)
+                if share < LITTLE and most <= found[j] * (LITTLE / share if share else 1.0):
+                    break  # no law would use it
                 low, high = 0.9 * MODERATE, 1.1 * MODERATE
+                if share == 0.0:
+                    dead = found[j]
+                    found[j] = min(DEAD * dead, most)
+                    continue
+                factor = 0.1 if np.isinf(share) else np.clip(MODERATE / share, 1.0 / MOST, MOST)
+                found[j] = min(dead + factor * (found[j] - dead), most)
+            if share < LITTLE:
+                found[j] = own[j]
             if noise and (gain := self.gain(j, found[j])):
                 steps = self._plant.horizon
                 least = least_variance(noise=noise, steps=steps, sample_time=gain, width=1.0, n_z=1)
-                most = found[j] / min(share, 1.0) if share else np.inf
+                most = found[j] / min(share, 1.0) if share > 0.0 else np.inf
                 most = min(most, widest[j] * admissible.exploration_scale[j])
                 found[j] = max(found[j], min(np.sqrt(least), most))
         return np.full_like(found, np.median(found)) if admissible.zero_mean else found
@@ -112,10 +118,10 @@ class Responses:
     def share(self, j: int, size: float) -> tuple[float, float]:
         """s_j of an input held at this size, and the distance that it is relative to.
 
-        inf: the plant diverges with it alone, in less than half the time; 0: nothing is known, as the
+        inf: the plant diverges with it alone, in less than half the time; NaN: nothing is known, as the
         state is at the target.
         """
-        cost, share, distance = self._plant.cost, 0.0, 0.0
+        cost, share, distance = self._plant.cost, np.nan, 0.0
         for steps in (SHORT, self._plant.horizon):
             if steps not in self._still:
                 self._still[steps] = self._held(self._actions(), steps)

@@ -310,7 +310,7 @@ def _responses(plant: Plant, values: Mapping[str, Any]) -> Iterator[Finding]:
     responses = Responses(plant, default)
     for j in np.flatnonzero(~np.isfinite(default.high - default.low)).tolist():
         share, _ = responses.share(j, own[j])
-        if not share or LITTLE <= share <= FAR:
+        if np.isnan(share) or LITTLE <= share <= FAR:
             continue
         does = f"changes the state by {share:.1g} of its distance from the target"
         told = (

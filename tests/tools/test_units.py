@@ -93,6 +93,19 @@ def test_the_check_says_which_input_hardly_moves_the_state() -> None:
     assert told_of_given.endswith("write the input in another unit, or set exploration_scale")
 
 
+class Sticky(Room):
+    """The same with a heater that needs 300 W at least, and a flow that does nothing."""
+
+    def step(self, z: Any, a: Any) -> Any:
+        heat = np.maximum(a[0] * self._unit[0] - 300.0, 0.0)
+        return super().step(z, np.array([heat, 0.0]) / self._unit)
+
+
+def test_a_dead_band_is_left_and_an_input_without_effect_is_not_scaled() -> None:
+    heat, flow = pdeloop.problem(plant=Sticky()).values["exploration_scale"]
+    assert 3.2 < heat < 4.0 and flow == pytest.approx(0.316, rel=1e-2)
+
+
 def test_given_standard_deviations_are_those_of_the_actions() -> None:
     mixed = ActionSet(
         3, [0.0, -1.0, -np.inf], [np.inf, 1.0, np.inf], exploration_scale=[50.0, 0.2, 3.0]
