@@ -320,6 +320,14 @@ def _unpredicted(made: Designed) -> float:
     return made.field.regression.simulated if made.field else np.inf
 
 
+def _of_all(rows: ModelRows, few: ModelRows) -> ModelRows:
+    """The law of a model of few modes, K z = K_r U_r^T z, on the modes of another one."""
+    if few.L is not None or rows.L is not None:
+        return few
+    onto = few.U.T @ rows.U
+    return replace(rows, K_a=few.K_a @ onto, K_b=few.K_b @ onto)
+
+
 def design_each(
     states: NDArray[np.float64],
     actions: NDArray[np.float64],
@@ -332,8 +340,9 @@ def design_each(
     Environments of one model have one design in common. A model without stabilising gains has gains of
     0: a training can explore again, or begin from no control. Where the actions act late
     (`study_delays`), a law with a filter has the last ones in its state; the identification "subspace"
-    knows them anyway. A small state is not reduced unless an order is asked for, or no model is
-    accepted and the one of the suggested order predicts better.
+    knows them anyway. A small state is not reduced unless an order is asked for; where no model is
+    accepted and the one of the suggested order predicts better, its law is the first one of the whole
+    state.
 
     states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
     to.
@@ -362,6 +371,8 @@ def design_each(
             unknown = made.field is not None and not made.field.judges and not settings.sensors
             if whole is not settings and unknown:
                 with suppress(ValueError):  # that of fewer modes may predict better
-                    made = min(made, design(settings), key=_unpredicted)
+                    other = design(settings)
+                    if _unpredicted(other) < _unpredicted(made):
+                        made = replace(made, rows=_of_all(made.rows, other.rows))
             found[number] = pack(made.rows)
     return np.stack([found[number] for number in numbers])

@@ -313,14 +313,14 @@ def test_a_law_of_the_suggested_order_senses_what_all_actuators_need() -> None:
 
 
 @pytest.mark.parametrize(
-    ("judges", "whole", "reduced", "order"),
+    ("judges", "whole", "reduced", "gains_of"),
     [((), 0.83, 0.74, 2), ((), 0.81, 0.94, 3), (("linear",), 0.83, 0.74, 3)],
 )
-def test_a_small_state_is_reduced_where_no_model_is_accepted_and_that_predicts_better(
+def test_the_law_of_few_modes_is_taken_where_no_model_is_accepted_and_they_predict_better(
     judges: tuple[str, ...],
     whole: float,
     reduced: float,
-    order: int,
+    gains_of: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def made(_: object, target: Array, known: DesignSettings, **__: object) -> Designed:
@@ -331,8 +331,11 @@ def test_a_small_state_is_reduced_where_no_model_is_accepted_and_that_predicts_b
 
     monkeypatch.setattr("controller_node.identification.designed", made)
     known = replace(settings("field"), n_a=1, reduced_order=0)
-    rows = design_each(np.zeros((5, 1, 3)), np.zeros((4, 1, 1)), [0], np.zeros(3), known)
-    assert rows.shape[2] == order
+    (rows,) = design_each(np.zeros((5, 1, 3)), np.zeros((4, 1, 1)), [0], np.zeros(3), known)
+    law = unpack(rows, n_a=1)
+    assert law.U.shape == (3, 3)  # which an adaptation may need all of
+    assert np.array_equal(law.K_a[0], np.arange(3) < gains_of)
+    assert np.array_equal(law.K_b, law.K_a)
 
 
 def test_what_costs_nothing_is_linearised_where_it_was_measured() -> None:
