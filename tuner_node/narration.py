@@ -14,6 +14,8 @@ LITTLE = 0.05
 """Share of the cost without control; a law that saves less of it hardly controls."""
 FAR_OFF = 0.2
 """Error of predicted costs, relative to the mean of measured ones, which is told."""
+ALONG = "steps along measured ones"
+"""What a reason of the history ends with where no model served."""
 REPEATS = 1e-6
 """Relative difference of the costs of one law on the same fields that is no rounding."""
 IDLE = (
@@ -246,6 +248,22 @@ def mispredicted(summary: Row) -> list[str]:
     return lines
 
 
+def unmodelled(summary: Row) -> list[str]:
+    """Seeds whose last law was improved along measured rollouts alone, and why."""
+    lines, first, several = [], summary["seed"], summary["seeds"] > 1
+    for seed in range(first, first + summary["seeds"]):
+        rows = [row for row in summary.get("history", []) if row.get("seed") == seed]
+        renewed = [row for row in rows if row.get("role") == "renewing"] or [{}]
+        why, _, how = str(renewed[-1].get("reason", "")).partition(": ")
+        if how == ALONG:
+            who = f"seed {seed}: " if several else ""
+            lines.append(
+                f"{who}{why}, so it was improved by {how} alone: explore less far "
+                "(exploration_variance), where a model may hold, or train with more rollouts"
+            )
+    return lines
+
+
 def _missed(row: Row) -> float:
     """By how much a model missed costs: each one, or, of a chaotic plant, their mean."""
     off: float = row.get("missed", abs(row["predicted"] - row["cost"]))
@@ -268,7 +286,9 @@ def reasons(summary: Row) -> list[str]:
         f"  {f'seed {_listed(seeds)}: ' if several else alone}{reason}"
         for alone, seeds_of in (("the optimiser says: ", kept), ("", early))
         for reason, seeds in seeds_of.items()
-    ] + [f"  {text}" for text in (*poor_laws(summary), *mispredicted(summary))]
+    ] + [
+        f"  {text}" for text in (*poor_laws(summary), *mispredicted(summary), *unmodelled(summary))
+    ]
 
 
 def against_lqt(reduction: float) -> str:

@@ -32,7 +32,14 @@ from pdeloop.study.results import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
-from tuner_node.narration import differences, misjudged_noise, mispredicted, poor_laws, span
+from tuner_node.narration import (
+    differences,
+    misjudged_noise,
+    mispredicted,
+    poor_laws,
+    span,
+    unmodelled,
+)
 from tuner_node.run_folder import RunFolderError
 
 PIXELS_PER_INCH = 115
@@ -249,7 +256,8 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
         which = f"{count} of {len(outcome)} seeds" if len(outcome) > 1 else "outcome"
         said.append(f"{which}: {own['verdict']}" + f" ({own['reason']})" * bool(own["reason"]))
     said += dict.fromkeys(own["early"] for own in outcome if own.get("early"))
-    said += poor_laws(problem.runs[best].result) + mispredicted(problem.runs[best].result)
+    for told in (poor_laws, mispredicted, unmodelled):
+        said += told(problem.runs[best].result)
     return problem.name, cost_text(cost), "; ".join(said)
 
 

@@ -13,7 +13,7 @@ from pdeloop.in_process import LocalPair
 from tests.support.small import parameters
 from tests.support.training_summary import summary
 from tuner_node.build import build_training
-from tuner_node.narration import Narration, closing_lines, failed, warnings
+from tuner_node.narration import ALONG, Narration, closing_lines, failed, warnings
 from tuner_node.rollouts import CHECK
 
 
@@ -241,6 +241,21 @@ def test_a_law_that_costs_more_than_its_model_predicts_is_said() -> None:
     assert any(told in line for line in closing_lines("kdv", alone, ""))
     fine = summary(seed=8, seeds=1, changed=[True], outcome=[own], history=[earlier, right])
     assert not any("the plant shows" in line for line in closing_lines("kdv", fine, ""))
+
+
+def test_that_no_model_served_in_the_end_is_said() -> None:
+    why = "no model of the whole field predicts the rollouts"
+    row = {"event": "adapted", "seed": 7, "role": "renewing", "reason": f"{why}: {ALONG}"}
+    own = {"verdict": "better", "reason": "it is better"}
+
+    def told(*history: dict[str, Any]) -> list[str]:
+        alone = summary(seed=7, seeds=1, changed=[True], outcome=[own], history=list(history))
+        return [line for line in closing_lines("kdv", alone, "") if ALONG in line]
+
+    (line,) = told(row)
+    assert line.startswith(f"  {why}, so it was improved by {ALONG} alone: explore less far")
+    modelled = {name: row[name] for name in ("event", "seed", "role")}
+    assert told(row, modelled) == []
 
 
 def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_law() -> None:
