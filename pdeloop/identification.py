@@ -123,8 +123,9 @@ class Identified:
         if loop is not None and loop.left > FAR:
             found.append(
                 f"on the model the law ends with {100 * loop.left:.3g} % of the distance to the target "
-                "left: the actuators hardly reach it, or the model is wrong; take a target that they "
-                "reach, a lower action_weight, or a log that comes nearer to the target"
+                "left: R a^2, which counts from a = 0, costs more than that distance, the actuators "
+                "hardly reach it, or the model is wrong; lower --action-weight, take a target that "
+                "they reach, or a log that comes nearer to it"
             )
         mean, spread = self.trajectory[0].mean(axis=0), self.trajectory[0].std(axis=0)
         set_off = (np.abs(mean) > OFFSET * spread) & (spread > 0.0)
@@ -289,7 +290,10 @@ class Identified:
             more = "" if self.model.b is None else " + b"
             law = f"a = K_a x + K_b s_r{more}, x = p + L (U^T z - p), and then p = A x + B a{drift}"
             names += "; p = U^T z at first"
-        return [*loop.text(self.sample_time), f"to apply the law elsewhere: {law}{every}{names}"]
+        return [
+            *loop.text(self.channels, self.sample_time),
+            f"to apply the law elsewhere: {law}{every}{names}",
+        ]
 
 
 def _finite(value: float) -> float | None:

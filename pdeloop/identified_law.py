@@ -10,6 +10,7 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.reduce.channels import SHOWN, Channels
 
 SETTLED = 0.05
 """Share of the way from the first to the last state within which the loop counts as settled."""
@@ -17,6 +18,8 @@ DECAYED = 1e-3
 """Remaining share of the closed loop's slowest mode at the end of a long enough simulation."""
 LONGEST = 10
 """Times as many steps as the recorded trajectory that are simulated at most."""
+BEYOND = 0.01
+"""Share of the recorded range of an action that it may leave it by."""
 _OVERFLOW = 1e100
 
 
@@ -25,7 +28,7 @@ class ClosedLoop:
     """The law on the model, from the first recorded state.
 
     states (N + 1, n_z): U s_k; actions (N, n_a); target (n_z,); radius: spectral radius of A + B K_a;
-    recorded: largest magnitude of each recorded action, (n_a,).
+    recorded: the lowest and the highest recorded value of each action, (2, n_a).
     """
 
     states: Array
@@ -54,22 +57,36 @@ class ClosedLoop:
             "steps": len(self.actions),
             "settled_step": self.settled,
             "distance_left": self.left if np.isfinite(self.left) else None,
-            "largest_actions": np.abs(self.actions).max(axis=0).tolist(),
-            "largest_recorded_actions": self.recorded.tolist(),
+            "action_range": self.taken.tolist(),
+            "recorded_range": self.recorded.tolist(),
         }
 
-    def text(self, sample_time: float | None) -> list[str]:
+    @property
+    def taken(self) -> Array:
+        """The lowest and the highest value of each action, (2, n_a)."""
+        return np.stack([self.actions.min(axis=0), self.actions.max(axis=0)])
+
+    def text(self, channels: Channels, sample_time: float | None) -> list[str]:
         """Lines for people."""
         unit, step = (" steps", 1.0) if sample_time is None else (" s", sample_time)
-        largest = np.abs(self.actions).max(axis=0)
-        beyond = ": beyond what the model was identified from"
-        return [
+        lines = [
             "closed loop on the model, from the first recorded state",
             f"  spectral radius {self.radius:.4f}; settled after {self.settled * step:.3g}{unit}, with "
             f"{100 * self.left:.3g} % of the distance to the target left",
-            f"  actions up to {largest.max():.3g}, recorded {self.recorded.max():.3g}"
-            f"{beyond if (largest > 1.01 * self.recorded).any() else ''}",
         ]
+        (low, high), (least, most) = self.taken, self.recorded
+        room = BEYOND * (most - least)
+        beyond = [
+            f"{channels.input(j)} from {low[j]:.3g} to {high[j]:.3g}, recorded {least[j]:.3g} to "
+            f"{most[j]:.3g}"
+            for j in np.flatnonzero((low < least - room) | (high > most + room)).tolist()
+        ]
+        if not beyond:
+            return [*lines, "  actions within the recorded ones"]
+        shown = "; ".join(beyond[:SHOWN]) + f"; and {len(beyond) - SHOWN} others" * (
+            len(beyond) > SHOWN
+        )
+        return [*lines, f"  actions beyond what the model was identified from: {shown}"]
 
 
 def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:
@@ -91,7 +108,7 @@ def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) ->
         s = after
         reduced.append(s)
         applied.append(a)
-    recorded = np.abs(actions).max(axis=0)
+    recorded = np.stack([actions.min(axis=0), actions.max(axis=0)])
     return ClosedLoop(
         np.array(reduced) @ law.measurement.T, np.array(applied), target, radius, recorded
     )

@@ -319,7 +319,8 @@ def test_the_law_on_the_model_is_the_law_that_is_saved(
         radius = np.abs(np.linalg.eigvals(A + B @ law["K_a"] @ law["U"].T)).max()
     assert loop["spectral_radius"] == pytest.approx(radius)
     assert loop["distance_left"] == pytest.approx(distances[-1] / distances[0], rel=1e-9)
-    np.testing.assert_allclose(loop["largest_actions"], np.abs(actions[:-1]).max(axis=0), rtol=1e-9)
+    taken = [np.min(actions[:-1], axis=0), np.max(actions[:-1], axis=0)]
+    np.testing.assert_allclose(loop["action_range"], taken, rtol=1e-9)
 
 
 def test_the_commands_options_reach_the_table(
