@@ -149,7 +149,11 @@ def no_model(settings: TrainingSettings, steps: Sequence[int], *, paid_up: bool)
     )
     told += "no rollouts are left for another exploration; " if paid_up else ""
     if len(steps) > 1 and steps[-1] <= steps[0]:
-        shorter = f"set a horizon of {min(steps)} steps or fewer, " if min(steps) else ""
+        shorter = f"set a horizon of {min(steps)} steps or fewer, "
+        if not any(steps):
+            shorter = "see that step returns finite numbers, "
+        elif not min(steps):
+            shorter = ""
         return (
             f"{told}weaker inputs did not delay it: if the plant diverges without control "
             f"(`pdeloop check` shows this), {shorter}raise divergence_bound, or begin nearer to "

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.text import shown
 
+_AXIS = "an axis has a name, a length and points, as in Axis('x', 1.0, 12)"
 MAX_NUMBERS = 2**24
 """Most numbers of a state that a text can tell of: no message holds more."""
 
@@ -55,8 +56,14 @@ class Axis:
     unit: str = "m"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "length", float(self.length))
-        object.__setattr__(self, "size", operator.index(self.size))
+        try:
+            length, size = float(self.length), operator.index(self.size)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{_AXIS}, got {self.name!r}, {self.length!r} and {self.size!r}"
+            ) from error
+        object.__setattr__(self, "length", length)
+        object.__setattr__(self, "size", size)
         if not (0 < self.length < math.inf and self.size >= 1):
             raise ValueError(
                 f"the axis {self.name} must have a positive length and at least 1 point, got "
@@ -169,14 +176,13 @@ class Grid:
             raise ValueError(f"fields have {size} numbers, but the axes have {self.size}")
 
     def _check(self) -> None:
-        axes = (self.axes,) if isinstance(self.axes, Axis) else tuple(self.axes)
+        axes = tuple(self.axes) if isinstance(self.axes, Iterable) else (self.axes,)
         named = (self.components,) if isinstance(self.components, str) else tuple(self.components)
         object.__setattr__(self, "axes", axes)
         object.__setattr__(self, "components", named)
         if other := [axis for axis in axes if not isinstance(axis, Axis)]:
             raise ValueError(
-                f"the axes of a grid must be of the class Axis, got {shown(other[0])}; an axis has a "
-                "name, a length and points, as in Axis('x', 1.0, 12)"
+                f"the axes of a grid must be of the class Axis, got {shown(other[0])}; {_AXIS}"
             )
         object.__setattr__(self, "numbers", operator.index(self.numbers))  # NumPy's is not JSON
         if not self.components:

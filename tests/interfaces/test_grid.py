@@ -108,6 +108,10 @@ def test_one_axis_or_component_may_be_given_by_itself() -> None:
 def test_what_is_no_grid_is_refused() -> None:
     with pytest.raises(ValueError, match="the axes of a grid must be of the class Axis, got 3"):
         Grid((3,))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="the axes of a grid must be of the class Axis, got 4"):
+        Grid(4)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"as in Axis\('x', 1.0, 12\), got 'x', 5 and 1.0"):
+        Axis("x", 5, 1.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 1 point"):
         Axis("x", 1.0, 0)
     with pytest.raises(ValueError, match="give one of the two"):

@@ -115,6 +115,8 @@ def test_inputs_that_delay_the_divergence_are_to_be_weaker_still(noise):
     told = no_model(settings, [3, 5], paid_up=False)
     assert "lower exploration_variance" in told and ("measurement_noise" in told) == bool(noise)
     assert "lower exploration_variance" in no_model(settings, [7], paid_up=True)
+    assert "finite" not in no_model(settings, [5, 0], paid_up=True)
+    assert "see that step returns finite numbers" in no_model(settings, [0, 0], paid_up=True)
     told = no_model(settings, [7, 5, 6], paid_up=False)
     assert "if the plant diverges without control" in told
     assert (
