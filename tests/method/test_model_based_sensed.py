@@ -120,12 +120,8 @@ def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_bett
     assert row["predicted_change"] == pytest.approx(level * (np.mean(first) - 9.1))
 
 
-def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_margin(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """And designs no linear observer, which costs more."""
+def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_margin() -> None:
     _, results, _ = told()
-    monkeypatch.delattr(model_based_sensed, "_observers")
     _, context = small()
     assert isinstance(context.law, Observer)
     law = ExtendedKalman(context.law.model, context.horizon)

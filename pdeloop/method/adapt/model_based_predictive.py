@@ -42,7 +42,7 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import ModelBasedSettings, index_of_cheapest
+from pdeloop.method.adapt.improve import ModelBasedSettings, cheapest
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
@@ -430,9 +430,8 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         laws, _ = estimated_laws(loop, fields, weights, self._settings)
         if not laws:
             return None
-        costs = np.array([loop.costs(theta, fields) for theta in laws])
-        i = index_of_cheapest(costs, weights)
-        return least_trusting(loop, laws[i], costs[i], fields, self._settings)[0]
+        best = cheapest(loop, laws, fields, weights)
+        return least_trusting(loop, best, fields, self._settings)
 
     def _loop(self, belief: Belief) -> SensedLoop:
         assert isinstance(belief.model, SensedModel)

@@ -216,26 +216,26 @@ class ModelBasedSensed(ModelBasedReadings):
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
         every, weights = weighted(fields, drawn)
         now = loop.theta(progress.policy)
-        if isinstance(law, ExtendedKalman):
-            laws, steps = estimated_laws(loop, every, weights, settings)
-        else:
-            laws, steps = _observers(loop, now, every, weights, settings, final)
+        linear = now if now.ndim > 1 else loop.theta(self._first)
+        laws, steps = _observers(loop, linear, every, weights, settings, final)
+        if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
+            further, more = estimated_laws(loop, every, weights, settings)
+            laws, steps = [*laws, *further], steps + more
         if not laws:
             row["reason"] = "no improved law stays finite on the model; the law is kept"
             return
         held_out = others if len(others) else fields
         equal = np.full(len(held_out), 1.0 / len(held_out))
-        laws = [loop.no_control, loop.theta(self._first), now, *laws]
-        costs = np.array([loop.costs(theta, held_out) for theta in laws])
-        base, best = index_of_cheapest(costs[:2], equal), index_of_cheapest(costs[2:], equal)
-        theta, own = laws[2 + best], costs[2 + best]
-        if best and isinstance(law, ExtendedKalman):
-            theta, own = least_trusting(loop, theta, own, held_out, settings)
-        if best:
+        theta = cheapest(loop, [now, *laws], held_out, equal)
+        if theta is not now:
+            if isinstance(law, ExtendedKalman) and theta.ndim == 1:
+                theta = least_trusting(loop, theta, held_out, settings)
             progress.policy = loop.policy(theta, self._first)
-        progress.safe = base == 1
+        first = loop.costs(loop.theta(self._first), held_out)
+        none = loop.costs(loop.no_control, held_out)
+        progress.safe = index_of_cheapest(np.stack([none, first]), equal) == 1
         with np.errstate(invalid="ignore"):
-            changes = own - costs[base]
+            changes = loop.costs(theta, held_out) - (first if progress.safe else none)
         known, row["steps"] = changes[np.isfinite(changes)], steps
         progress.change = change = mean_of(known) if len(known) else Estimate(np.nan, np.nan)
         if len(known):

@@ -326,23 +326,23 @@ def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: flo
 
 
 def least_trusting(
-    loop: SensedLoop, best: Array, costs: Array, fields: Array, settings: ModelBasedSettings
-) -> tuple[Array, Array]:
+    loop: SensedLoop, best: Array, fields: Array, settings: ModelBasedSettings
+) -> Array:
     """The cheapest law with the first of `UNPREDICTED` with which it costs hardly more, or else itself.
 
-    With its costs. Simulated plants follow the filter's equation: what trusts it looks too good.
+    Simulated plants follow the filter's equation: what trusts it looks too good.
     """
-    law, known = loop.kalman, np.isfinite(costs)
+    law, costs = loop.kalman, loop.costs(best, fields)
+    known = np.isfinite(costs)
     if not known.any():
-        return best, costs
+        return best
     most = (1.0 + settings.filter_margin) * costs[known].mean()
     for times in UNPREDICTED:
         noise = np.array([noise_of_filter(loop.model, settings, times)])
         other = law.vector({**law.parts(best), "noise": noise})
-        found = loop.costs(other, fields)
-        if found[known].mean() <= most:
-            return other, found
-    return best, costs
+        if loop.costs(other, fields)[known].mean() <= most:
+            return other
+    return best
 
 
 def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Array]:
