@@ -321,9 +321,9 @@ def _unpredicted(made: Designed) -> float:
 
 
 def _of_all(rows: ModelRows, few: ModelRows) -> ModelRows:
-    """The law of a model of few modes, K z = K_r U_r^T z, on the modes of another one."""
+    """The law of a model of few modes, K z = K_r U_r^T z, on all modes; filters keep to their own."""
     if few.L is not None or rows.L is not None:
-        return few
+        return rows
     onto = few.U.T @ rows.U
     return replace(rows, K_a=few.K_a @ onto, K_b=few.K_b @ onto)
 
