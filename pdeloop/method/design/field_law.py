@@ -302,11 +302,10 @@ def field_law(
             total += float(cost.at_end(states[-1:])[0][0])
         return total / (ahead * len(fields))
 
-    still = replace(rows, K_a=0.0 * K_a, K_b=0.0 * rows.K_b)
-    mine, others, idle = (
-        max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other, still)
-    )
-    doubtful = alone and min(mine, others) >= (1.0 - math.sqrt(fitted.error)) * idle
+    mine, others = (max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other))
+    still = replace(rows, K_a=0.0 * K_a, K_b=0.0 * K_b)
+    sure = (1.0 - math.sqrt(fitted.error)) * predicted_cost(still, model) if alone else np.inf
+    doubtful = min(mine, others) >= sure
     return replace(
         report, rows=rows, cost=mine, other_cost=others, remark=remark, doubtful=doubtful
     )
