@@ -83,10 +83,10 @@ class ClosedLoop:
         ]
         if not beyond:
             return [*lines, "  actions within the recorded ones"]
-        shown = "; ".join(beyond[:SHOWN]) + f"; and {len(beyond) - SHOWN} others" * (
-            len(beyond) > SHOWN
-        )
-        return [*lines, f"  actions beyond what the model was identified from: {shown}"]
+        if len(beyond) > SHOWN:
+            beyond[SHOWN:] = [f"and {len(beyond) - SHOWN} others"]
+        told = "; ".join(beyond)
+        return [*lines, f"  actions beyond what the model was identified from: {told}"]
 
 
 def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:

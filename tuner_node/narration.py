@@ -7,6 +7,8 @@ The tuner logs these lines, and `pdeloop train` shows them.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from pdeloop.method.adapt.replay import ALONG
+
 Row = Mapping[str, Any]
 COSTLIER = 3
 """Exit code where a law costs more than no control."""
@@ -14,8 +16,6 @@ LITTLE = 0.05
 """Share of the cost without control; a law that saves less of it hardly controls."""
 FAR_OFF = 0.2
 """Error of predicted costs, relative to the mean of measured ones, which is told."""
-ALONG = "steps along measured ones"
-"""What a reason of the history ends with where no model served."""
 REPEATS = 1e-6
 """Relative difference of the costs of one law on the same fields that is no rounding."""
 IDLE = (
@@ -233,13 +233,10 @@ def poor_laws(summary: Row) -> list[str]:
 
 def mispredicted(summary: Row) -> list[str]:
     """What the model predicted of the last law and what was measured, where they are far apart."""
-    lines, first, several = [], summary["seed"], summary["seeds"] > 1
-    for seed in range(first, first + summary["seeds"]):
-        rows = [row for row in summary.get("history", []) if row.get("seed") == seed]
-        judged = [row for row in rows if row.get("role") == "judging"] or [{}]
-        cost, predicted = judged[-1].get("cost"), judged[-1].get("predicted")
-        if cost and predicted and (off := _missed(judged[-1]) / cost) > FAR_OFF:
-            who = f"seed {seed}: " if several else ""
+    lines = []
+    for who, row in _last(summary, "judging"):
+        cost, predicted = row.get("cost"), row.get("predicted")
+        if cost and predicted and (off := _missed(row) / cost) > FAR_OFF:
             lines.append(
                 f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g} "
                 f"(rollouts are missed by {100 * off:.2g} % of that): the model does not hold where it "
@@ -250,18 +247,22 @@ def mispredicted(summary: Row) -> list[str]:
 
 def unmodelled(summary: Row) -> list[str]:
     """Seeds whose last law was improved along measured rollouts alone, and why."""
-    lines, first, several = [], summary["seed"], summary["seeds"] > 1
-    for seed in range(first, first + summary["seeds"]):
-        rows = [row for row in summary.get("history", []) if row.get("seed") == seed]
-        renewed = [row for row in rows if row.get("role") == "renewing"] or [{}]
-        why, _, how = str(renewed[-1].get("reason", "")).partition(": ")
+    lines = []
+    for who, row in _last(summary, "renewing"):
+        why, _, how = str(row.get("reason", "")).partition(": ")
         if how == ALONG:
-            who = f"seed {seed}: " if several else ""
             lines.append(
                 f"{who}{why}, so it was improved by {how} alone: explore less far "
                 "(exploration_variance), where a model may hold, or train with more rollouts"
             )
     return lines
+
+
+def _last(summary: Row, role: str) -> list[tuple[str, Row]]:
+    """The last row of this role of each seed that has one, with the seed, if there are several."""
+    rows = {row["seed"]: row for row in summary.get("history", []) if row.get("role") == role}
+    several = summary["seeds"] > 1
+    return [(f"seed {seed}: " if several else "", rows[seed]) for seed in sorted(rows)]
 
 
 def _missed(row: Row) -> float:

@@ -10,10 +10,11 @@ import pytest
 
 from pdeloop.display import Display
 from pdeloop.in_process import LocalPair
+from pdeloop.method.adapt.replay import ALONG
 from tests.support.small import parameters
 from tests.support.training_summary import summary
 from tuner_node.build import build_training
-from tuner_node.narration import ALONG, Narration, closing_lines, failed, warnings
+from tuner_node.narration import Narration, closing_lines, failed, warnings
 from tuner_node.rollouts import CHECK
 
 

@@ -540,7 +540,7 @@ class ModelBased(Optimizer):
         else:
             progress.trust = replay.FIRST_TRUST
         progress.policy = best.copy()
-        row["reason"] = f"{why}: steps along measured ones"
+        row["reason"] = f"{why}: {replay.ALONG}"
         if final:
             return
         again = self._designed_again(best)

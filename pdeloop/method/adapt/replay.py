@@ -40,6 +40,8 @@ from pdeloop.method.models.base import Measured, samples_of
 from pdeloop.method.models.selection import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
 
+ALONG = "steps along measured ones"
+"""What the reason of a row of the history ends with where no model helps."""
 FEWEST = 2
 """Rollouts of a law with which its mean cost counts."""
 FIRST_TRUST = 0.3
