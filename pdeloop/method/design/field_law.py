@@ -304,8 +304,8 @@ def field_law(
 
     mine, others = (max(predicted_cost(law, judge) for judge in accepted) for law in (rows, other))
     still = replace(rows, K_a=0.0 * K_a, K_b=0.0 * K_b)
-    sure = (1.0 - math.sqrt(fitted.error)) * predicted_cost(still, model) if alone else np.inf
-    doubtful = min(mine, others) >= sure
+    sure = 1.0 - math.sqrt(fitted.error)
+    doubtful = alone and min(mine, others) >= sure * predicted_cost(still, model)
     return replace(
         report, rows=rows, cost=mine, other_cost=others, remark=remark, doubtful=doubtful
     )
