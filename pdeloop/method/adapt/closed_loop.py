@@ -43,6 +43,9 @@ from pdeloop.method.models import FieldModel
 from pdeloop.method.models.linear import ReadingsModel
 from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
+_WITHIN_RATE = 0.99
+"""Share of the moves of actuators with which `ClosedLoop.detuned` begins."""
+
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
@@ -253,11 +256,16 @@ class ClosedLoop:
         return np.hstack([lqr.K @ self.U, np.tile(lqr.b[:, None], self.constants)])
 
     def detuned(self, theta: Array, share: float, fields: Array, weights: Array) -> Array:
-        """The law with this share of the gains of its actions, and the mean actions of its own way."""
+        """The law with this share of the gains of its actions, and the mean actions of its own way.
+
+        Their moves are a little within the rate limits: at these a rounding decides on the gradient.
+        """
         simulation, n_a = self.simulate(theta, fields), self.model.n_a
         n_f, changed = theta.shape[1] - self.constants, theta.copy()
         changed[:n_a, :n_f] *= share
-        b = simulation.actions - simulation.features[:, :, :-1] @ changed[:n_a, :n_f].T
+        start = self.action_set.start
+        actions = start + _WITHIN_RATE * (simulation.actions - start)
+        b = actions - simulation.features[:, :, :-1] @ changed[:n_a, :n_f].T
         of_steps = np.einsum("kfi,f->ik", b, weights)
         changed[:n_a, n_f:] = of_steps if self.constants > 1 else of_steps.mean(axis=1)[:, None]
         return changed
