@@ -169,7 +169,9 @@ def test_an_experiment_that_is_appended_with_t_in_equal_steps_is_told_and_cut_of
     z, u = np.vstack([rod(steps(), REST), other]) + 293.15, np.vstack([steps(), steps(9)])
     for cut in (False, True):
         found = identified(tmp_path, z, u, cut=cut)
-        assert found.pole[0] == pytest.approx(POLE, abs=1e-3)
+        pole, low, high = found.pole
+        assert low < POLE < high
+        assert not cut or pole == pytest.approx(POLE, abs=1e-4)
         assert len(found.sources) == 1 + cut
         told = any(text.startswith("the states jump in row 603, and not") for text in found.remarks)
         assert told != cut
