@@ -35,6 +35,7 @@ Chapman & Hall 2002, chapter 3 (backward elimination).
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -454,6 +455,8 @@ _POINT_PASSES = 4
 """How often an equation of finite differences is refitted along the paths of the last fit."""
 _POINT_SUBSTEPS = 32
 """Maximum number of internal steps per sampling time."""
+_COARSE = 1e-4
+"""Largest change of a step by fewer internal ones, per root mean square of the change in all steps."""
 _POINT_REACH = 2.5
 """Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
@@ -484,7 +487,7 @@ def fit_finite_difference(
             break
         substeps = substeps_of(found, size, _POINT_REACH)
         model = fitted = replace(found, substeps=substeps)
-    return fitted
+    return fitted and coarsest(fitted, samples)
 
 
 def nothing(
@@ -503,6 +506,20 @@ def nothing(
 def largest_of(samples: Samples) -> float:
     """The size of a field, for which internal steps are counted."""
     return float(np.quantile(np.abs(samples.before).max(axis=1), 0.9))
+
+
+def coarsest(model: FiniteDifferenceModel, samples: Samples) -> FiniteDifferenceModel:
+    """With the fewest internal steps that change no step by more than a share of the mean change."""
+    fine = model.step(samples.before, samples.actions)
+    most = _COARSE * np.sqrt(np.mean(np.sum((samples.after - samples.before) ** 2, axis=1)))
+
+    def suffice(substeps: int) -> bool:
+        coarse = replace(model, substeps=substeps).step(samples.before, samples.actions)
+        with np.errstate(invalid="ignore"):
+            return bool(np.linalg.norm(coarse - fine, axis=1).max() <= most)
+
+    counts = range(1, model.substeps)
+    return replace(model, substeps=1 + bisect_left(counts, True, key=suffice))
 
 
 def substeps_of(model: FiniteDifferenceModel, size: float, reach: float) -> int:
