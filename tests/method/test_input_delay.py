@@ -107,6 +107,33 @@ def test_feedback_and_idle_inputs_are_no_delay(seed: int) -> None:
     assert study_delays([(z, np.random.default_rng(9).normal(size=a.shape))]).best == (0, 0)
 
 
+@pytest.mark.parametrize("late", [0, 3])
+@pytest.mark.parametrize("seed", range(2))
+def test_an_input_without_effect_that_follows_the_state_is_not_logged_late(
+    late: int, seed: int
+) -> None:
+    """The next row of it tells the next state exactly; the other input is held, and moves the plant."""
+    rng, z, a = np.random.default_rng(seed), np.zeros((501, 4)), np.zeros((500, 2))
+    for k in range(500):
+        held = a[k - 1, 0] if k and rng.random() > 0.1 else rng.normal()
+        a[k] = held, -z[max(k - late, 0), 3]
+        z[k + 1] = A @ z[k] + B[:, 0] * held + 0.05 * rng.normal(size=4)
+    assert study_delays([(z, a)]).best == (0, 0)
+
+
+def test_a_delay_that_hardly_lowers_the_errors_is_none() -> None:
+    """Slow sensors of two of four states: 1.06 to 1.09 times smaller, and there is no dead time."""
+    for seed in range(6):
+        rng, lag = np.random.default_rng(seed), 0.8
+        x, z, a = np.zeros(4), np.zeros((501, 4)), np.zeros((500, 2))
+        for k in range(500):
+            a[k] = rng.normal(size=2) if k % 20 == 0 else a[k - 1]
+            x = A @ x + B @ a[k] + 0.02 * rng.normal(size=4)
+            z[k + 1] = lag * z[k] + (1.0 - lag) * x
+        seen = z[:, [0, 3]] + 0.05 * rng.normal(size=(501, 2))
+        assert study_delays([(seen, a)]).best == (0, 0)
+
+
 def test_the_gain_is_the_ratio_of_errors() -> None:
     # At the wrong delay the error of each state is the effect of its input, 10 |B|, at the right one
     # the noise of a measurement and of its prediction.
@@ -188,7 +215,7 @@ def test_shifts_need_rows() -> None:
         shifted([(z, a)], (5, 0))
 
 
-@pytest.mark.parametrize(("noise", "held"), [(3.0, 1), (3.0, 5), (1.0, 12), (3.0, 12)])
+@pytest.mark.parametrize(("noise", "held"), [(3.0, 1), (3.0, 5), (1.0, 12), (2.0, 5)])
 def test_a_delay_that_the_data_do_not_tell_from_others_is_not_clear(
     noise: float, held: int
 ) -> None:

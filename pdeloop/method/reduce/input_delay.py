@@ -14,7 +14,8 @@ delay of each input on its own follows by a search along single inputs.
 
 Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only for an input a_k whose prediction
 from its own past z_{k+n} does not improve (Granger), while the change to z_{k+n+1} does: the effect of
-an input that is logged late is in the states before its row, but not in those before it acted. And
+an input that is logged late is in the states before its row, but not in those before it acted. One that
+follows from z_{k+n+1} alone is fed back. And
 another delay counts only if the inputs with the delay in use add nothing to it.
 
 References
@@ -35,6 +36,7 @@ from scipy import linalg
 
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
+from pdeloop.method.reduce.identifiability import DEPENDENT
 from pdeloop.method.reduce.reduced_model import Trajectory, distinct
 from pdeloop.process.one_thread import one_thread
 
@@ -48,7 +50,7 @@ EVIDENCE = 10.0
 """Log-likelihood by which another delay must be better."""
 ADDED = 0.3
 """Share of the log-likelihood gained by another delay that the inputs as used may add to it."""
-LOWER = 0.9
+LOWER = 0.84
 """Squared error, relative to that of the delay before, up to which another one matters."""
 MOST_INPUTS = 16
 """Inputs of which each has a delay of its own, at most; more have one in common."""
@@ -321,8 +323,9 @@ class _Regression:
     def free(self, n: int) -> tuple[Flags, Flags]:
         """Of each input: whether z_{k+n}, from which a_k acts with a delay n < 0, tells nothing of it.
 
-        That is, does not improve its prediction from a_{k-1}, a_{k-2}, ... And whether it improves that
-        from z_{k+n+1}: such an input has caused the change between the two.
+        That is, does not improve its prediction from a_{k-1}, a_{k-2}, ... And whether it does beside
+        z_{k+n+1}: such an input has caused the change between the two, whereas one that is fed back
+        follows from z_{k+n+1} alone, and one that is held from its own past.
         """
         inputs, at = range(self.n_a), n + 1
         now = self._inputs([at] * self.n_a, inputs)
@@ -338,6 +341,8 @@ class _Regression:
             columns = [0, *known, *range(1 + self.n, 1 + 2 * self.n)]
             without = self._held_out([0, *known], of_y, of_yy).sum(axis=0)
             with_it = self._held_out(columns, of_y, of_yy).sum(axis=0)
+            with_it = np.maximum(with_it, DEPENDENT**2 * of_yy.sum(axis=0))  # less is rounding
             return np.asarray(np.log(without / with_it) > enough)
 
-        return ~improves(past), improves([*range(1, 1 + self.n)])
+        after = [*range(1, 1 + self.n)]
+        return ~improves(past), improves(after) & improves([*past, *after])
