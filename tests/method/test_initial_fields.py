@@ -70,7 +70,9 @@ class Falling:
 
 
 def test_states_of_a_plant_that_runs_away_do_not_serve_as_initial_fields() -> None:
-    near = np.random.default_rng(0).uniform(0.006, 0.012, (4, N_Z))
+    near = np.random.default_rng(0).uniform(0.010, 0.011, (4, N_Z)) * np.array(
+        [[1], [-1], [1], [-1]]
+    )
     falls = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Falling())  # type: ignore[arg-type]
     none = falls.no_control
     assert is_chaotic(falls, near)
@@ -79,6 +81,22 @@ def test_states_of_a_plant_that_runs_away_do_not_serve_as_initial_fields() -> No
     fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
     states = 3.9 * fields * (1.0 - fields)
     assert any_state_serves(stays, stays.no_control, fields, states)
+
+
+class Escaping(Logistic):
+    """z' = r z + (1 - r) z^3, which comes to rest from |z| < 1 and runs away from beyond."""
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return self.r * states + (1.0 - self.r) * states**3
+
+
+def test_a_stable_plant_is_not_chaotic_where_its_model_runs_away_from_some_fields() -> None:
+    """As that of a heat exchanger without flow; close to where it does, small changes matter."""
+    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Escaping(0.8))  # type: ignore[arg-type]
+    fields = np.array([0.3, 0.4, 0.5, 0.6, 0.998, 1.2])[:, None] * np.ones(N_Z)
+    costs = loop.costs(loop.no_control, fields)
+    assert np.isinf(costs[-1]) and costs[-2] > 2.0 * costs[:-2].sum()
+    assert not is_chaotic(loop, fields)
 
 
 def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:

@@ -591,7 +591,8 @@ class ModelBased(Optimizer):
         data, settings, known = self._data(), self._settings, (loop, base, improved)
         states = renewal.measured_states(data, CHAOTIC_FIELDS)
         if not belief.whole or renewal.any_state_serves(loop, base, fields, states):
-            row["chaotic"] = True
+            # A model may also predict no more than pieces because it is wrong.
+            row["chaotic" if renewal.is_chaotic(loop, states) else "pieces"] = True
             found = renewal.renew_from_states(*known, data, draw, settings, final=final)
         else:
             parts = self._progress.parts
