@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from controller_node.identification import DesignSettings, designed, examined, identify
@@ -41,10 +42,12 @@ from pdeloop.method.reduce.reduced_model import ReducedModel, Samples, Trajector
 from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
+    Model,
     Residuals,
     disproportionate,
     fit_percent,
     largest_pole,
+    products,
     residuals,
     stability,
     structural_break,
@@ -87,7 +90,9 @@ class Identified:
     field: the report on the model of the whole field, for the identification "field"; input_delay: of
     each input, in steps; pole: |lambda| of the largest one, and its interval; innovations: of the
     identification "subspace"; fits: FIT of each number of the state, by what was simulated; refit: a
-    model of other data by the same method and of the same sizes.
+    model of other data by the same method and of the same sizes; method: "regression" or "dmdc", where
+    there is no model in innovation form. pole, residuals and fits are those of the model whose law is
+    used (`kind`).
     """
 
     model: ModelRows | ReducedModel
@@ -107,13 +112,43 @@ class Identified:
     innovations: InnovationModel | None = None
     fits: tuple[tuple[str, Array], ...] = ()
     refit: Callable[[list[Trajectory]], InnovationModel] | None = None
+    method: str = "regression"
+
+    @property
+    def of_field(self) -> FieldLaw | None:
+        """The report on the model of the whole field where its law is used."""
+        return self.field if self.field and self.field.better else None
+
+    @property
+    def simulated(self) -> Model:
+        """The model whose law is used."""
+        used = self.of_field
+        return used.fitted.model if used and used.fitted else self.model
+
+    @property
+    def kind(self) -> str:
+        """Its kind: regression, dmdc, subspace, or that of the model of the whole field."""
+        used = self.of_field
+        if used and used.fitted:
+            return used.fitted.model.kind
+        return self.method if self.innovations is None else "subspace"
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """The poles of that model, at the target where it is not linear."""
+        used = self.of_field
+        linear = used.linear if used and used.linear else self.model
+        return np.asarray(np.linalg.eigvals(linear.A), dtype=np.complex128)
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
         """The law on the model; None without a target."""
         if self.target is None or not isinstance(self.model, ModelRows):
             return None
-        return closed_loop(self.model, self.target, *self.trajectory)
+        known, used = (self.model, self.target, *self.trajectory), self.of_field
+        if used and used.fitted and self.model.L is None:
+            return closed_loop(*known, used.fitted.model, used.linear)
+        return closed_loop(*known)
 
     @property
     def warnings(self) -> list[str]:
@@ -170,8 +205,9 @@ class Identified:
         """The result as data, without the arrays, which `save` writes."""
         A, B, U, study = self.model.A, self.model.B, self.model.U, self.study
         determined, loop = self.determined, self.closed_loop
-        poles = np.linalg.eigvals(A)
+        poles = self.poles
         return {
+            "model": self.kind,
             "reduced_order": len(A),
             "n_z": U.shape[0],
             "n_a": B.shape[1],
@@ -214,8 +250,15 @@ class Identified:
             f"  {known['n_z']} points, {known['n_a']} actuators, "
             f"spectral radius {known['spectral_radius']:.4f}",
         ]
+        if (used_law := self.of_field) and used_law.inputs is not None:
+            held = _row([f"{a:.3g}" for a in used_law.inputs.tolist()])
+            where = "as said below" if used_law.remark else f"at the target and a = {held}"
+            lines.append(
+                f"  poles and residuals are those of the {self.kind} model of the whole field, whose "
+                f"law is used, linearised {where}; those of the regression: --identification regression"
+            )
         if self.sample_time is not None:
-            size = np.abs(np.linalg.eigvals(self.model.A))
+            size = np.abs(self.poles)
             rates = np.log(size[size > DEAD * size.max()]) / self.sample_time
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
         if self.model.d is not None and self.model.d.any():
@@ -239,7 +282,7 @@ class Identified:
         elif self.study is None:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
-            lines += ["", self.study.text()]
+            lines += ["", *["  of the regression:"] * bool(self.of_field), self.study.text()]
         if self.field is not None:
             lines += ["", *self.field.text()]
         return "\n".join([*lines, "", *self._law_lines()])
@@ -355,17 +398,7 @@ def identify_data(
         better = delays.text(found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     seen = shifted(found.trajectories, used)
-    if other := structural_break(seen):
-        i, k, ratio = other
-        place = f"step {k} of " * (k > 1) + _source_text(found.sources[i])
-        text = (
-            f"from about {place} on the states follow the inputs otherwise (one model for all of it "
-            f"misses {ratio:.3g} times the squares of two): two machines, a stuck actuator or two "
-            "operating points in one log; identify from a part where the plant is one"
-        )
-        found = replace(found, remarks=(*found.remarks, text))
-    elif bend := disproportionate(seen):
-        found = replace(found, remarks=(*found.remarks, bend.text(found.channels)))
+    found = replace(found, remarks=(*found.remarks, *_nonlinear(seen, found)))
     constant = regression.has_offset(seen)
 
     def by(own: Mapping[str, Any], *, simulations: bool = False) -> Identified:
@@ -393,6 +426,25 @@ def identify_data(
             raise NotIdentifiableError(followed_the_state(alone))
         return first
     return _or_subspace(first, by, seen, given, alone)
+
+
+def _nonlinear(seen: Sequence[Trajectory], found: Measurements) -> list[str]:
+    """What explains best that one linear model does not hold in all of a log, in one sentence."""
+    told: list[tuple[float, str]] = []
+    if other := structural_break(seen):
+        i, k, ratio = other
+        place = f"step {k} of " * (k > 1) + _source_text(found.sources[i])
+        text = (
+            f"from about {place} on the states follow the inputs otherwise (one model for all of it "
+            f"misses {ratio:.3g} times the squares of two): two machines, a stuck actuator or two "
+            "operating points in one log; identify from a part where the plant is one"
+        )
+        told.append((ratio, text))
+    if product := products(seen):
+        told.append((product.of_linear, product.text(found.channels)))
+    if not other and (bend := disproportionate(seen)):
+        told.append((bend.ratio, bend.text(found.channels)))
+    return [max(told)[1]] if told else []
 
 
 def _or_subspace(
@@ -591,6 +643,13 @@ def _identified(
     late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
     aligned = shifted(logged, early) if delays else trajectories
     refit = partial(_refitted, model, method, p, sum(late), innovations, simulations)
+    pole = largest_pole(model.A, seen, lambda parts: refit(parts).A)
+    checked: Model = model
+    acting = early
+    if field and field.better and field.fitted and field.linear and field.refit:
+        rollouts = [(np.asarray(own.states), own.actions) for own in field.fitted.rollouts]
+        pole = largest_pole(field.linear.A, rollouts, field.refit)
+        checked, aligned, acting = field.fitted.model, trajectories, delays  # it has no memory
     return Identified(
         model,
         sources,
@@ -604,14 +663,15 @@ def _identified(
         remarks,
         field,
         delays,
-        largest_pole(model.A, seen, lambda parts: refit(parts).A),
-        residuals(model, aligned),
+        pole,
+        residuals(checked, aligned),
         innovations,
         tuple(
-            (name, fit_percent(model, shifted(own.trajectories, early)))
+            (name, fit_percent(checked, shifted(own.trajectories, acting)))
             for name, own in validation.items()
         ),
         refit,
+        "dmdc" if method == "dmdc" else "regression",
     )
 
 

@@ -45,8 +45,9 @@ def plot(found: Identified) -> Figure:
     states, actions = found.trajectory
     shown = _spread(states.shape[1])
     _lines(axes[0, 1], states, shown, None, step, linewidth=3.0, alpha=0.35)
-    _lines(axes[0, 1], simulated(found.model, states, actions), shown, found.channels.state, step)
-    axes[0, 1].set(title="recorded (thick), simulated (thin)", xlabel=unit)
+    drawn = simulated(found.simulated, states, actions)
+    _lines(axes[0, 1], drawn, shown, found.channels.state, step)
+    axes[0, 1].set(title=f"recorded (thick), simulated (thin): {found.kind}", xlabel=unit)
     axes[0, 1].legend(frameon=False, fontsize="small")
     loop = found.closed_loop
     if loop is not None:

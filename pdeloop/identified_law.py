@@ -10,7 +10,9 @@ import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.models.base import FieldModel
 from pdeloop.method.reduce.channels import SHOWN, Channels
+from pdeloop.method.reduce.reduced_model import ReducedModel
 
 SETTLED = 0.05
 """Share of the way from the first to the last state within which the loop counts as settled."""
@@ -28,7 +30,8 @@ class ClosedLoop:
     """The law on the model, from the first recorded state.
 
     states (N + 1, n_z): U s_k; actions (N, n_a); target (n_z,); radius: spectral radius of A + B K_a;
-    recorded: the lowest and the highest recorded value of each action, (2, n_a).
+    recorded: the lowest and the highest recorded value of each action, (2, n_a); model: its kind, of
+    one of the whole field.
     """
 
     states: Array
@@ -36,6 +39,7 @@ class ClosedLoop:
     target: Array
     radius: float
     recorded: Array
+    model: str = ""
 
     @property
     def settled(self) -> int:
@@ -70,7 +74,8 @@ class ClosedLoop:
         """Lines for people."""
         unit, step = (" steps", 1.0) if sample_time is None else (" s", sample_time)
         lines = [
-            "closed loop on the model, from the first recorded state",
+            f"closed loop on the {self.model + ' ' * bool(self.model)}model, from the first recorded "
+            "state",
             f"  spectral radius {self.radius:.4f}; settled after {self.settled * step:.3g}{unit}, with "
             f"{100 * self.left:.3g} % of the distance to the target left",
         ]
@@ -89,26 +94,41 @@ class ClosedLoop:
         return [*lines, f"  actions beyond what the model was identified from: {told}"]
 
 
-def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:
+def closed_loop(
+    law: ModelRows,
+    target: Array,
+    states: Array,
+    actions: Array,
+    model: FieldModel | None = None,
+    linear: ReducedModel | None = None,
+) -> ClosedLoop:
     """Simulate s_{k+1} = A s_k + B a_k + d under a_k = K_a s_k + K_b s_r + b, from s_0 = U^T z_0.
 
     states (N + 1, n_z) and actions (N, n_a): the recorded trajectory whose first state it begins with.
-    It runs for its length, or longer, until the slowest mode has decayed.
+    It runs for its length, or longer, until the slowest mode has decayed. model, linear: one of the
+    whole field that is simulated in its place, and its linearisation.
     """
-    radius = float(np.abs(np.linalg.eigvals(law.A + law.B @ law.K_a)).max())
+    A, B, K = law.A, law.B, law.K_a
+    if linear is not None:
+        A, B, K = linear.A, linear.B, K @ law.U.T
+    radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
     needed = np.log(DECAYED) / np.log(min(max(radius, 0.01), 1.0 - 1e-9))
     steps = int(np.clip(np.ceil(needed), len(actions), LONGEST * len(actions)))
-    s, forced = law.U.T @ states[0], law.constant
+    s, forced = law.U.T @ states[0] if model is None else states[0], law.constant
     reduced, applied = [s], list[Array]()
     for _ in range(steps):
-        a = law.K_a @ s + forced
-        after = law.A @ s + law.B @ a + (0.0 if law.d is None else law.d)
+        a = K @ s + forced
+        with np.errstate(all="ignore"):
+            if model is None:
+                after = A @ s + B @ a + (0.0 if law.d is None else law.d)
+            else:
+                after = model.step(s[None], a[None])[0]
         if applied and not np.abs(after).max() < _OVERFLOW:
             break
         s = after
         reduced.append(s)
         applied.append(a)
     recorded = np.stack([actions.min(axis=0), actions.max(axis=0)])
-    return ClosedLoop(
-        np.array(reduced) @ law.measurement.T, np.array(applied), target, radius, recorded
-    )
+    seen = np.array(reduced) if model else np.array(reduced) @ law.measurement.T
+    kind = model.kind if model else ""
+    return ClosedLoop(seen, np.array(applied), target, radius, recorded, kind)

@@ -23,7 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import combinations_with_replacement
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +32,7 @@ from scipy import linalg, special
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
+from pdeloop.method.models.base import FieldModel, Measured, predicted
 from pdeloop.method.reduce.channels import Channels, listed
 from pdeloop.method.reduce.reduced_model import ReducedModel, Trajectory
 from pdeloop.method.reduce.subspace import InnovationModel, driven
@@ -50,7 +52,7 @@ LEAST = 4
 SLOW = 10.0
 """Time constants of a slow mode that the longest trajectory has, at most."""
 EVIDENCE = 20.0
-"""Log-likelihood of the effects on such a mode from which on they count."""
+"""Log-likelihood of the effects on such a mode, or of products, from which on they count."""
 FIRST = 8
 """Measurements from which a filter finds the state."""
 CHANGED = 2.0
@@ -61,8 +63,13 @@ PLACES = 20
 BENT = 1.3
 """Residuals of a model linear in an input relative to those of one piecewise linear in it, as squares,
 from which on the states do not follow it in proportion."""
+MODES = 4
+"""Leading modes of the state in products."""
 KNOTS = 0.1, 0.25, 0.5, 0.75, 0.9
 """Where the pieces end: quantiles of the input."""
+
+
+Model: TypeAlias = ReducedModel | ModelRows | FieldModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,6 +298,77 @@ def disproportionate(trajectories: Sequence[Trajectory]) -> Bend | None:
     return found
 
 
+@dataclass(frozen=True)
+class Products:
+    """A state that follows products of the state and inputs.
+
+    ratio: of squares that models without and with these products miss; of_linear: of a linear model and
+    that with all products of two numbers.
+    """
+
+    state: int
+    inputs: tuple[int, ...]
+    ratio: float
+    of_linear: float
+
+    def text(self, channels: Channels) -> str:
+        """One sentence."""
+        names = listed([channels.input(j) for j in self.inputs])
+        return (
+            f"{channels.state(self.state)} follows products of a state and {names} (a linear model "
+            f"misses {self.of_linear:.3g} times the squares of one with products), as where a flow "
+            "carries heat or a valve opens a path: poles and gains change with the point, and a "
+            "linear law holds near its target alone; identify from rows near it, or by the model of "
+            "the whole field, which has products (with a --target)"
+        )
+
+
+def products(trajectories: Sequence[Trajectory]) -> Products | None:
+    """The state that products of leading modes of the state and inputs explain best, if any.
+
+    Residuals of steps by regressions on two rows, with products of two modes and of two inputs, and
+    those of a mode and an input as well.
+    """
+    known = [(z, a) for z, a in trajectories if len(a) > 1]
+    n_z, n_a = (part.shape[1] for part in trajectories[0])
+    parts = [np.hstack([z[1:-1], z[:-2], a[1:], a[:-1]]) for z, a in known]
+    if not parts:
+        return None
+    X, after = np.concatenate(parts), np.concatenate([z[2:] for z, _ in known])
+    mean, unit = X.mean(axis=0), X.std(axis=0)
+    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
+    X = (X - mean) / unit
+    s, u = X[:, :n_z], X[:, 2 * n_z : 2 * n_z + n_a]
+    with one_thread():
+        s = s @ linalg.svd(s, full_matrices=False)[2][:MODES].T
+    pairs = [*combinations_with_replacement(range(s.shape[1]), 2)]
+    others = [*combinations_with_replacement(range(n_a), 2)]
+    without = np.column_stack(
+        [np.ones(len(X)), X, *(s[:, i] * s[:, j] for i, j in pairs)]
+        + [u[:, i] * u[:, j] for i, j in others]
+    )
+    mixed = [s * u[:, j : j + 1] for j in range(n_a)]
+    least = (ROUNDED * after.std(axis=0)) ** 2
+    width = without.shape[1] + n_a * s.shape[1]
+    if len(X) < LEAST * width:
+        return None
+
+    def missed(columns: Array) -> Array:
+        left = after - columns @ linalg.lstsq(columns, after, cond=1e-10)[0]
+        squares = np.sum(left**2, axis=0) / (len(X) - columns.shape[1])
+        return np.asarray(np.maximum(squares, least))
+
+    every = missed(np.hstack([without, *mixed]))
+    ratio = missed(without) / np.maximum(every, 1e-300)
+    i = int(ratio.argmax())
+    if not (ratio[i] > BENT and 0.5 * len(X) * np.log(ratio[i]) > EVIDENCE):
+        return None
+    fewer = [missed(np.hstack([without, *mixed[:j], *mixed[j + 1 :]]))[i] for j in range(n_a)]
+    told = [j for j in range(n_a) if fewer[j] > BENT * every[i]] or [int(np.argmax(fewer))]
+    linear = missed(without[:, : 1 + X.shape[1]])[i] / every[i]
+    return Products(i, tuple(told), float(ratio[i]), float(linear))
+
+
 def stability(low: float, high: float) -> str:
     """Yes, no, or undecided.
 
@@ -304,18 +382,19 @@ def _radius(A: Array) -> float:
     return float(np.abs(np.linalg.eigvals(A)).max())
 
 
-def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory]) -> Residuals:
+def residuals(model: Model, trajectories: Sequence[Trajectory]) -> Residuals:
     """Test the residuals of the model's predictions of the next measurement.
 
     Channels are the numbers of z, or the directions that the model predicts if these are fewer.
     Those from which a filter finds the state do not count.
     """
-    skipped = _beginning(model)
     states = np.concatenate([z for z, _ in trajectories])
-    basis = np.eye(states.shape[1])
-    if len(model.U) > model.U.shape[1]:
-        with one_thread():
-            basis = linalg.orth(model.U)
+    skipped, basis = 0, np.eye(states.shape[1])
+    if isinstance(model, ReducedModel | ModelRows):
+        skipped = _beginning(model)
+        if len(model.U) > model.U.shape[1]:
+            with one_thread():
+                basis = linalg.orth(model.U)
     parts, inputs = [], []
     for z, a in trajectories:
         e = ((z[1:] - predicted_next(model, z, a)[:-1]) @ basis)[skipped:]
@@ -357,14 +436,17 @@ def residuals(model: ReducedModel | ModelRows, trajectories: Sequence[Trajectory
         n,
         tuple((int(i), float(np.abs(rho[:, i]).max())) for i in in_time),
         tuple((int(i), float(share[i])) for i in moved),
-        modes=basis.shape[1] < len(model.U),
+        modes=basis.shape[1] < len(basis),
         size=size,
         driven=driven,
     )
 
 
-def predicted_next(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array:
+def predicted_next(model: Model, z: Array, a: Array) -> Array:
     """z_{k+1|k} for z_k (N + 1, n_z) and a_k (N, n_a); the last one is not used, (N + 1, n_z)."""
+    if not isinstance(model, ReducedModel | ModelRows):
+        found = model.step(z[: len(a)], a)
+        return np.vstack([found, found[-1:]])
     estimated = _estimates(model, z, a, len(a))
     d = 0.0 if model.d is None else model.d
     ahead = estimated @ model.A.T + a @ model.B.T + d
@@ -372,11 +454,16 @@ def predicted_next(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array
     return np.vstack([found, found[-1:]])
 
 
-def simulated(model: ReducedModel | ModelRows, z: Array, a: Array) -> Array:
+def simulated(model: Model, z: Array, a: Array) -> Array:
     """The measurements that the model simulates under recorded actions, (N + 1, n_z).
 
     A filter finds the state from the first measurements; without one, s_0 = U^T z_0.
     """
+    if not isinstance(model, ReducedModel | ModelRows):
+        found = np.full((len(a) + 1, z.shape[1]), np.inf)  # from where it diverges on
+        (states,) = predicted(model, [Measured(z[: len(a) + 1], a)])
+        found[: len(states)] = states
+        return found
     taken = min(_beginning(model), len(a) // 4)
     s = _estimates(model, z, a, taken + 1)
     d = 0.0 if model.d is None else model.d
@@ -408,7 +495,7 @@ def _seen(model: ReducedModel | ModelRows) -> Array:
 
 
 def fit_percent(
-    model: ReducedModel | ModelRows,
+    model: Model,
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
     first: int = 0,
 ) -> Array:

@@ -28,8 +28,9 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,9 +52,12 @@ from pdeloop.method.models.selection import (
     Accuracy,
     Kind,
     Selection,
+    kinds_of,
     limited,
     scale_of,
+    with_clean,
 )
+from pdeloop.method.models.selection import fitted as fitted_kind
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import (
     DEFAULTS,
@@ -94,7 +98,9 @@ class FieldLaw:
     its accuracy, to compare with `fitted.own`. judges: the models that were accepted. remark: where the
     model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
     where those are the first ones of trajectories alone; 0: all. doubtful: whether what it saves
-    against no control may be the error of a model that was not accepted.
+    against no control may be the error of a model that was not accepted. linear: the linearised model
+    of the whole state, of which `rows` has the part on U, at `inputs`; refit: its A, of a model of the
+    same kind fitted to other data.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
     declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
@@ -111,6 +117,9 @@ class FieldLaw:
     remark: str = ""
     part: int = 0
     doubtful: bool = False
+    linear: ReducedModel | None = None
+    inputs: Array | None = None
+    refit: Callable[[Sequence[Trajectory]], Array] | None = None
 
     @property
     def better(self) -> bool:
@@ -273,7 +282,8 @@ def field_law(
         return report
     aim = target if weights is None else aim_of(scale.reference, target, weights)
     point, remark = linearisation_point(trajectories, aim, fitted, models.reproduced)
-    lqr = regulator(model, cost, point, operating_inputs(trajectories))
+    inputs = operating_inputs(trajectories)
+    lqr = regulator(model, cost, point, inputs)
     if lqr is None:  # it grows beyond all bounds within the horizon
         return report
     K, b = lqr.K, lqr.b
@@ -289,8 +299,10 @@ def field_law(
     K_a, s_r = K @ U, U.T @ target
     # There is no constant part where the target is outside of U.
     K_b, _ = target_gain(b, s_r)
-    d = U.T @ (point + lqr.drift - lqr.A @ point)
-    rows = ModelRows(A=U.T @ lqr.A @ U, B=U.T @ lqr.B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=d)
+    drift = point + lqr.drift - lqr.A @ point
+    rows = ModelRows(
+        A=U.T @ lqr.A @ U, B=U.T @ lqr.B, U=U, K_a=K_a, K_b=K_b, s_r=s_r, d=U.T @ drift
+    )
 
     def predicted_cost(rows: ModelRows, judge: FieldModel) -> float:
         law, total = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), 0.0
@@ -307,8 +319,37 @@ def field_law(
     sure = 1.0 - math.sqrt(fitted.error)
     doubtful = alone and min(mine, others) >= sure * predicted_cost(still, model)
     return replace(
-        report, rows=rows, cost=mine, other_cost=others, remark=remark, doubtful=doubtful
+        report,
+        rows=rows,
+        cost=mine,
+        other_cost=others,
+        remark=remark,
+        doubtful=doubtful,
+        linear=ReducedModel(lqr.A, lqr.B, d=drift),
+        inputs=inputs,
+        refit=partial(_relinearised, selection, model.kind, point, inputs),
     )
+
+
+def _relinearised(
+    selection: Selection,
+    name: str,
+    point: Array,
+    action: Array,
+    trajectories: Sequence[Trajectory],
+) -> Array:
+    """A of the model of this kind of other data, at the same point; ValueError where there is none."""
+    known = len(point), selection.settings
+    kinds = kinds_of(*known, line=selection.line, shape=selection.shape)
+    rollouts = [limited(Measured(*own), selection.action_set) for own in trajectories]
+    if selection.noise:
+        rollouts = with_clean(rollouts, selection.noise, line=selection.line)
+    model = fitted_kind(
+        next(kind for kind in kinds if kind.name == name), rollouts, selection.noise
+    )
+    if model is None:
+        raise ValueError(f"no model of the kind {name} can be fitted")
+    return model.linearise(point, action)[0]
 
 
 def _accepted(models: Sequence[tuple[FieldModel, Accuracy]], most: float) -> list[FieldModel]:
