@@ -256,29 +256,39 @@ def carry_out(
     display: Display,
     check: Callable[[], None],
     advice: str,
+    *,
+    kept: bool = True,
 ) -> None:
     """Train in `folder` to the end; `check`, called now and then, may raise to stop it.
 
-    advice: how to go on after a failure.
+    advice: how to go on after a failure; kept: whether the folder stays.
     """
     for remark in remarks_on(values):
         display.warn(remark)
     if told := scale_remark(values):
         display.line(told)
     if transport.in_process:
-        _train_here(folder, values, display, check, advice)
+        _train_here(folder, values, display, check, advice, kept)
     else:
         _train_over_topics(folder, display, transport, check)
 
 
 def _train_here(
-    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None], advice: str
+    folder: Path,
+    values: dict[str, Any],
+    display: Display,
+    check: Callable[[], None],
+    advice: str,
+    kept: bool,
 ) -> None:
+    begun = False
     with RunFolder(folder).locked():
         training = build_training(values)
         writer = RunWriter(folder, values, training, warn=display.line)
 
         def report(row: Mapping[str, Any]) -> None:
+            nonlocal begun
+            begun |= row.get("event") != "phase"
             writer.note(row)
             writer.keep(now=time.monotonic())
             display.row(row)
@@ -291,6 +301,8 @@ def _train_here(
             writer.fail(str(error))
             raise
         except OwnCodeError as error:
+            if not (kept or begun):  # nothing is lost
+                raise
             raise OwnCodeError(f"{error} ({advice})") from error
         try:
             writer.finish({"transport": "in-process", "controller": built_in(training)})

@@ -333,20 +333,35 @@ def test_a_plant_that_fails_ends_the_training_with_its_cause_and_loses_nothing(
 
 
 class Breaking(pdeloop.Dynamics):
-    n_z, n_a, horizon = 2, 1, 10
+    """Fails in a step with an action, but for the first ones."""
+
+    n_z, n_a, horizon, stateful = 2, 1, 10, True
+    lasts, taken = 0, 0
 
     def initial_state(self, rng: np.random.Generator) -> Any:
-        return rng.normal(size=2)
+        self.z = rng.normal(size=2)
+        return self.z
 
     def step(self, z: Any, a: Any) -> Any:
-        if a.any():
+        Breaking.taken += bool(a.any())
+        if Breaking.taken > self.lasts:
             raise RuntimeError("no licence")
-        return 0.9 * z
+        self.z = 0.9 * self.z + 0.1 * a
+        return self.z
+
+
+class LateBreaking(Breaking):
+    """After the exploration."""
+
+    lasts = 40
 
 
 def test_a_failure_of_a_training_that_is_not_kept_is_not_to_be_continued(tmp_path: Path) -> None:
-    with pytest.raises(OwnCodeError, match=r"no licence \(give out=FOLDER, in which") as told:
+    with pytest.raises(OwnCodeError, match=r"no licence$"):  # nothing was done that could be kept
         pdeloop.train(plant=Breaking())
+    Breaking.taken = 0
+    with pytest.raises(OwnCodeError, match=r"no licence \(give out=FOLDER, in which") as told:
+        pdeloop.train(plant=LateBreaking())
     assert "resume" not in str(told.value)
     out = tmp_path / "run"
     with pytest.raises(OwnCodeError, match=rf"\(continue with: .* --resume {out} --in-process"):
