@@ -99,7 +99,8 @@ class StreamConsole(Console):
 class Display:
     """Shows a training of `seeds` seeds from `seed` on, row by row.
 
-    `remarks`: the lines about its explorations, such as inputs that they hardly tell apart.
+    `remarks`: the warnings, and the lines about its explorations, such as inputs that they hardly tell
+    apart.
     """
 
     def __init__(self, seed: int, seeds: int, stream: TextIO | None = None) -> None:
@@ -114,6 +115,7 @@ class Display:
 
     def warn(self, text: str) -> None:
         """One line that must not be overlooked."""
+        self.remarks.append(text)
         self._console.print(f"  WARNING: {text}", markup=False, style="bold yellow")
 
     def row(self, row: Mapping[str, Any]) -> None:

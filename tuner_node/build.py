@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.actuators import indicators, placed_indicators
 from pdeloop.messages.array_files import read_arrays
-from pdeloop.messages.cost import measured_cost
+from pdeloop.messages.cost import Cost, measured_cost
 from pdeloop.messages.grid import Grid, axes_of
 from pdeloop.messages.model_rows import completed, unpack
 from pdeloop.messages.parameters import measured_size, model_order, noisy
@@ -29,6 +29,7 @@ from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models.sensed import SENSED_MOST
+from pdeloop.method.reduce.channels import SHOWN, listed
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.optimizer_parameters import kind_of, settings_of
@@ -204,6 +205,31 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
 
 def remarks_on(values: Mapping[str, Any]) -> list[str]:
     """What to say before a training with these parameters begins."""
+    return [*_resting_remarks(values), *_sensor_remarks(values)]
+
+
+def _resting_remarks(values: Mapping[str, Any]) -> list[str]:
+    """Targets of the actions that no admissible action reaches."""
+    cost, allowed = Cost.parse(values["cost"]), ActionSet.of(values)
+    if cost is None or not cost.action_target.any():
+        return []
+    wanted = cost.action_target
+    nearest = allowed.project(wanted)
+    own = np.flatnonzero(
+        np.abs(nearest - wanted) > 1e-9 * np.maximum(np.abs(wanted), np.abs(nearest))
+    )
+    if not own.size:
+        return []
+    names = listed([f"a{j + 1}" for j in own])
+    aims, ends = (", ".join(f"{a:g}" for a in each[own[:SHOWN]]) for each in (wanted, nearest))
+    return [
+        f"no admissible action reaches the action_target of {names}, {aims}: the nearest is {ends}; "
+        "give one within action_low and action_high, or other bounds"
+    ]
+
+
+def _sensor_remarks(values: Mapping[str, Any]) -> list[str]:
+    """What a plant of few sensors does not say."""
     grid = Grid.parse(values["grid"]) if values["grid"] else None
     few = 0 < values["sensors"] <= SENSED_MOST
     if grid is None or not few or values["sensors"] >= values["n_z"]:

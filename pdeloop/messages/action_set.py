@@ -120,8 +120,15 @@ class ActionSet:
         if not (self.low <= self.high).all():
             told = f", and within action_limit, {limit:g}" if limit else ""
             raise ValueError(f"action_low must be at most action_high for each actuator{told}")
-        if zero_mean and not self.low.sum() <= 0.0 <= self.high.sum():
-            raise ValueError("no action between action_low and action_high has mean zero")
+        if (fixed := np.flatnonzero(self.low == self.high)).size:
+            which = f" of actuator {fixed[0] + 1}" if self.low.ndim else ""
+            raise ValueError(
+                f"action_low and action_high{which} are both {self.low.flat[fixed[0]]:g}, so it has "
+                "nothing to choose: give it a range, or leave it out of the actions (n_a)"
+            )
+        if zero_mean and not self.low.sum() < 0.0 < self.high.sum():
+            count = "only one" if self.low.sum() <= 0.0 <= self.high.sum() else "no"
+            raise ValueError(f"{count} action between action_low and action_high has mean zero")
         self.bounds: list[float] = []
         """The parameter `action_bounds`."""
         if zero_mean or self.rated or np.isfinite(own).any():

@@ -20,6 +20,7 @@ from pdeloop.method.laws import FeedForward, Law, Observer
 from pdeloop.method.laws.registry import laws_of
 from pdeloop.method.models.linear import LinearModel
 from tests.support.small import FEW_FITS
+from tuner_node.build import remarks_on
 
 N_Z, N_A, T = 6, 2, 20
 A = 0.95 * np.linalg.qr(np.random.default_rng(0).standard_normal((N_Z, N_Z)))[0]
@@ -251,6 +252,11 @@ def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
         ({"action_low": [1.0, 2.0, 3.0]}, "Servo: action_low must be a number or 2 numbers"),
         ({"action_low": 1.0, "action_high": 0.0}, "action_low must be at most action_high"),
         ({"action_low": 1.0, "zero_mean": True}, "no action between .* has mean zero"),
+        ({"action_low": 0.0, "zero_mean": True}, "only one action between .* has mean zero"),
+        (
+            {"action_low": [0.0, 2.0], "action_high": 2.0},
+            "of actuator 2 are both 2, so it has nothing",
+        ),
         ({"action_weight": 0.0}, "action_weight must be positive"),
         (
             {"state_weight": 0.0},
@@ -263,6 +269,22 @@ def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str)
     vars(servo).update(changes)
     with pytest.raises(ValueError, match=told):
         DynamicsPlant(servo)
+
+
+def test_a_target_of_the_actions_beyond_their_bounds_is_told() -> None:
+    servo = Servo()
+    servo.action_low, servo.action_high = 0.0, [0.4, 1.0]
+    (told,) = remarks_on(pdeloop.problem(plant=servo).values)
+    assert told.startswith(
+        "no admissible action reaches the action_target of a1 and a2, 0.5, -0.5: "
+    )
+    assert "the nearest is 0.4, 0" in told
+    with pytest.warns(
+        pdeloop.TrainingWarning, match="no admissible action reaches the action_target"
+    ):
+        pdeloop.train(plant=servo, rollouts=6, **FEW)
+    servo.action_low, servo.action_high = -1.0, 1.0
+    assert not remarks_on(pdeloop.problem(plant=servo).values)
 
 
 def test_what_a_plant_declares_is_read_back_or_refused_at_the_start() -> None:
