@@ -48,11 +48,13 @@ class Narration:
 
     @property
     def status(self) -> str:
-        """The newest cost of the policies that are being adapted."""
+        """The newest cost of the adaptation, which is the mean of the laws that it has tried."""
         costs = list(self._costs.values())
         if not costs:
             return ""
-        return f"cost {_spread(costs)}" if any(cost is not None for cost in costs) else "diverged"
+        if all(cost is None for cost in costs):
+            return "the laws tried last diverged"
+        return f"mean cost {_spread(costs)} of the laws tried last"
 
     @property
     def progress(self) -> str:
@@ -71,7 +73,10 @@ class Narration:
         lines = self._flush()
         if event == "phase":
             if self._phase == "adapt" and self._costs:
-                lines.append(f"  {self.done} rollouts: {self.status}")
+                returned = "the returned one" if self._seeds == 1 else "those returned"
+                known = any(cost is not None for cost in self._costs.values())
+                more = f", not of {returned}" if known else ""
+                lines.append(f"  {self.done} rollouts: {self.status}{more}")
             self._phase = str(row["phase"])
             self._rollouts = dict(enumerate(row["rollouts"]))
             self.budget = max(1, sum(row["budget"]))

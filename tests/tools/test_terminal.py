@@ -28,7 +28,9 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
     assert re.search(
-        r"adapting [━╺╸]+ +\d+ of 403 rollouts cost [\d.]+ +\d:\d\d:\d\d left", shown.plain
+        r"adapting [━╺╸]+ +\d+ of 403 rollouts mean cost [\d.]+ of the laws tried last +"
+        r"\d:\d\d:\d\d left",
+        shown.plain,
     ), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
@@ -46,8 +48,9 @@ def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
         environment={"TERM": "xterm-256color"},
         cwd=tmp_path,
     )
-    assert done.stdout.count(" of 35 rollouts, cost ") >= 6
-    assert re.search(r"^  35 rollouts: cost [\d.]+$", done.stdout, flags=re.MULTILINE)
+    assert done.stdout.count(" of 35 rollouts, mean cost ") >= 6
+    told = r"^  35 rollouts: mean cost [\d.]+ of the laws tried last, not of the returned one$"
+    assert re.search(told, done.stdout, flags=re.MULTILINE)
     assert "\x1b" not in done.stdout
     assert "\r" not in done.stdout
 

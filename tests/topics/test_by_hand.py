@@ -70,7 +70,7 @@ def test_the_three_terminals_train_and_say_where_the_results_are(
     shown = (tmp_path / "2.log").read_text()
     for words in (
         "seed 0: reduced model of order",
-        "rollouts: cost",
+        "rollouts: mean cost",
         "mean stage cost after adaptation",
         "results in my_run",
     ):

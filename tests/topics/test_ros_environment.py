@@ -67,5 +67,9 @@ def test_a_second_training_in_a_domain_that_is_given_ends_at_once_and_the_first_
     second = loop.pdeloop(*TRAIN, "--out", str(tmp_path / "b"))
     said = loop.wait(second, LIMIT, code=1)
     assert "another training runs in ROS_DOMAIN_ID=" in said.splitlines()[-1]
-    before = loop.output(first).count("rollouts, cost")
-    until(lambda: loop.output(first).count("rollouts, cost") > before, LIMIT, "the first going on")
+    before = loop.output(first).count("rollouts, mean cost")
+    until(
+        lambda: loop.output(first).count("rollouts, mean cost") > before,
+        LIMIT,
+        "the first going on",
+    )

@@ -55,7 +55,7 @@ def test_one_seed_is_told_event_by_event():
         "  seed 3: a rollout costs 5 without control, 9 with LQT; "
         "LQT is no better, and no exploration is left, so the warm start is poor",
         "adapt",
-        "  20 rollouts: cost 1.25",
+        "  20 rollouts: mean cost 1.25 of the laws tried last, not of the returned one",
         "evaluate",
     ]
 
@@ -74,10 +74,11 @@ def test_the_status_is_of_all_seeds_and_a_diverged_law_says_so():
     narration.lines(phase("adapt", [9, 9, 18]))
     assert (narration.done, narration.budget) == (36, 60)
     narration.lines(adapted(4, 11, None))
-    assert (narration.done, narration.status) == (38, "diverged")
+    assert (narration.done, narration.status) == (38, "the laws tried last diverged")
     narration.lines(adapted(5, 11, 1.0))
     narration.lines(adapted(6, 20, 3.0))
-    assert (narration.done, narration.status) == (42, "cost 2 (1 to 3) and 1 diverged")
+    told = "mean cost 2 (1 to 3) and 1 diverged of the laws tried last"
+    assert (narration.done, narration.status) == (42, told)
 
 
 def test_a_real_training_with_a_law_that_diverges_never_says_a_billion(capsys):
@@ -136,7 +137,7 @@ def test_an_optimiser_that_tells_no_cost_has_not_diverged():
     narration.lines({"event": "adapted", "seed": 3, "rollouts": 5})
     assert narration.progress == "  5 of 20 rollouts"
     narration.lines(adapted(3, 7, None))
-    assert narration.progress == "  7 of 20 rollouts: diverged"
+    assert narration.progress == "  7 of 20 rollouts: the laws tried last diverged"
 
 
 def test_what_adapted_nothing_is_no_gain():
