@@ -36,6 +36,7 @@ from pdeloop.method.reduce.identifiability import (
     NotIdentifiableError,
     fed_back,
     require_effects,
+    require_motion,
 )
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
 from pdeloop.method.reduce.reduced_model import ReducedModel, Samples, Trajectory, steps_of
@@ -387,6 +388,7 @@ def identify_data(
         raise ParameterError(
             f"expected one --input-delay, or one for each of the {n_a} inputs, got {len(input_delay)}"
         )
+    require_motion(found.trajectories, found.channels)
     used = (input_delay or (0,)) * (1 if len(input_delay or ()) > 1 else n_a)
     delays = study_delays(found.trajectories, used)
     aligned = shifted(found.trajectories, delays.best)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdeloop.data_file import read_measurements
+from pdeloop.data_file import Measurements, read_measurements
 from pdeloop.identification import Identified, identify_data
 from pdeloop.method.reduce.identifiability import NotIdentifiableError, require_effects
 
@@ -189,3 +189,34 @@ def test_steps_of_inputs_are_no_other_experiments(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "own.csv", table, delimiter=",", header=names, comments="")
     remarks = read_measurements(tmp_path / "own.csv").remarks
     assert not any("jump" in text for text in remarks)
+
+
+@pytest.mark.parametrize(
+    ("moved", "digits", "told"),
+    [
+        (0.0, "%.17g", "nor an input"),
+        (1e-12, "%.17g", "nor an input"),
+        (1e-3, "%.4g", "nor an input"),
+        (1e-3, "%.17g", ""),
+        (1.0, "%.4g", ""),
+    ],
+)
+def test_a_log_at_rest_is_told(tmp_path: Path, moved: float, digits: str, told: str) -> None:
+    """A rod at 100 degrees C: of inputs that move enough its poles are found, of others nothing."""
+    u = 50.0 + moved * (steps() - 50.0) / 50.0
+    z = rod(u, REST, noise=0.0) + 100.0
+    table = np.column_stack([10.0 * np.arange(len(z)), z, u])
+    names = "t,z1,z2,z3,z4,a1,a2"
+    path = tmp_path / "rest.csv"
+    np.savetxt(path, table, fmt=digits, delimiter=",", header=names, comments="")
+    if not told:
+        identify_data(read_measurements(path), {"identification": "regression"})
+        return
+    with pytest.raises(NotIdentifiableError, match=f"the plant stands still: .*{told}"):
+        identify_data(read_measurements(path), {})
+
+
+def test_states_that_are_frozen_while_inputs_move_are_no_plant_at_rest() -> None:
+    own = Measurements([(np.full((ROWS, 4), 20.0), steps()[:-1])], None, 1.0)
+    with pytest.raises(NotIdentifiableError, match=r"stands still: .* although a1 and a2 moved"):
+        identify_data(own, {})

@@ -65,6 +65,10 @@ PAST = 8
 """Rows whose inputs may have an effect on readings that do not show the whole state."""
 FED_BACK = 0.1
 """Independence of the last `PAST` rows below which an input may be that of a controller."""
+RESTS, NEARLY = 1e-9, 1e-2
+"""Ranges of a channel, relative to its largest value, that are rounding, and that are small."""
+DIGITS = 3
+"""Steps in which a channel was written that a small range of one at rest has at most."""
 LEVELS = 10
 """Different values from which on an input counts as rounded; below it is switched."""
 
@@ -178,6 +182,32 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
         names = [channels.input(j) for j in own]
         moves, means = y.std(axis=0)[own].tolist(), y.mean(axis=0)[own].tolist()
         raise NotIdentifiableError(words.no_effect(names, moves, means))
+
+
+def require_motion(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> None:
+    """NotIdentifiableError where no state moves by more than rounding.
+
+    That is double precision, or, of inputs that hardly move either, the last digits that were written.
+    """
+    states, inputs = (np.concatenate(own) for own in zip(*trajectories, strict=True))
+    moved, pushed = (_ranges(own) for own in (states, inputs))
+    digits = [np.diff(np.unique(x), prepend=0.0)[1:].min(initial=np.inf) for x in states.T]
+    written = np.ptp(states, axis=0) <= DIGITS * np.array(digits)
+    still = bool((pushed <= NEARLY).all())
+    if not ((moved <= RESTS) | (still & written & (moved <= NEARLY))).all():
+        return
+    own = [channels.input(int(j)) for j in np.flatnonzero(pushed > NEARLY)]
+    other = f", although {words.listed(own)} moved" if own else ", nor an input by more than 1 %"
+    raise NotIdentifiableError(
+        f"in all of the log the plant stands still: no state moves by more than {moved.max():.1g} of "
+        f"its size, which is rounding{other}; log an experiment in which the inputs move the states"
+    )
+
+
+def _ranges(columns: Array) -> Array:
+    """That of each column, relative to its largest magnitude."""
+    size = np.abs(columns).max(axis=0)
+    return np.asarray(np.ptp(columns, axis=0) / np.where(size > 0.0, size, 1.0))
 
 
 def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
