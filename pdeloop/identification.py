@@ -252,7 +252,8 @@ class Identified:
             f"spectral radius {known['spectral_radius']:.4f}",
         ]
         if (used_law := self.of_field) and used_law.inputs is not None:
-            held = _row([f"{a:.3g}" for a in used_law.inputs.tolist()])
+            some = used_law.inputs.any()
+            held = _row([f"{a:.3g}" for a in used_law.inputs.tolist()]) if some else "0"
             where = "as said below" if used_law.remark else f"at the target and a = {held}"
             lines.append(
                 f"  poles and residuals are those of the {self.kind} model of the whole field, whose "

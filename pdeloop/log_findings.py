@@ -43,6 +43,8 @@ EXPLAINED = 0.02
 """Part of usual steps that a regression misses of them at least."""
 DRIFT = 50.0
 """Variances by which a trend in time lowers the squares of residuals, from which the plant drifts."""
+BLOCKS = 20
+"""Parts of a log in each of which residuals may depend on each other."""
 PAST = 4
 """Rows of states and inputs beside which that trend counts."""
 FOLLOWED = 0.8
@@ -414,10 +416,15 @@ def _drifts(states: Array, inputs: Array, first: Flags, channels: Channels) -> l
     trend = trend - known @ linalg.lstsq(known, trend)[0]
     found = linalg.lstsq(known, z[k + 1])[0]
     missed = z[k + 1] - known @ found
-    gained = (trend @ missed) ** 2 / (trend @ trend)
+    seen = trend @ missed
+    gained = seen**2 / (trend @ trend)
     least = EXPLAINED**2 * np.sum((z[k + 1] - z[k]) ** 2, axis=0)
     left = np.maximum(np.sum(missed**2, axis=0) - gained, least)
-    own = np.flatnonzero(gained * (len(k) - width) > DRIFT * left)
+    # What a linear model misses of a nonlinear plant is no noise from row to row.
+    rest = trend[:, None] * (missed - np.outer(trend, seen / (trend @ trend)))
+    chance = sum(np.sum(part, axis=0) ** 2 for part in np.array_split(rest, BLOCKS))
+    sure = (gained * (len(k) - width) > DRIFT * left) & (seen**2 > DRIFT * chance)
+    own = np.flatnonzero(sure)
     if not own.size:
         return []
     names = listed([channels.state(i) for i in own.tolist()])

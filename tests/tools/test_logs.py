@@ -275,6 +275,21 @@ def test_a_disturbance_that_grows_is_told(tmp_path: Path, drift: float) -> None:
     assert len(told) == (drift > 0.0) and all(text.startswith("z1 ") for text in told)
 
 
+@pytest.mark.parametrize("seed", [24, 51])
+def test_a_nonlinear_plant_does_not_drift(tmp_path: Path, seed: int) -> None:
+    """Two tanks whose outflow is the root of the level."""
+    rng, z = np.random.default_rng(seed), np.full((900, 2), 4.0)
+    held = [np.repeat(rng.uniform(0.0, 6.0, 80), rng.integers(12, 50, 80)) for _ in range(2)]
+    u = np.stack([own[:900] for own in held], axis=1)
+    for k in range(899):
+        out = 0.1 * np.sqrt(np.maximum(z[k], 0.0))
+        z[k + 1] = z[k] + [0.1 * u[k, 0] - out[0], 0.05 * u[k, 1] + out[0] - out[1]]
+    z += 0.02 * rng.standard_normal(z.shape)
+    np.savez(tmp_path / "log.npz", states=z, actions=u[:-1], sample_time=1.0)
+    remarks = read_measurements(tmp_path / "log.npz").remarks
+    assert not any("drift" in text for text in remarks)
+
+
 def test_rows_of_another_step_that_cut_leaves_out_are_told(tmp_path: Path) -> None:
     """The second half was logged at every third step: none of its rows has a neighbour."""
     kept = np.r_[:150, 150:ROWS:3]
