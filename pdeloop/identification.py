@@ -156,12 +156,11 @@ class Identified:
         """Warnings to read before the model is used."""
         found = [*self.remarks, *self.determined.remarks]
         loop, d = self.closed_loop, self.model.d
-        if loop is not None and loop.left > FAR:
+        if loop is not None and loop.ends[0] > FAR:
             found.append(
-                f"on the model the law ends with {100 * loop.left:.3g} % of the distance to the target "
-                "left: R a^2, which counts from a = 0, costs more than that distance, the actuators "
-                "hardly reach it, or the model is wrong; lower --action-weight, take a target that "
-                "they reach, or a log that comes nearer to it"
+                f"on the model the law ends {loop.ends[1]}: R a^2, which counts from a = 0, costs more "
+                "than that distance, the actuators hardly reach it, or the model is wrong; lower "
+                "--action-weight, take a target that they reach, or a log that comes nearer to it"
             )
         mean, spread = self.trajectory[0].mean(axis=0), self.trajectory[0].std(axis=0)
         set_off = (np.abs(mean) > OFFSET * spread) & (spread > 0.0)

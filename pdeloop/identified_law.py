@@ -31,7 +31,7 @@ class ClosedLoop:
 
     states (N + 1, n_z): U s_k; actions (N, n_a); target (n_z,); radius: spectral radius of A + B K_a;
     recorded: the lowest and the highest recorded value of each action, (2, n_a); model: its kind, of
-    one of the whole field.
+    one of the whole field; variation: of the recorded states, the norm of their standard deviations.
     """
 
     states: Array
@@ -40,6 +40,7 @@ class ClosedLoop:
     radius: float
     recorded: Array
     model: str = ""
+    variation: float = 0.0
 
     @property
     def settled(self) -> int:
@@ -53,6 +54,17 @@ class ClosedLoop:
         """|U s_N - z_r|, relative to |U s_0 - z_r|; infinity if s_0 is there already."""
         first, last = (float(np.linalg.norm(self.states[k] - self.target)) for k in (0, -1))
         return last / first if first > 0.0 else float("inf") if last > 0.0 else 0.0
+
+    @property
+    def ends(self) -> tuple[float, str]:
+        """How far from the target it ends, relative to where it begins or the variation; in words."""
+        if np.isfinite(self.left):
+            return self.left, f"with {100 * self.left:.3g} % of the distance to the target left"
+        away = float(np.linalg.norm(self.states[-1] - self.target)) / max(self.variation, 1e-300)
+        return (
+            away,
+            f"from the target to {100 * away:.3g} % of the variation of the log away from it",
+        )
 
     def summary(self) -> dict[str, Any]:
         """The findings as data."""
@@ -76,8 +88,8 @@ class ClosedLoop:
         lines = [
             f"closed loop on the {self.model + ' ' * bool(self.model)}model, from the first recorded "
             "state",
-            f"  spectral radius {self.radius:.4f}; settled after {self.settled * step:.3g}{unit}, with "
-            f"{100 * self.left:.3g} % of the distance to the target left",
+            f"  spectral radius {self.radius:.4f}; settled after {self.settled * step:.3g}{unit}, "
+            f"{self.ends[1]}",
         ]
         (low, high), (least, most) = self.taken, self.recorded
         room = BEYOND * (most - least)
@@ -131,4 +143,5 @@ def closed_loop(
     recorded = np.stack([actions.min(axis=0), actions.max(axis=0)])
     seen = np.array(reduced) if model else np.array(reduced) @ law.measurement.T
     kind = model.kind if model else ""
-    return ClosedLoop(seen, np.array(applied), target, radius, recorded, kind)
+    variation = float(np.linalg.norm(states.std(axis=0)))
+    return ClosedLoop(seen, np.array(applied), target, radius, recorded, kind, variation)

@@ -113,6 +113,18 @@ def test_identify_gives_its_verdict_and_the_orders_of_its_method(
     assert "residuals: " in text
 
 
+def test_a_law_that_begins_at_the_target_ends_near_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not an infinite share of no distance away."""
+    z, a = logged((0, 0), noise=0.0, process=0.3)
+    np.savez(tmp_path / "own.npz", states=z, actions=a, target=z[0], sample_time=0.5)
+    assert main(["identify", "--data", str(tmp_path / "own.npz"), "--order", "4"]) == 0
+    said = capsys.readouterr()
+    assert "% of the variation of the log away from it" in said.out
+    assert "law ends" not in said.err and "inf" not in said.out + said.err
+
+
 def test_units_in_which_a_state_has_no_say_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
