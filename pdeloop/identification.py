@@ -138,8 +138,8 @@ class Identified:
     def poles(self) -> NDArray[np.complex128]:
         """The poles of that model, at the target where it is not linear."""
         used = self.of_field
-        linear = used.linear if used and used.linear else self.model
-        return np.asarray(np.linalg.eigvals(linear.A), dtype=np.complex128)
+        A = used.determined(used.linear.A) if used and used.linear else self.model.A
+        return np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
@@ -147,9 +147,7 @@ class Identified:
         if self.target is None or not isinstance(self.model, ModelRows):
             return None
         known, used = (self.model, self.target, *self.trajectory), self.of_field
-        if used and used.fitted and self.model.L is None:
-            return closed_loop(*known, used.fitted.model, used.linear)
-        return closed_loop(*known)
+        return closed_loop(*known, used if self.model.L is None else None)
 
     @property
     def warnings(self) -> list[str]:
@@ -650,7 +648,9 @@ def _identified(
     acting = early
     if field and field.better and field.fitted and field.linear and field.refit:
         rollouts = [(np.asarray(own.states), own.actions) for own in field.fitted.rollouts]
-        pole = largest_pole(field.linear.A, rollouts, field.refit)
+        again, own_part = field.refit, field.determined
+        known_part = own_part(field.linear.A)
+        pole = largest_pole(known_part, rollouts, lambda parts: own_part(again(parts)))
         checked, aligned, acting = field.fitted.model, trajectories, delays  # it has no memory
     return Identified(
         model,

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
-from pdeloop.method.models.base import FieldModel
 from pdeloop.method.reduce.channels import SHOWN, Channels
-from pdeloop.method.reduce.reduced_model import ReducedModel
+
+if TYPE_CHECKING:
+    from pdeloop.method.design.field_law import FieldLaw
 
 SETTLED = 0.05
 """Share of the way from the first to the last state within which the loop counts as settled."""
@@ -111,19 +112,20 @@ def closed_loop(
     target: Array,
     states: Array,
     actions: Array,
-    model: FieldModel | None = None,
-    linear: ReducedModel | None = None,
+    field: FieldLaw | None = None,
 ) -> ClosedLoop:
     """Simulate s_{k+1} = A s_k + B a_k + d under a_k = K_a s_k + K_b s_r + b, from s_0 = U^T z_0.
 
     states (N + 1, n_z) and actions (N, n_a): the recorded trajectory whose first state it begins with.
-    It runs for its length, or longer, until the slowest mode has decayed. model, linear: one of the
-    whole field that is simulated in its place, and its linearisation.
+    It runs for its length, or longer, until the slowest mode has decayed. field: the report on a model
+    of the whole field, which is simulated in its place.
     """
-    A, B, K = law.A, law.B, law.K_a
-    if linear is not None:
-        A, B, K = linear.A, linear.B, K @ law.U.T
-    radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
+    A, B, K, model = law.A, law.B, law.K_a, None
+    closed = A + B @ K
+    if field is not None and field.linear is not None and field.fitted is not None:
+        K, model = K @ law.U.T, field.fitted.model
+        closed = field.determined(field.linear.A + field.linear.B @ K)
+    radius = float(np.abs(np.linalg.eigvals(closed)).max())
     needed = np.log(DECAYED) / np.log(min(max(radius, 0.01), 1.0 - 1e-9))
     steps = int(np.clip(np.ceil(needed), len(actions), LONGEST * len(actions)))
     s, forced = law.U.T @ states[0] if model is None else states[0], law.constant

@@ -65,6 +65,21 @@ def test_the_figures_are_those_of_the_model_whose_law_is_used() -> None:
     assert "closed loop on the polynomial model" in text and "of the regression:" in text
 
 
+def test_directions_in_which_nothing_moves_have_no_poles() -> None:
+    """A third sensor between the two tanks: a polynomial model leaves what is not moved where it is."""
+    z, a = log()
+    own = Measurements(
+        [(np.column_stack([z, z.mean(axis=1)]), a)],
+        np.r_[TARGET, TARGET.mean()],
+        1.0,
+        sources=[{"trajectory": 0}],
+    )
+    found = identify_data(own, {"action_weight": 1.0, "reduced_order": 2})
+    assert found.kind == "polynomial" and found.closed_loop is not None
+    np.testing.assert_allclose(np.sort(found.poles.real), poles_at(a.mean(axis=0)), atol=1e-4)
+    assert found.pole[2] < 0.95 and found.closed_loop.radius < 0.95
+
+
 def test_the_figures_of_the_regression_are_had_by_its_name() -> None:
     found = identified(*log(), identification="regression", reduced_order=2)
     known = found.summary()

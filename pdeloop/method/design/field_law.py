@@ -46,11 +46,13 @@ from pdeloop.method.models.base import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.base import Law, pieces, predicted, samples_of, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
+from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.selection import (
     BETTER,
     UNKNOWN,
     Accuracy,
     Kind,
+    Scale,
     Selection,
     kinds_of,
     limited,
@@ -82,6 +84,9 @@ EQUAL = 1e-4
 """Relative difference up to which costs are the same: the law of the regression is used then."""
 EXACT = 1e-6
 """E of a model that counts as exact."""
+EXCITED = 3e-3
+"""Variation in a direction, relative to the largest, from which on the data say how it decays: ridges
+are up to the square of that."""
 FAR = 3.0
 """Distance of the target from the mean state, relative to that of the farthest measured state, above
 which it is outside of the data."""
@@ -99,8 +104,9 @@ class FieldLaw:
     model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
     where those are the first ones of trajectories alone; 0: all. doubtful: whether what it saves
     against no control may be the error of a model that was not accepted. linear: the linearised model
-    of the whole state, of which `rows` has the part on U, at `inputs`; refit: its A, of a model of the
-    same kind fitted to other data.
+    of the whole state, of which `rows` has the part on U, at `inputs`; excited: S and P with S P = I,
+    onto the directions in which the data move and back, empty: all; refit: A, of a model of the same
+    kind fitted to other data.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
     declared. There is no law then, as the exploration was drawn for the declared noise, and is too weak
@@ -119,12 +125,20 @@ class FieldLaw:
     doubtful: bool = False
     linear: ReducedModel | None = None
     inputs: Array | None = None
+    excited: tuple[Array, ...] = ()
     refit: Callable[[Sequence[Trajectory]], Array] | None = None
 
     @property
     def better(self) -> bool:
         """True if its law is cheaper on the model than the other one, by more than nothing."""
         return self.rows is not None and self.cost < (1.0 - EQUAL) * self.other_cost
+
+    def determined(self, A: Array) -> Array:
+        """What the data determine of a matrix of the whole state: S A P."""
+        if not self.excited:
+            return A
+        S, P = self.excited
+        return S @ A @ P
 
     def summary(self) -> dict[str, Any]:
         """The report as data."""
@@ -327,8 +341,20 @@ def field_law(
         doubtful=doubtful,
         linear=ReducedModel(lqr.A, lqr.B, d=drift),
         inputs=inputs,
+        excited=_excited(model, [states for states, _ in trajectories], scale),
         refit=partial(_relinearised, selection, model.kind, point, inputs),
     )
+
+
+def _excited(model: FieldModel, states: Sequence[Array], scale: Scale) -> tuple[Array, ...]:
+    """`FieldLaw.excited` of a model whose coefficients no points share: elsewhere its ridge decides."""
+    if not isinstance(getattr(model, "inner", model), LinearModel | PolynomialModel):
+        return ()
+    gram = sum(y.T @ y for y in ((own - scale.reference) / scale.units for own in states))
+    with one_thread():
+        squares, vectors = linalg.eigh(gram)
+    W = vectors[:, squares > EXCITED**2 * squares[-1]]
+    return W.T / scale.units, W * scale.units[:, None]
 
 
 def _relinearised(
