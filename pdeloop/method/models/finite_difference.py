@@ -453,10 +453,13 @@ def of_features(
 
 _POINT_PASSES = 4
 """How often an equation of finite differences is refitted along the paths of the last fit."""
+_SETTLED = 0.1
+"""Relative change of what its steps miss at which the passes end."""
 _POINT_SUBSTEPS = 32
 """Maximum number of internal steps per sampling time."""
-_COARSE = 1e-4
-"""Largest change of a step by fewer internal ones, per root mean square of the change in all steps."""
+_COARSE_SAMPLES, _COARSE = 100, 1e-4
+"""Data steps, at most, that choose internal ones, and what fewer may change in a step, per root mean
+square of the change in all steps."""
 _POINT_REACH = 2.5
 """Fastest rate of a finite-difference model times its internal step, of a rule of order 4."""
 
@@ -478,10 +481,12 @@ def fit_finite_difference(
     features = features_of(components, len(shape) or 1)
     size = largest_of(samples)
     model, fitted = nothing(kind, features, samples, components, shape), None
+    least = np.inf
     for _ in range(_POINT_PASSES):
         data = Regression.along(model, samples)
-        if data is None:
+        if data is None or data.miss > (1.0 - _SETTLED) * least:
             break
+        least = data.miss
         found = data.solved(coefficients(data.columns(), ridge), model)
         if found is None:
             break
@@ -510,6 +515,7 @@ def largest_of(samples: Samples) -> float:
 
 def coarsest(model: FiniteDifferenceModel, samples: Samples) -> FiniteDifferenceModel:
     """With the fewest internal steps that change no step by more than a share of the mean change."""
+    samples = samples.thinned(_COARSE_SAMPLES)
     fine = model.step(samples.before, samples.actions)
     most = _COARSE * np.sqrt(np.mean(np.sum((samples.after - samples.before) ** 2, axis=1)))
 
@@ -645,8 +651,6 @@ _NEAR_SUBSTEPS = 8
 """Maximum number of internal steps of the paths of a fit."""
 _NEAR_PASSES = 8
 """Further passes of a model of neighbours, on what its steps miss."""
-_NEAR_SETTLED = 0.1
-"""Relative change of what its steps miss at which the passes end."""
 _NEAR_DROPPED = 0.5
 """Share by which its residual may grow when products are left out."""
 _NEAR_NEGLIGIBLE = 1e-12
@@ -713,7 +717,7 @@ def _passes(
         data = Regression.along(model, samples, missed=True)
         if data is None or not data.miss < least:
             break
-        settled = data.miss > (1.0 - _NEAR_SETTLED) * least
+        settled = data.miss > (1.0 - _SETTLED) * least
         best, least = model, data.miss
         if settled:
             break
