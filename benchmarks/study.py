@@ -5,6 +5,7 @@
 driver is killed twice: the same bits as in one process without any kill. `overhead`: seconds per
 training on one process of a study against a bare loop in this one, and the speed-up with two.
 `simulated`: many tasks that sleep, on many simulated workers: processor time and memory of the driver.
+`scheduler`: the same on a Dask scheduler, whose workers are threads of one process.
 """
 
 from __future__ import annotations
@@ -12,21 +13,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import multiprocessing
 import os
+import pickle
 import random
 import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from operator import sub
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 from benchmarks.processes import markdown
@@ -36,9 +41,9 @@ from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import local_workers
 from pdeloop.study.results import Ended, reading
-from pdeloop.study.run import Pool, ended_well
+from pdeloop.study.run import Pool, Task, ended_well
 from pdeloop.study.table import status
-from pdeloop.study.training import train_one
+from pdeloop.study.training import listener, train_one
 
 SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 20}
 DRIVER_KILLS = 2
@@ -54,6 +59,7 @@ def run(
     tasks: int = 10_000,
     simulated: int = 64,
     seconds: float = 1.0,
+    scheduler: bool = False,
     problem: str = "burgers",
 ) -> dict[str, Any]:
     """Kill workers and drivers, and measure what a study adds to its trainings.
@@ -74,6 +80,8 @@ def run(
         Simulated workers that carry them out.
     seconds
         Seconds that each sleeps.
+    scheduler
+        Also carry the tasks out on a Dask scheduler.
     problem
         The problem of the trainings.
     """
@@ -86,6 +94,8 @@ def run(
             result["killed"] = killed(_study(problem, range(trainings)), folder, workers, every)
         if tasks:
             result["simulated"] = without_work(problem, folder, tasks, simulated, seconds)
+        if tasks and scheduler:
+            result["scheduler"] = on_a_scheduler(problem, folder, tasks, simulated, seconds)
     return result
 
 
@@ -237,23 +247,111 @@ def without_work(
             time.sleep(seconds)
             return ended._replace(name=name)
 
-    before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.perf_counter()
-    carry_out(study, folder / "simulated", partial(Sleeping, simulated))
-    elapsed = time.perf_counter() - began
-    spent = time.process_time() - before
-    kept = [path for path in (folder / "simulated").rglob("*") if path.is_file()]
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return _driver(study, folder / "simulated", partial(Sleeping, simulated), simulated, seconds)
+
+
+def on_a_scheduler(
+    problem: str, folder: Path, tasks: int, simulated: int, seconds: float
+) -> dict[str, Any]:
+    """The same on a Dask scheduler, with its workers in one process: real messages, and progress."""
+    from pdeloop.study.cluster import cluster
+
+    study = _study(problem, range(tasks))
+    path = folder / "files"
+    path.write_bytes(pickle.dumps(train_one(next(iter(study.trainings().values())))))
+    context = multiprocessing.get_context("spawn")
+    address = context.SimpleQueue()
+    process = context.Process(target=_dask, args=(simulated, address), daemon=True)
+    process.start()
+    try:
+        pool = partial(cluster, address.get())
+        own = {"two-point": partial(asleep, str(path), seconds)}
+        memory: list[int] = []
+
+        def look() -> None:
+            memory.append(_memory(process.pid))
+
+        found = _driver(study, folder / "scheduler", pool, simulated, seconds, own, look)
+    finally:
+        process.kill()
+        process.join()
+    found["scheduler_and_workers_mb"] = max(memory) / 1e6
+    found["their_growth_mb"] = (max(memory) - memory[0]) / 1e6
+    return found
+
+
+def _dask(count: int, address: Any) -> None:
+    """In a process of its own: a scheduler with so many workers."""
+    from distributed import LocalCluster
+
+    with LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=count,
+        threads_per_worker=1,
+        processes=False,
+        memory_limit=0,
+        silence_logs=logging.CRITICAL + 1,
+        host="127.0.0.1",
+        protocol="tcp",
+        dashboard_address=None,
+    ) as own:
+        address.put(own.scheduler_address)
+        threading.Event().wait()
+
+
+ROWS = 12
+"""Rows of progress of a task, as many as of a training by `SETTINGS`."""
+
+
+def asleep(path: str, seconds: float, values: Mapping[str, Any]) -> Mapping[str, bytes]:
+    """Sleep, with the progress of a training, and have the files that another one has left there."""
+    tell = listener()
+    for row in range(ROWS):
+        tell({"phase": "adapting", "rollouts": 2.0 * row, "memory_mb": 200.0})
+        time.sleep(seconds / ROWS)
+    files: Mapping[str, bytes] = pickle.loads(Path(path).read_bytes())
+    return files
+
+
+def _memory(pid: int | None) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def _driver(
+    study: Study,
+    folder: Path,
+    pool: Pool,
+    simulated: int,
+    seconds: float,
+    own: Mapping[str, Task] = MappingProxyType({}),
+    look: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Processor time and memory of a driver from the first results to the last tasks.
+
+    look: called meanwhile.
+    """
+    tasks = len(study.trainings())
+    marks: list[tuple[int, float, float, int]] = []
+
+    def tell(done: int, total: int, status: str) -> None:
+        if simulated <= done < tasks:
+            now = done, time.perf_counter(), time.process_time(), _memory(os.getpid())
+            marks[1:] = [now]
+            look()
+
+    carry_out(study, folder, pool, tasks=own, tell=tell)
+    (first, began, before, memory), (last, ended, after, most) = marks
+    spent, elapsed, count = after - before, ended - began, last - first
+    kept = [path for path in folder.rglob("*") if path.is_file()]
     return {
         "tasks": tasks,
         "workers": simulated,
         "task_seconds": seconds,
         "seconds": elapsed,
-        "share_of_workers_percent": 100 * tasks * seconds / (elapsed * simulated),
-        "driver_ms_per_task": 1e3 * spent / tasks,
+        "share_of_workers_percent": 100 * count * seconds / (elapsed * simulated),
+        "driver_ms_per_task": 1e3 * spent / count,
         "driver_percent_of_a_core": 100 * spent / elapsed,
-        "memory_mb": most / 1024,
-        "memory_growth_mb": (most - memory) / 1024,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "memory_growth_mb": (most - memory) / 1e6,
         "files": len(kept),
         "megabytes": sum(path.stat().st_size for path in kept) / 1e6,
     }

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, wait
 from importlib import metadata
 from itertools import chain
 from typing import Any
@@ -36,12 +36,13 @@ MANY = 1e9
 """What a worker has of a resource, of which a training takes 1."""
 ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
 """Events of workers, in a topic of the study's, and of the scheduler."""
-PACE = 0.1
-"""Seconds in which results gather; meanwhile workers begin with what waits there."""
+PACE = 0.5
+"""Seconds in which results gather, as few large messages cost the driver less than many; meanwhile
+workers begin with what waits there."""
 SETTLED, LOOK_PERIOD = 1.0, 30.0
 """Seconds after which the scheduler has what was submitted, and between two looks at what it has."""
-TELL_PERIOD = 0.1
-"""Seconds between two events of a training, at least."""
+TELL_PERIOD, TOLD = 0.1, 100.0
+"""Seconds between two rows of progress of a training, at least, and most of them of all in a second."""
 
 
 class Cluster(Workers):
@@ -64,6 +65,7 @@ class Cluster(Workers):
         self._kinds: dict[str, str] = {}
         self._strangers: dict[str, str] = {}
         self._waiting = {}
+        self._new: list[tuple[str, str, bytes]] = []
         self._at: dict[str, Any] = {}
         self._kind_of: dict[str, str] = {}
         self._since: dict[str, float] = {}
@@ -74,7 +76,6 @@ class Cluster(Workers):
             self._meet(at, environment)
         self._datasets: dict[str, str] = {}
         self._left: set[str] = set()
-        self._new: dict[str, Any] = {}
         self._old: list[str] = []
         self._progress: dict[str, deque[Mapping[str, Any]]] = {}
         self._running: dict[str, set[str]] = defaultdict(set)
@@ -113,31 +114,54 @@ class Cluster(Workers):
 
         resource = resource_of(self.environments[kind]) if kind else ANY
         dataset = f"pdeloop/{self._study}/{identity}/{resource}/{name}"
-        with _of_the_scheduler():
-            future = None
-            if dataset in self._left:  # of a driver that has died
-                self._left.discard(dataset)
+        self._datasets[name], self._kind_of[name] = dataset, kind
+        self._since[name] = time.monotonic()
+        if dataset in self._left:  # of a driver that has died
+            self._left.discard(dataset)
+            with _of_the_scheduler():
                 future = self._client.get_dataset(dataset)
-            if future is None or future.key not in self._there:
-                future = self._client.submit(
+            if future.key in self._there:
+                self._at[name] = future
+                return
+        # Dask looks into every argument for its own.
+        self._new.append((name, resource, pickle.dumps((task, arguments))))
+
+    def settle(self) -> None:
+        new, self._new = self._new, []
+        period = max(TELL_PERIOD, len(self._kinds) / TOLD)
+        with _of_the_scheduler():
+            for resource in {resource for _, resource, _ in new}:
+                own = {name: pickled for name, other, pickled in new if other == resource}
+                futures = self._client.map(
                     on_worker,
-                    self._topic,
-                    name,
-                    pickle.dumps((task, arguments)),  # Dask looks into every argument for its own
-                    key=f"pdeloop-{name}-{uuid4().hex}",
+                    [*own],
+                    [*own.values()],
+                    topic=self._topic,
+                    period=period,
+                    key=[f"pdeloop-{name}-{uuid4().hex}" for name in own],
                     retries=0,
                     resources={resource: 1},
                 )
-                self._new[dataset] = future
-        own: Future[Ended] = Future()
-        self._waiting[own], self._at[name], self._datasets[name] = name, future, dataset
-        self._kind_of[name], self._since[name] = kind, time.monotonic()
-        self._client.loop.add_callback(self._pass_on, future, own)
+                self._at |= zip(own, futures, strict=True)
+            if self._old:
+                self._client.unpublish_dataset(self._old)
+                self._old = []
+            if new:
+                published = {self._datasets[name]: self._at[name] for name, *_ in new}
+                self._client.publish_dataset(published, override=True)
 
     def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
         time.sleep(PACE)
+        asked = {*self._waiting.values()}
+        done: dict[Future[Ended], str] = {
+            Future(): name for name in self._at if name not in asked and self._at[name].done()
+        }
+        self._waiting |= done
+        for own, name in done.items():
+            self._client.loop.add_callback(self._pass_on, self._at[name], own)
+        wait(done, timeout)  # but for one that its worker has lost meanwhile
         found = []
-        for name, future in super().collect(timeout):
+        for name, future in super().collect(0):
             again = name in self._again and future.cancelled()
             found.append((name, lost() if again else future))
             self._leave(name)
@@ -180,15 +204,6 @@ class Cluster(Workers):
             self._revive()
         return found
 
-    def settle(self) -> None:
-        with _of_the_scheduler():
-            if self._old:
-                self._client.unpublish_dataset([n for n in self._old if n not in self._new])
-                self._old = []
-            if self._new:
-                self._client.publish_dataset(self._new, override=True)
-                self._new = {}
-
     def take_back(self, name: str) -> None:
         future = self._at[name]
         super().take_back(name)
@@ -197,6 +212,7 @@ class Cluster(Workers):
 
     def end(self) -> None:
         """Carry nothing out any longer."""
+        self._new = []
         with contextlib.suppress(Exception):  # of a scheduler that has gone
             for name in [*self._at]:
                 self.take_back(name)
@@ -247,9 +263,8 @@ class Cluster(Workers):
         self._look_at = now + LOOK_PERIOD
         with _of_the_scheduler():
             there = self._with_a_worker()
-            for own, name in self._waiting.items():
-                future, settled = self._at[name], now > self._since[name] + SETTLED
-                if future.key in there or own.done() or not settled:
+            for name, future in self._at.items():
+                if future.key in there or future.done() or now < self._since[name] + SETTLED:
                     continue
                 if self.window(self._kind_of[name]):
                     self._again.add(name)
@@ -261,9 +276,7 @@ class Cluster(Workers):
 
     def _leave(self, name: str) -> None:
         """A training is not this object's any longer."""
-        dataset = self._datasets.pop(name)
-        if self._new.pop(dataset, None) is None:
-            self._old.append(dataset)
+        self._old.append(self._datasets.pop(name))
         del self._at[name], self._kind_of[name], self._since[name]
         self._again.discard(name)
         self._progress.pop(name, None)
@@ -302,10 +315,10 @@ async def meet(dask_worker: Any) -> dict[str, str]:
     return own
 
 
-def on_worker(topic: str, name: str, pickled: bytes) -> Ended:
+def on_worker(name: str, pickled: bytes, *, topic: str, period: float) -> Ended:
     """Carry out a task on a worker, which tells the driver how far it is.
 
-    pickled: the task and its arguments.
+    pickled: the task and its arguments; period: seconds between two rows of progress, at least.
     """
     from distributed import get_worker
     from distributed.protocol import pickle
@@ -320,7 +333,7 @@ def on_worker(topic: str, name: str, pickled: bytes) -> Ended:
 
     def hear(row: Mapping[str, Any]) -> None:
         nonlocal told_at
-        if time.monotonic() > told_at + TELL_PERIOD:
+        if time.monotonic() > told_at + period:
             told_at = time.monotonic()
             tell("row", row=dict(row))
 
@@ -355,51 +368,56 @@ def cluster(address: str, security: Mapping[str, str] | None = None) -> Iterator
     own = metadata.version("distributed")
     # First, as a client fails in many ways at another one.
     _check_versions({"scheduler": _version_at(address, arguments)}, own)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _of_the_scheduler():
         warnings.simplefilter("ignore", VersionMismatchWarning)
         client = Client(address, timeout=CONNECTING, set_as_default=False, security=secured)
     with _quiet(), client:
-        with contextlib.suppress(TimeoutError):  # in a batch job they come later
-            client.wait_for_workers(1, timeout=WAITING)
-        known_versions: Any = client.get_versions()
-        workers = known_versions["workers"]
-        if not workers:
-            raise StudyError(
-                f"the scheduler at {address} has no workers; start some with: "
-                + WORKER.format(address=address)
-            )
-        known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
-        _check_versions(known, own)
-        # A worker would end at a task of a package that it lacks; the scheduler reads tasks as well.
-        found = client.run(metadata.version, "pdeloop", on_error="return")
-        installed = {f"worker at {at}": version for at, version in found.items()}
-        try:
-            installed["scheduler"] = client.run_on_scheduler(metadata.version, "pdeloop")
-        except metadata.PackageNotFoundError as error:
-            installed["scheduler"] = error
-        for whose, version in installed.items():
-            if isinstance(version, OSError):
-                continue  # it has gone meanwhile
-            if isinstance(version, Exception):
-                raise StudyError(f"the {whose} has no pdeloop; install pdeloop[cluster] there")
-            if version != metadata.version("pdeloop"):
-                raise StudyError(
-                    f"the {whose} has pdeloop {version}, and this machine has "
-                    f"{metadata.version('pdeloop')}; install the same on all"
-                )
-        answers = client.run(meet, on_error="return")
-        environments = {at: own for at, own in answers.items() if not isinstance(own, OSError)}
-        for at, answer in environments.items():
-            if isinstance(answer, Exception):
-                raise StudyError(
-                    f"the worker at {at} has another pdeloop, or cannot answer ({answer}); install the "
-                    "same on all"
-                )
-        pool = Cluster(client, environments)
+        with _of_the_scheduler():
+            pool = Cluster(client, _environments(client, address, own))
         try:
             yield pool
         finally:
             pool.end()
+
+
+def _environments(client: Any, address: str, own: str) -> dict[str, Mapping[str, str]]:
+    """Those of the workers, by address. StudyError unless all have this pdeloop and Dask `own`."""
+    with contextlib.suppress(TimeoutError):  # in a batch job they come later
+        client.wait_for_workers(1, timeout=WAITING)
+    workers = client.get_versions()["workers"]
+    if not workers:
+        raise StudyError(
+            f"the scheduler at {address} has no workers; start some with: "
+            + WORKER.format(address=address)
+        )
+    known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
+    _check_versions(known, own)
+    # A worker would end at a task of a package that it lacks; the scheduler reads tasks as well.
+    found = client.run(metadata.version, "pdeloop", on_error="return")
+    installed = {f"worker at {at}": version for at, version in found.items()}
+    try:
+        installed["scheduler"] = client.run_on_scheduler(metadata.version, "pdeloop")
+    except metadata.PackageNotFoundError as error:
+        installed["scheduler"] = error
+    for whose, version in installed.items():
+        if isinstance(version, OSError):
+            continue  # it has gone meanwhile
+        if isinstance(version, Exception):
+            raise StudyError(f"the {whose} has no pdeloop; install pdeloop[cluster] there")
+        if version != metadata.version("pdeloop"):
+            raise StudyError(
+                f"the {whose} has pdeloop {version}, and this machine has "
+                f"{metadata.version('pdeloop')}; install the same on all"
+            )
+    answers = client.run(meet, on_error="return")
+    environments = {at: own for at, own in answers.items() if not isinstance(own, OSError)}
+    for at, answer in environments.items():
+        if isinstance(answer, Exception):
+            raise StudyError(
+                f"the worker at {at} has another pdeloop, or cannot answer ({answer}); install the "
+                "same on all"
+            )
+    return environments
 
 
 def _is_news(record: logging.LogRecord) -> bool:

@@ -120,13 +120,12 @@ def run(
         if (folder / STUDY_FILE).exists():
             driver = begun()
         attempts = 0
-        while True:
+        while not driver or driver.done < len(trainings):
             before = driver.done if driver else 0
             try:
                 with _kept(executor, driver, folder) as pool:
                     driver = driver or begun()  # no folder before there are workers
                     driver.carry_out(pool if isinstance(pool, Workers) else Workers(pool))
-                return driver.failures()
             except (BrokenExecutor, CancelledError) as error:
                 attempts = 0 if driver and driver.done > before else attempts + 1
                 if attempts == ATTEMPTS:
@@ -135,6 +134,7 @@ def run(
                         f"the workers ended {ATTEMPTS} times before their trainings ({error}); is "
                         f"there enough memory? {done} of {len(trainings)} are done and kept in {folder}"
                     ) from error
+        return driver.failures()
 
 
 @contextmanager

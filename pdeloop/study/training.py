@@ -46,7 +46,7 @@ _folder: str | None = None
 _listener: ContextVar[Callable[[Mapping[str, Any]], None]] = ContextVar(
     "listener", default=lambda row: None
 )
-"""What is told of each batch of the training: its phase, rollouts and memory."""
+"""What is told of each batch of a training: its phase, rollouts and memory."""
 CHECKPOINT_PERIOD, CHECKPOINT_SHARE = 10.0, 0.05
 """Seconds between two checkpoints of a training, and the share of its time that they may take."""
 PLANT_FILE = "plant"
@@ -83,6 +83,11 @@ def listening(tell: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
         yield
     finally:
         _listener.reset(before)
+
+
+def listener() -> Callable[[Mapping[str, Any]], None]:
+    """What is told of each batch of the trainings of this thread."""
+    return _listener.get()
 
 
 def work_in(folder: str) -> None:
@@ -132,7 +137,7 @@ def _train(folder: RunFolder, parameters: Mapping[str, Any], pair: LocalPair, cu
     writer = RunWriter(folder.path, parameters, training, warn=lambda text: None)
     policies: list[NDArray[np.float64]] = []
     rollouts: list[float] = []
-    tell, keep_at = _listener.get(), time.monotonic() + CHECKPOINT_PERIOD
+    tell, keep_at = listener(), time.monotonic() + CHECKPOINT_PERIOD
 
     def note() -> None:
         nonlocal keep_at

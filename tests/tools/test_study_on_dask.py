@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -250,6 +250,35 @@ def test_a_scheduler_that_is_killed_is_reported_in_a_sentence(
     (line,) = [line for line in told.err.splitlines() if line.startswith("pdeloop: ")]
     assert "no Dask scheduler answers at tcp://127.0.0.1:" in line
     assert f"trainings are kept in {out}, which `pdeloop study --out {out}` continues" in line
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("seen", ["scheduler", "worker"])
+def test_a_scheduler_that_ends_while_a_driver_connects_is_reported_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: str
+):
+    """Once the driver has seen its version, or that of its workers."""
+    check = dask_client._check_versions
+    monkeypatch.setattr(dask_client, "CONNECTING", 3.0)
+    with dask_cluster(tmp_path / "dask", 1) as dask:
+
+        def end_after(versions: dict[str, str], own: str) -> None:
+            check(versions, own)
+            if min(versions).startswith(seen):
+                assert dask.scheduler is not None
+                dask.scheduler.kill()
+                dask.scheduler.wait()
+
+        monkeypatch.setattr(dask_client, "_check_versions", end_after)
+        with pytest.raises(StudyError, match="no Dask scheduler answers at tcp://"):
+            run(Study.of(CONTENT), tmp_path / "out", partial(cluster, dask.address))
+
+
+def test_a_finished_study_needs_no_workers(reference: Path):
+    def none() -> NoReturn:
+        raise AssertionError("asked for workers")
+
+    assert run(read_study(reference), reference, none) == []
 
 
 def other_processor(folder: Path) -> str:
