@@ -46,6 +46,7 @@ from pdeloop.study.table import status
 from pdeloop.study.training import listener, train_one
 
 SETTINGS: dict[str, Any] = {"optimizer": "two_point", "rollouts": 20}
+SHORT: dict[str, Any] = {"optimizer": "two_point", "rollouts": 5, "evaluation_fields": 2}
 DRIVER_KILLS = 2
 BLOCK = 6
 
@@ -67,7 +68,7 @@ def run(
     Parameters
     ----------
     trainings
-        Trainings of the study whose processes are killed; 0: leave this part out.
+        Trainings of the study whose processes are killed, short ones; 0: leave this part out.
     workers
         Its processes.
     every
@@ -91,7 +92,9 @@ def run(
         if alone:
             result["overhead"] = overhead(problem, folder, alone)
         if trainings:
-            result["killed"] = killed(_study(problem, range(trainings)), folder, workers, every)
+            result["killed"] = killed(
+                _study(problem, range(trainings), SHORT), folder, workers, every
+            )
         if tasks:
             result["simulated"] = without_work(problem, folder, tasks, simulated, seconds)
         if tasks and scheduler:
@@ -99,8 +102,8 @@ def run(
     return result
 
 
-def _study(problem: str, seeds: range) -> Study:
-    content = {"problems": [problem], "seeds": [*seeds], "settings": SETTINGS}
+def _study(problem: str, seeds: range, settings: Mapping[str, Any] = SETTINGS) -> Study:
+    content = {"problems": [problem], "seeds": [*seeds], "settings": settings}
     return Study.of({**content, "variants": {"two-point": {}}})
 
 
@@ -177,17 +180,20 @@ def killed(study: Study, folder: Path, workers: int, every: float) -> dict[str, 
     began = time.perf_counter()
     while True:
         driver = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while driver.poll() is None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                driver.wait(every)
-            done = status(out)["finished"] if (out / "results.sqlite").exists() else 0
-            if drivers < DRIVER_KILLS and done > total * (drivers + 1) / (DRIVER_KILLS + 1):
-                driver.kill()
-                driver.wait()
-                drivers += 1
-            elif training := _training_processes(driver.pid, out):
-                os.kill(draw.choice(training), signal.SIGKILL)
-                kills += 1
+        try:
+            while driver.poll() is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    driver.wait(every)
+                done = status(out)["finished"] if (out / "results.sqlite").exists() else 0
+                if drivers < DRIVER_KILLS and done > total * (drivers + 1) / (DRIVER_KILLS + 1):
+                    driver.kill()
+                    driver.wait()
+                    drivers += 1
+                elif training := _training_processes(driver.pid, out):
+                    os.kill(draw.choice(training), signal.SIGKILL)
+                    kills += 1
+        finally:
+            driver.kill()
         if driver.returncode != -signal.SIGKILL:
             break
     elapsed = time.perf_counter() - began

@@ -36,13 +36,11 @@ MANY = 1e9
 """What a worker has of a resource, of which a training takes 1."""
 ACTIONS = ("began", "row", "ended", "add-worker", "remove-worker")
 """Events of workers, in a topic of the study's, and of the scheduler."""
-PACE = 0.5
-"""Seconds in which results gather, as few large messages cost the driver less than many; meanwhile
-workers begin with what waits there."""
+LEAST_PERIOD, MOST_PERIOD, PERIOD = 0.1, 1.0, 1 / 128
+"""Seconds in which results gather, and between two rows of progress of a training: so many for each
+worker, as few large messages cost a driver less than many. Workers have something to do meanwhile."""
 SETTLED, LOOK_PERIOD = 1.0, 30.0
 """Seconds after which the scheduler has what was submitted, and between two looks at what it has."""
-TELL_PERIOD, TOLD = 0.1, 100.0
-"""Seconds between two rows of progress of a training, at least, and most of them of all in a second."""
 
 
 class Cluster(Workers):
@@ -128,7 +126,6 @@ class Cluster(Workers):
 
     def settle(self) -> None:
         new, self._new = self._new, []
-        period = max(TELL_PERIOD, len(self._kinds) / TOLD)
         with _of_the_scheduler():
             for resource in {resource for _, resource, _ in new}:
                 own = {name: pickled for name, other, pickled in new if other == resource}
@@ -137,7 +134,7 @@ class Cluster(Workers):
                     [*own],
                     [*own.values()],
                     topic=self._topic,
-                    period=period,
+                    period=self._period,
                     key=[f"pdeloop-{name}-{uuid4().hex}" for name in own],
                     retries=0,
                     resources={resource: 1},
@@ -151,7 +148,7 @@ class Cluster(Workers):
                 self._client.publish_dataset(published, override=True)
 
     def collect(self, timeout: float) -> list[tuple[str, Future[Ended]]]:
-        time.sleep(PACE)
+        time.sleep(self._period)
         asked = {*self._waiting.values()}
         done: dict[Future[Ended], str] = {
             Future(): name for name in self._at if name not in asked and self._at[name].done()
@@ -273,6 +270,10 @@ class Cluster(Workers):
     @property
     def _topic(self) -> str:
         return f"pdeloop-{self._study}"
+
+    @property
+    def _period(self) -> float:
+        return min(MOST_PERIOD, max(LEAST_PERIOD, PERIOD * len(self._kinds)))
 
     def _leave(self, name: str) -> None:
         """A training is not this object's any longer."""

@@ -39,6 +39,11 @@ BUSY = 30.0
 """Seconds that a reader waits for the writer, and the other way round."""
 MOST = 2**30
 """Most bytes of a file of a run."""
+_ADVICE = {
+    sqlite3.SQLITE_FULL: "free some space there, and continue",
+    sqlite3.SQLITE_CORRUPT: "put back a copy of it, or begin in another folder",
+    sqlite3.SQLITE_NOTADB: "put back a copy of it, or begin in another folder",
+}
 _TABLES = """
 CREATE TABLE IF NOT EXISTS study (id TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS trainings (
@@ -284,7 +289,9 @@ def _reported(folder: Path, doing: str) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        raise StudyError(f"cannot {doing} {folder / RESULTS_FILE}: {error}") from error
+        advice = _ADVICE.get(getattr(error, "sqlite_errorcode", 0))
+        more = f"; {advice}" if advice else ""
+        raise StudyError(f"cannot {doing} {folder / RESULTS_FILE}: {error}{more}") from error
 
 
 def _unpacked(content: bytes) -> bytes:

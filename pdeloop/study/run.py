@@ -134,6 +134,7 @@ def run(
                         f"the workers ended {ATTEMPTS} times before their trainings ({error}); is "
                         f"there enough memory? {done} of {len(trainings)} are done and kept in {folder}"
                     ) from error
+        tell(len(trainings), len(trainings), "")
         return driver.failures()
 
 
@@ -327,7 +328,6 @@ class _Driver:
                     ended.append(Ended.failed(death.name, self._trainings[death.name], reason))
         finally:
             self._keep(ended)
-        self._tell(self.done, len(self._trainings), "")
 
     def _died(self, death: Death) -> str:
         """Count a death; why its training is given up, empty: it is not."""

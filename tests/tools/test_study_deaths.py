@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdeloop.study import Study, StudyError, run, training
+from pdeloop.study import Study, StudyError, results, run, training
 from pdeloop.study.executors import Deaths, local_workers
 from pdeloop.study.results import Ended, reading, writing
 from pdeloop.study.table import status
@@ -150,6 +150,23 @@ def test_a_workers_full_disk_ends_the_study_and_fails_no_training(tmp_path: Path
         run(study, out, partial(local_workers, 1), tasks=tasks)
     assert (status(out)["finished"], status(out)["failed"]) == (2, 0)
     assert run(study, out, here, tasks=dict.fromkeys(study.variants, study_tasks.result)) == []
+
+
+def test_a_full_disk_of_the_driver_ends_the_study_which_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    study, out = Study.of({**CONTENT, "seeds": 60, "variants": {"noted": {}}}), tmp_path / "out"
+    tasks = {"noted": study_tasks.result}
+    with monkeypatch.context() as patch:
+        patch.setattr(results, "_TABLES", f"{results._TABLES} PRAGMA max_page_count = 12;")
+        with pytest.raises(
+            StudyError, match=r"cannot write to .*; free some space there, and cont"
+        ):
+            run(study, out, here, tasks=tasks)
+    assert run(study, out, here, tasks=tasks) == [] and status(out)["finished"] == 60
+    (out / results.RESULTS_FILE).write_bytes(b"damaged")
+    with pytest.raises(StudyError, match="put back a copy of it, or begin in another folder"):
+        status(out)
 
 
 def test_processes_that_cannot_start_fail_no_training(tmp_path: Path):
