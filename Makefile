@@ -78,8 +78,10 @@ test-extras: setup packages
 	@$(PIP) install --quiet -c constraints.txt -e '.[extras]'
 	$(PYTEST) $(EXTRAS)
 
-EXTRAS := tests/plant/test_fmu.py tests/plant/test_cell.py tests/plant/test_tokamak.py tests/tools/test_data_sets.py \
-	tests/tools/test_model_files.py
+EXTRAS := $(addprefix tests/plant/test_,fmu.py cell.py tokamak.py) \
+	$(addprefix tests/tools/test_,data_sets.py logs.py model_files.py stable_baselines.py tensorboard.py warm_start.py) \
+	tests/method/test_neural.py::test_it_is_trained_evaluated_and_exported \
+	tests/benchmarks/test_baselines.py::test_agents_pay_for_each_rollout_and_are_functions_of_the_seed
 
 # The libraries of docs/neighbours.md, pinned, against ours.
 test-neighbours: setup
