@@ -31,15 +31,17 @@ def add(commands: common.Commands) -> None:
         commands,
         "export",
         _export,
-        help="export a run's law as .npz, C or a ROS 2 package, its learning curve as .csv or for "
-        "TensorBoard",
+        help="export a run's law as .npz, C, a ROS 2 package, an FMU, ONNX or .mat, its rollouts as a "
+        "data set, its learning curve",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: "
         "as .npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` also reads, or "
         "as a C99 function; the laws `feedforward`, `observer` and `neural` as a C99 function of the "
         "step, with a memory, or with a network; any other law's parameters as .npz; affine laws and "
-        "observers also as a ROS 2 package of rclpy and NumPy; and the cost after each step of the "
-        "training as .csv or as event files of TensorBoard.",
-        example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
+        "observers also as a ROS 2 package of rclpy and NumPy, an FMU, an ONNX model or matrices for "
+        "MATLAB; the rollouts of the training as a data set; and the cost after each step of it as "
+        ".csv or as event files of TensorBoard.",
+        example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --ros2 src/my_law "
+        "--fmu law.fmu --onnx law.onnx --matlab law.mat --minari burgers/rollouts-v0",
     )
     add_argument = export.add_argument
     add_argument("folder", type=common.a_path, metavar="RUN", help="folder of a finished run")

@@ -21,7 +21,8 @@ def add(commands: common.Commands) -> None:
         help="train a controller: identify, design, adapt, evaluate",
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
         "them from rollouts, and evaluate them. The plant, the controller and the tuner run as ROS 2 "
-        "nodes in separate processes.",
+        "nodes in separate processes. Plants that you have: --plant rod.fmu --set fmu.inputs=q1,q2, or "
+        "--plant 'process:python rod.py'.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
     problem = train.add_argument_group("problem")

@@ -83,6 +83,35 @@ def test_a_program_that_ends_is_started_again_and_the_episode_repeated(tmp_path:
     assert episode.states[:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
+def test_a_training_whose_program_stays_away_is_continued_with_the_same_bits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken, begun, own = (tmp_path / name for name in ("broken", "begun", "rod.py"))
+    source, step = (EXAMPLES / "rod.py").read_text(), "    else:\n"
+    assert source.count(step) == 1
+    own.write_text(
+        source.replace(
+            step,
+            f"        print(file=open({str(begun)!r}, 'a'))\n"
+            f"        import os; os.path.exists({str(broken)!r}) "
+            f"and len(open({str(begun)!r}).readlines()) > 6 and sys.exit(3)\n{step}",
+        )
+    )
+    plant = ["--plant", f"process:{sys.executable} {own}"]
+    words = ["--in-process", "--rollouts", "12", "--optimizer", "two_point", "--set"]
+    words += ["evaluation_fields=2", "--set", "max_batch=1"]
+    broken.touch()
+    assert main(["train", *plant, *words, "--out", str(tmp_path / "run")]) == 1
+    told = capsys.readouterr().err
+    assert "has ended, with exit code 3" in told and "--resume" in told
+    broken.unlink()
+    assert main(["train", *plant, "--in-process", "--resume", str(tmp_path / "run")]) == 0
+    assert main(["train", *plant, *words, "--out", str(tmp_path / "whole")]) == 0
+    continued, whole = (pdeloop.load_run(tmp_path / name) for name in ("run", "whole"))
+    assert np.array_equal(continued.policies[0], whole.policies[0])
+    assert np.array_equal(continued.costs["adapted"], whole.costs["adapted"])
+
+
 @pytest.mark.parametrize(
     ("body", "told"),
     [

@@ -203,3 +203,66 @@ def test_colcon_builds_it_and_over_topics_it_is_the_law_of_the_loop(
     assert len(returns) > 1 and (np.abs(returns) <= np.array(RATE) + 1e-12).all()
     assert "no measurement for" in loop.output(started)
     assert "must be 8 finite numbers, got 1" in loop.output(started)
+
+
+OPERATOR = """
+import sys, time
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
+from std_msgs.msg import Float64MultiArray
+
+rclpy.init()
+node, heard, told, limit = rclpy.create_node("rig"), [], [], time.monotonic() + 60.0
+sender = node.create_publisher(Float64MultiArray, "measurement", 1)
+node.create_subscription(Float64MultiArray, "action", lambda m: heard.append(list(m.data)), 100)
+node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: told.extend(m.status), 10)
+change = node.create_client(ChangeState, "bounded_law/change_state")
+
+def wait(condition):
+    while not condition():
+        assert time.monotonic() < limit, (heard, told)
+        rclpy.spin_once(node, timeout_sec=0.05)
+
+def go(transition):
+    request = ChangeState.Request()
+    request.transition.label = transition
+    answer = change.call_async(request)
+    wait(answer.done)
+    assert answer.result().success, transition
+
+def told_of(state):
+    told.clear()
+    wait(lambda: told and told[-1].message == state)
+    return {entry.key: int(entry.value) for entry in told[-1].values}, told[-1].level[0]
+
+wait(change.service_is_ready)
+go("configure")
+wait(sender.get_subscription_count)
+assert told_of("inactive") == ({"answered": 0, "refused measurements": 0}, 0) and not heard
+go("activate")
+sender.publish(Float64MultiArray(data=[1.0] * 8))
+wait(lambda: len(heard) >= 3)  # of one measurement, at the rate
+counts, level = told_of("active")
+assert counts["answered"] >= 3 and level == 0
+go("deactivate")
+assert told_of("inactive")[1] == 0
+print("heard", heard[0], heard[2], heard[-1], flush=True)
+"""
+
+
+@pytest.mark.topics
+def test_an_operator_steps_its_lifecycle_and_reads_its_diagnostics(
+    loop: Processes, trained: FinishedRun, tmp_path: Path
+) -> None:
+    """By the services of `ros2 lifecycle set`; one measurement is answered at the rate."""
+    write_package(trained, tmp_path / "bounded_law")
+    loop.environment["PYTHONPATH"] = str(tmp_path / "bounded_law")
+    words = ["autostart:=false", "rate:=10.0", "timeout_samples:=1000", f"safe_action:={SAFE}"]
+    parameters = [part for word in words for part in ("-p", word)]
+    node = [sys.executable, "-m", "bounded_law.node", "--ros-args", *parameters]
+    loop.program(*node, name="law")
+    operator = loop.program(sys.executable, "-c", OPERATOR, name="rig")
+    loop.wait(operator, LIMIT)
+    expected = answers(trained, np.ones((1, 8)))[0].tolist()
+    assert f"heard {expected} {expected} {SAFE}" in loop.output(operator)
