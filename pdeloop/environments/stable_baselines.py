@@ -14,15 +14,22 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.environments.keywords import Source
 from pdeloop.environments.signals import one
 from pdeloop.environments.vector import VectorEnvironment
 from pdeloop.messages.arrays import Array
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise DependencyNotInstalled(
+        "VecEnvironment needs stable-baselines3: pip install 'pdeloop[rl]'"
+    ) from error
 
 __all__ = ["VecEnvironment"]
 

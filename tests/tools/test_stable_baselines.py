@@ -192,6 +192,15 @@ def test_a_copy_continues_with_the_same_bits(kind: Any) -> None:
             assert all(np.array_equal(a, b) for a, b in zip(ours[:3], theirs[:3], strict=True))
 
 
+def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "pdeloop.environments.stable_baselines"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    with pytest.raises(gymnasium.error.DependencyNotInstalled, match=r"install 'pdeloop\[rl\]'"):
+        importlib.import_module(name)
+
+
 needs_library = pytest.mark.skipif(
     not INSTALLED, reason="stable-baselines3 is not installed: extra rl"
 )
@@ -239,7 +248,12 @@ def test_the_first_line_of_everybody_works_and_has_the_bits_of_the_batch() -> No
 
 
 @needs_library
-def test_its_algorithms_and_wrappers_take_the_batch(tmp_path: Path) -> None:
+def test_its_algorithms_and_wrappers_take_the_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its logs and the compiler's files, of which it tells nobody, go to the test's folder."""
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "logs"))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "inductor"))
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
