@@ -2,13 +2,16 @@
 """`python -m benchmarks agents`: PPO, SAC and CrossQ that begin with the law of a run, and without.
 
 An agent of stable-baselines3 with the library's defaults learns on `VecEnvironment` of the run's
-problem and is evaluated, without exploring, on the fields of the run's evaluation.
+problem, whose actions are bounded at the law's largest one in four rollouts, and is evaluated, without
+exploring, on the fields of the run's evaluation.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,17 @@ import numpy as np
 import pdeloop
 from benchmarks.processes import markdown, shown
 from pde_sim_node.build import build_plant
+from pdeloop.episode import EpisodeRecord, Law
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.arrays import Array
 
 STD = 0.05
 """Exploration of the cloned agents, the default of `warm_start`."""
-STARTS = ("cold", "path", "frozen", "cloned")
-"""Without a law; with a linear path that learns, or does not; with the network fitted to rollouts."""
+SCALE = 0.1
+"""Of the residual agents' actions, as in docs/deploy.md."""
+STARTS = ("cold", "path", "frozen", "cloned", "residual")
+"""Without a law; with a linear path that learns, or does not; with the network fitted to rollouts;
+with a network that begins at 0 and adds to the law's actions."""
 
 
 def run(
@@ -43,7 +50,7 @@ def run(
     algorithms
         ppo, sac, crossq.
     starts
-        cold, path, frozen, cloned.
+        cold, path, frozen, cloned, residual.
     rollouts
         Numbers of episodes after which an agent is evaluated.
     seeds
@@ -53,6 +60,8 @@ def run(
 
     torch.set_num_threads(1)
     law = pdeloop.load_run(folder)
+    limit = float(np.abs(_rollouts(law).actions).max())
+    law = replace(law, values={**law.values, "action_limit": limit})
     rows = []
     for algorithm in algorithms:
         for start in starts:
@@ -68,17 +77,24 @@ def _learn(
     law: FinishedRun, algorithm: str, start: str, rollouts: Sequence[int], seed: int
 ) -> list[float]:
     """Costs at the beginning and after each number of rollouts."""
+    import torch
     from sb3_contrib import CrossQ  # in PyTorch, as `warm_start` needs it
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.vec_env import DummyVecEnv
 
-    from pdeloop.environments import warm_start
+    from pdeloop.environments import Environment, ResidualAction, warm_start
     from pdeloop.environments.stable_baselines import VecEnvironment
 
     algorithms = {"ppo": PPO, "sac": SAC, "crossq": CrossQ}
     plant = build_plant(law.values)
     batch = 4 if algorithm == "ppo" else 1
-    env = VecEnvironment(plant, num_envs=batch)
+    env: Any = VecEnvironment(plant, num_envs=batch)
+    if start == "residual":
+        single = Environment(build_plant(law.values))
+        env = DummyVecEnv(
+            [lambda: ResidualAction(deepcopy(single), law, scale=SCALE) for _ in range(batch)]
+        )
     own = {"n_steps": plant.horizon} if algorithm == "ppo" else {}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You have specified a mini-batch size")
@@ -86,24 +102,38 @@ def _learn(
     agent.set_logger(Logger(None, []))  # else each call of `learn` makes a folder
     if start in ("path", "frozen"):
         warm_start(agent, law)
+    head = agent.policy.action_net if algorithm == "ppo" else agent.actor.mu
     if start == "frozen":
-        head = agent.policy.action_net if algorithm == "ppo" else agent.actor.mu
         head.law.requires_grad_(False)
+    if start == "residual":
+        with torch.no_grad():
+            head.weight.zero_(), head.bias.zero_()
     if start == "cloned":
         _clone(agent, law)
-    costs, paid = [_cost(agent, law)], 0
+    beside = law.law() if start == "residual" else None
+    costs, paid = [_cost(agent, law, beside)], 0
     for budget in rollouts:
         agent.learn((budget - paid) * plant.horizon, reset_num_timesteps=False)
         paid = budget
-        costs.append(_cost(agent, law))
+        costs.append(_cost(agent, law, beside))
     return costs
 
 
-def _cost(agent: Any, law: FinishedRun) -> float:
-    """The mean stage cost of its mean actions on the evaluation's fields."""
+def _rollouts(law: FinishedRun) -> EpisodeRecord:
+    """Four of the law."""
+    return pdeloop.rollout(build_plant(law.values), law.law(), range(4))
+
+
+def _cost(agent: Any, law: FinishedRun, beside: Law | None) -> float:
+    """The mean stage cost of its mean actions, beside a law or alone, on the evaluation's fields."""
+    space = agent.action_space
 
     def acting(k: int, states: Array) -> Array:
-        return np.asarray(agent.predict(states, deterministic=True)[0], dtype=np.float64)
+        own = np.asarray(agent.predict(states, deterministic=True)[0], dtype=np.float64)
+        if beside is None:
+            return own
+        asked = beside(k, states) + SCALE * own  # whose space is twice as wide as the actions'
+        return np.asarray(np.clip(asked, space.low / 2.0, space.high / 2.0))
 
     episode = pdeloop.rollout(build_plant(law.values), acting, *law.evaluation)
     return float(episode.costs.mean.mean())
@@ -113,7 +143,7 @@ def _clone(agent: Any, law: FinishedRun, steps: int = 3000) -> None:
     """Fit the mean actions to the law's on four of its rollouts, by least squares."""
     import torch
 
-    episode = pdeloop.rollout(build_plant(law.values), law.law(), range(4))
+    episode = _rollouts(law)
     states = episode.states[:-1].reshape(-1, episode.states.shape[-1])
     actions = agent.policy.scale_action(episode.actions.reshape(len(states), -1))
     squashed = hasattr(agent, "actor")

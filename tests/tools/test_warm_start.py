@@ -16,6 +16,7 @@ import pytest
 
 import pdeloop
 import pdeloop.environments
+from benchmarks import agents
 from pdeloop.environments import Environment, ResidualAction, warm_start
 from pdeloop.finished_run import FinishedRun
 from pdeloop.messages.arrays import Array
@@ -160,3 +161,20 @@ def normalised() -> Any:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     return VecNormalize(DummyVecEnv([environment]))
+
+
+@needs_library
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_agents_of_the_benchmark_begin_at_the_cost_of_the_law(
+    run: FinishedRun, algorithm: str
+) -> None:
+    """But the cold one, which does not know the law; all of them learn."""
+    found = agents.run(
+        run.folder, algorithms=[algorithm], starts=agents.STARTS, rollouts=[8], seeds=1
+    )
+    costs = {row["start"]: [cost for (cost,) in row["costs"].values()] for row in found["rows"]}
+    for start in ("path", "frozen", "residual"):
+        assert costs[start][0] == pytest.approx(found["law"], rel=1e-3)
+        assert costs[start][1] != costs[start][0]
+    assert abs(costs["cold"][0] / found["law"] - 1.0) > 0.05
+    assert abs(costs["cloned"][0] / found["law"] - 1.0) < 0.2
