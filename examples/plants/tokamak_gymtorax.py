@@ -3,8 +3,9 @@
 
 Actions go about the open loop that Gym-TORAX brings: a part of the plasma current (MA) that is added to
 its ramp, and the shares of its beam and microwave power, which it turns on after 99 of 150 s. Measured:
-the fusion gain Q, safety factors, and temperatures of the core and along the radius (10 keV). The cost
-tracks Q = 10 where the plasma burns, with q_min and q95 as in the environment's reward.
+the fusion gain Q, safety factors, and temperatures of the core and along the radius (10 keV). Q, fusion
+power over heating power, has no bound where the heating goes out: its logarithm is measured, with 0 for
+Q = 0 and 1 for Q = 10. The cost tracks Q = 10, with q_min and q95 as in the environment's reward.
 """
 
 import gymnasium
@@ -51,7 +52,7 @@ class Scenario(gymnasium.Wrapper):
     def _measured(self, observation):
         scalars, profiles = observation["scalars"], observation["profiles"]
         return {
-            "Q": scalars["Q_fusion"] / 10.0,
+            "Q": logarithmic(scalars["Q_fusion"]),
             "q_min": np.minimum(scalars["q_min"], 1.0),
             "q95": np.minimum(scalars["q95"] / 3.0, 1.0),
             "H98": scalars["H98"],
@@ -59,6 +60,11 @@ class Scenario(gymnasium.Wrapper):
             "T_i": profiles["T_i"][RADII] / 10.0,
             "current": profiles["Ip_profile"][-1:] / 1e7,
         }
+
+
+def logarithmic(gain):
+    """log(1 + Q), which is 1 for Q = 10."""
+    return np.log1p(gain) / np.log(11.0)
 
 
 def scenario():
@@ -70,7 +76,7 @@ def ramp(gain=10.0):
     """The scenario, to burn at this fusion gain."""
     return pdeloop.from_gymnasium(
         scenario(),
-        target={"Q": gain / 10.0, "q_min": 1.0, "q95": 1.0},
+        target={"Q": logarithmic(gain), "q_min": 1.0, "q95": 1.0},
         state_weight={"Q": 1.0, "q_min": 0.1, "q95": 0.1},
         action_weight=0.01,
         action_rate={"current": 0.1},

@@ -56,8 +56,9 @@ def test_the_open_loop_returns_what_it_does_without_us_and_less_heating_gains_mo
     assert whole.whole and -whole.costs.total[0] == pytest.approx(3.263, abs=5e-4)
     less = episode(plants[0], 0.5, 0.0, 0.5)
     assert -less.costs.total[0] > 3.5
-    # The keys are sorted: H98, and then Q/10.
-    assert less.states[-1, 0, 1] > 1.4 * whole.states[-1, 0, 1]
+    # The keys are sorted: H98, and then log(1 + Q) / log 11.
+    gains = [11.0 ** own.states[-1, 0, 1] - 1.0 for own in (less, whole)]
+    assert gains[0] > 1.4 * gains[1] and gains[1] == pytest.approx(6.87, abs=0.01)
 
 
 def test_a_step_that_fails_ends_the_rollout_and_the_end_of_the_scenario_does_not(
