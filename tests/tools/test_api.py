@@ -229,7 +229,7 @@ def test_numbers_of_numpy_serve_as_parameters() -> None:
 def test_a_training_that_is_stopped_by_a_service_says_how_to_go_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def stopped(*_: object) -> None:
+    def stopped(*_: object, **__: object) -> None:
         raise Interruption("request")
 
     monkeypatch.setattr("pdeloop.api.carry_out", stopped)

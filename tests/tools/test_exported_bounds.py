@@ -26,7 +26,7 @@ N_Z, N_S, N_A, N_H, T = 6, 3, 4, 5, 12
 RNG = np.random.default_rng(0)
 SETS = {
     "one side": ActionSet(N_A, 0.0, np.inf),
-    "each its own": ActionSet(N_A, [0.0, -1.0, -np.inf, 0.2], [4.0, 2.0, 0.5, 0.2]),
+    "each its own": ActionSet(N_A, [0.0, -1.0, -np.inf, 0.2], [4.0, 2.0, 0.5, 0.25]),
     "a limit besides": ActionSet(N_A, 0.0, np.inf, limit=0.7),
     "zero mean": ActionSet(N_A, zero_mean=True),
     "zero mean within bounds": ActionSet(
