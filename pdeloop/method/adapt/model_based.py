@@ -590,9 +590,12 @@ class ModelBased(Optimizer):
         )
         data, settings, known = self._data(), self._settings, (loop, base, improved)
         states = renewal.measured_states(data, CHAOTIC_FIELDS)
-        if not belief.whole or renewal.any_state_serves(loop, base, fields, states):
-            # A model may also predict no more than pieces because it is wrong.
-            row["chaotic" if renewal.is_chaotic(loop, states) else "pieces"] = True
+        if belief.whole:
+            chaotic = renewal.any_state_serves(loop, base, fields, states)
+        else:  # of pieces, as also where it is wrong
+            chaotic = renewal.is_chaotic(loop, states)
+        if chaotic or not belief.whole:
+            row["chaotic" if chaotic else "pieces"] = True
             found = renewal.renew_from_states(*known, data, draw, settings, final=final)
         else:
             parts = self._progress.parts
