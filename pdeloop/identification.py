@@ -643,15 +643,15 @@ def _identified(
     late, early = [max(n, 0) for n in delays], tuple(min(n, 0) for n in delays)
     aligned = shifted(logged, early) if delays else trajectories
     refit = partial(_refitted, model, method, p, sum(late), innovations, simulations)
-    pole = largest_pole(model.A, seen, lambda parts: refit(parts).A)
     checked: Model = model
     acting = early
     if field and field.better and field.fitted and field.linear and field.refit:
         rollouts = [(np.asarray(own.states), own.actions) for own in field.fitted.rollouts]
-        again, own_part = field.refit, field.determined
-        known_part = own_part(field.linear.A)
-        pole = largest_pole(known_part, rollouts, lambda parts: own_part(again(parts)))
+        again, part = field.refit, field.determined
+        pole = largest_pole(part(field.linear.A), rollouts, lambda parts: part(again(parts)))
         checked, aligned, acting = field.fitted.model, trajectories, delays  # it has no memory
+    else:
+        pole = largest_pole(model.A, seen, lambda parts: refit(parts).A)
     return Identified(
         model,
         sources,

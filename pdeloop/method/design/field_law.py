@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,6 @@ from pdeloop.method.models.selection import (
     UNKNOWN,
     Accuracy,
     Kind,
-    Scale,
     Selection,
     kinds_of,
     limited,
@@ -104,8 +103,7 @@ class FieldLaw:
     model is linearised, if the target is far outside of the data. part: steps that it was fitted to,
     where those are the first ones of trajectories alone; 0: all. doubtful: whether what it saves
     against no control may be the error of a model that was not accepted. linear: the linearised model
-    of the whole state, of which `rows` has the part on U, at `inputs`; excited: S and P with S P = I,
-    onto the directions in which the data move and back, empty: all; refit: A, of a model of the same
+    of the whole state, of which `rows` has the part on U, at `inputs`; refit: A, of a model of the same
     kind fitted to other data.
 
     noise: that which the model was fitted for where another one, or none, was declared; 0: what was
@@ -125,7 +123,6 @@ class FieldLaw:
     doubtful: bool = False
     linear: ReducedModel | None = None
     inputs: Array | None = None
-    excited: tuple[Array, ...] = ()
     refit: Callable[[Sequence[Trajectory]], Array] | None = None
 
     @property
@@ -135,10 +132,28 @@ class FieldLaw:
 
     def determined(self, A: Array) -> Array:
         """What the data determine of a matrix of the whole state: S A P."""
-        if not self.excited:
+        if self._excited is None:
             return A
-        S, P = self.excited
+        S, P = self._excited
         return S @ A @ P
+
+    @cached_property
+    def _excited(self) -> tuple[Array, Array] | None:
+        """S and P, S P = I: onto the directions in which the data move, and back; None: all.
+
+        In others the ridge of a model decides whose coefficients no points share.
+        """
+        model = self.fitted.model if self.fitted else None
+        if not isinstance(getattr(model, "inner", model), LinearModel | PolynomialModel):
+            return None
+        assert self.fitted is not None
+        states = [np.asarray(own.states) for own in self.fitted.rollouts]
+        scale = scale_of(states)
+        gram = sum(y.T @ y for y in ((own - scale.reference) / scale.units for own in states))
+        with one_thread():
+            squares, vectors = linalg.eigh(gram)
+        W = vectors[:, squares > EXCITED**2 * squares[-1]]
+        return W.T / scale.units, W * scale.units[:, None]
 
     def summary(self) -> dict[str, Any]:
         """The report as data."""
@@ -341,20 +356,8 @@ def field_law(
         doubtful=doubtful,
         linear=ReducedModel(lqr.A, lqr.B, d=drift),
         inputs=inputs,
-        excited=_excited(model, [states for states, _ in trajectories], scale),
         refit=partial(_relinearised, selection, model.kind, point, inputs),
     )
-
-
-def _excited(model: FieldModel, states: Sequence[Array], scale: Scale) -> tuple[Array, ...]:
-    """`FieldLaw.excited` of a model whose coefficients no points share: elsewhere its ridge decides."""
-    if not isinstance(getattr(model, "inner", model), LinearModel | PolynomialModel):
-        return ()
-    gram = sum(y.T @ y for y in ((own - scale.reference) / scale.units for own in states))
-    with one_thread():
-        squares, vectors = linalg.eigh(gram)
-    W = vectors[:, squares > EXCITED**2 * squares[-1]]
-    return W.T / scale.units, W * scale.units[:, None]
 
 
 def _relinearised(
