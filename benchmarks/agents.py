@@ -107,7 +107,8 @@ def _learn(
         head.law.requires_grad_(False)
     if start == "residual":
         with torch.no_grad():
-            head.weight.zero_(), head.bias.zero_()
+            for part in head.parameters():
+                part.zero_()
     if start == "cloned":
         _clone(agent, law)
     beside = law.law() if start == "residual" else None

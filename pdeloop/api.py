@@ -407,8 +407,8 @@ def train(
         if out is None:
             advice = "give out=FOLDER, in which a training is kept that can be continued"
         try:
-            known = folder, values, transport, display
-            carry_out(*known, lambda: None, advice, kept=out is not None)
+            kept = out is not None
+            carry_out(folder, values, transport, display, lambda: None, advice, kept=kept)
         except Interruption as reason:
             raise RuntimeError(f"stopped by {reason}; {advice}") from None
         finally:

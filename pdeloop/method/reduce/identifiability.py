@@ -191,7 +191,7 @@ def require_motion(trajectories: Sequence[Trajectory], channels: Channels = NUMB
     """
     states, inputs = (np.concatenate(own) for own in zip(*trajectories, strict=True))
     moved, pushed = (_ranges(own) for own in (states, inputs))
-    digits = [np.diff(np.unique(x), prepend=0.0)[1:].min(initial=np.inf) for x in states.T]
+    digits = [np.diff(np.unique(x)).min(initial=np.inf) for x in states.T]
     written = np.ptp(states, axis=0) <= DIGITS * np.array(digits)
     still = bool((pushed <= NEARLY).all())
     if not ((moved <= RESTS) | (still & written & (moved <= NEARLY))).all():
