@@ -16,7 +16,7 @@ from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop
 from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
 from pdeloop.method.adapt.renewal import renew
-from pdeloop.method.design.lqt import track_horizon
+from pdeloop.method.design.lqt import regulator, track_horizon
 from pdeloop.method.laws.linear import FeedForward
 from pdeloop.method.models.linear import LinearModel
 
@@ -75,6 +75,17 @@ def test_the_descent_leads_to_the_tracking_law_of_one_initial_state() -> None:
     assert found.after == pytest.approx(best[0] / T, rel=1e-4)
     policy = closed.policy(found.theta, closed.law.theta_start)
     assert np.array_equal(closed.theta(policy), found.theta)
+
+
+def test_a_law_without_gains_is_no_control_also_where_the_target_moves() -> None:
+    """As is said where a training begins so: a model that gave no gains gives no offsets either."""
+    still = loop().law
+    assert isinstance(still, FeedForward) and not still.theta_start.any()
+    gains = regulator(MODEL, COST)
+    assert gains is not None
+    found = FeedForward(replace(still.model, K_a=gains.K), T)
+    found.cost = COST
+    assert np.ptp(found.start()["b"], axis=0).min() > 0.1
 
 
 @pytest.mark.parametrize(

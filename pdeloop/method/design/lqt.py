@@ -447,10 +447,10 @@ def tracking_offsets(model: ModelRows, cost: Cost | None, horizon: int) -> Array
 
         b_k = K_b s_r + a_k - K_a e_k,        e_0 = 0,        e_{k+1} = A e_k + B a_k.
 
-    Without a cost of this horizon all b_k are K_b s_r.
+    Without a cost of this horizon, or without gains, all b_k are K_b s_r.
     """
     b = np.tile(model.constant, (horizon, 1))
-    if cost is not None and cost.horizon == horizon:
+    if cost is not None and cost.horizon == horizon and model.K_a.any():
         K, ahead = track_horizon(model.A, model.B, cost.deviations(), model.measurement)
         e = np.zeros(len(model.A))
         for k in range(horizon):
