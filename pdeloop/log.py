@@ -187,6 +187,8 @@ def trajectories_of(log: Log, remedies: Remedies, *, timed: bool, most: int) -> 
     if step is not None and timed:
         after_gap[1:] = np.diff(times) > GAP * max(step, remedies.resample or 0.0)
     found = findings(values, first | after_gap, rows, log.channels, step or 1.0)
+    for one in found:
+        first = first | one.begins
     spoilt = _missing(values, first, n_z)
     dropped = list[int]()
     if remedies.cut:

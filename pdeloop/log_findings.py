@@ -30,6 +30,8 @@ FROZEN = 15
 """Equal rows of a frozen sensor."""
 LONGER = 5
 """Usual runs of equal rows that a frozen one is as long as."""
+STUCK = 2
+"""Usual runs of equal inputs that a stuck one is as long as."""
 SATURATED = 10
 """Rows at an extreme value of a saturated sensor, at least, and `SATURATED_SHARE` of all."""
 SATURATED_SHARE = 0.02
@@ -67,12 +69,13 @@ class Finding:
 
     text: one sentence with the channels, the first row, and the option that helps; spoilt (R,): the
     rows that `--cut` leaves out; step: rows between two readings of a sensor that is slower than the
-    log, or 0.
+    log, or 0; begins (R,): rows that begin a trajectory.
     """
 
     text: str
     spoilt: Flags
     step: int = 0
+    begins: Flags | bool = False
 
 
 def _last_digits(values: Array, column: Array) -> Array:
@@ -223,13 +226,18 @@ def findings(
         [np.zeros(len(values), dtype=bool), *(own for _, own in found.values())], axis=0
     )
     others[1:] |= others[:-1].copy()
-    if (spoilt := _jumps(states, inputs, first) & ~others).any():
-        found["jump", 0, 0] = [*range(n_z)], spoilt
     result = [
         Finding(_sentence(kind, own, spoilt, states, rows, channels), spoilt)
         for (kind, _, _), (own, spoilt) in found.items()
     ]
     nothing = np.zeros(len(values), dtype=bool)
+    if (jumps := _jumps(states, inputs, first) & ~others).any():
+        more = f" (and in {int(jumps.sum()) - 1} more rows)" if jumps.sum() > 1 else ""
+        text = (
+            f"the states jump in row {rows[int(np.argmax(jumps))]}{more}, and not by an input, as "
+            "where another experiment begins: a trajectory begins there"
+        )
+        result.append(Finding(text, nothing, begins=jumps))
     if sum(map(len, slow.values())) < n_z:  # the others are as fast as the log
         for period in regular:
             slow.pop(period, None)
@@ -282,11 +290,6 @@ def _sentence(
             f"{names} {'jumps' if len(own) == 1 else 'jump'} from one end of the range to the other in "
             f"row {rows[k]}{more}, as an angle or a counter that begins anew: log it without that (as "
             "numpy.unwrap makes it), or begin a trajectory there with --cut"
-        )
-    if kind == "jump":
-        return (
-            f"the states jump in row {rows[k]}{more}, and not by an input, as where another experiment "
-            "begins: begin its times anew there, or leave the row out with --cut"
         )
     if kind == "saturated":
         return (
@@ -461,8 +464,10 @@ def _stuck(
         longest = int(np.argmax(runs.lengths))
         begin, length = int(runs.begins[longest]), int(runs.lengths[longest])
         own = (pair >= begin) & (pair + 1 < begin + length)
-        others = np.quantile(runs.lengths, 0.95)
-        if length < LONGER * others or min(own.sum(), (~own).sum()) < least:
+        others = (
+            np.quantile(np.delete(runs.lengths, longest), 0.95) if len(runs.lengths) > 1 else 0.0
+        )
+        if length < STUCK * others or min(own.sum(), (~own).sum()) < least:
             continue
         inside, outside = (
             np.var(step[part] - known[part] @ linalg.lstsq(known[part], step[part])[0], axis=0)

@@ -52,14 +52,12 @@ def regulated() -> tuple[np.ndarray, np.ndarray]:
     return z, u
 
 
-def identified(
-    tmp_path: Path, z: np.ndarray, u: np.ndarray, cut: bool = False, **given: Any
-) -> Identified:
+def identified(tmp_path: Path, z: np.ndarray, u: np.ndarray, **given: Any) -> Identified:
     path = tmp_path / "own.csv"
     names = ",".join(["t", *(f"z{i}" for i in range(1, 5)), "a1", "a2"])
     table = np.column_stack([10.0 * np.arange(len(z)), z, u])
     np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.4f")
-    return identify_data(read_measurements(path, cut=cut), given)
+    return identify_data(read_measurements(path), given)
 
 
 @pytest.mark.parametrize("method", ["regression", "subspace"])
@@ -162,19 +160,16 @@ def test_a_controller_with_an_integral_part_needs_set_points_that_move(
         identified(tmp_path, z, u)
 
 
-def test_an_experiment_that_is_appended_with_t_in_equal_steps_is_told_and_cut_off(
+def test_an_experiment_that_is_appended_with_t_in_equal_steps_is_a_trajectory_and_told(
     tmp_path: Path,
 ) -> None:
     other = rod(steps(9), np.array([20.0, 5.0, 0.0, 0.0]), seed=9)
     z, u = np.vstack([rod(steps(), REST), other]) + 293.15, np.vstack([steps(), steps(9)])
-    for cut in (False, True):
-        found = identified(tmp_path, z, u, cut=cut)
-        pole, low, high = found.pole
-        assert low < POLE < high
-        assert not cut or pole == pytest.approx(POLE, abs=1e-4)
-        assert len(found.sources) == 1 + cut
-        told = any(text.startswith("the states jump in row 603, and not") for text in found.remarks)
-        assert told != cut
+    found = identified(tmp_path, z, u)
+    pole, low, high = found.pole
+    assert low < POLE < high and pole == pytest.approx(POLE, abs=1e-4)
+    assert len(found.sources) == 2
+    assert any(text.startswith("the states jump in row 603, and not") for text in found.remarks)
 
 
 def test_steps_of_inputs_are_no_other_experiments(tmp_path: Path) -> None:
