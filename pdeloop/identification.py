@@ -21,6 +21,7 @@ from scipy import linalg
 from controller_node.identification import DesignSettings, designed, examined, identify
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
+from pdeloop.linearity import disproportionate, products, rate_limited, structural_break
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
@@ -43,15 +44,14 @@ from pdeloop.method.reduce.reduced_model import ReducedModel, Samples, Trajector
 from pdeloop.method.reduce.regression import OrderStudy, study_orders
 from pdeloop.method.reduce.subspace import InnovationModel, held_out_errors, subspace_model
 from pdeloop.model_checks import (
+    LAGS,
     Model,
     Residuals,
-    disproportionate,
     fit_percent,
     largest_pole,
-    products,
     residuals,
     stability,
-    structural_break,
+    uncertain_effects,
     without_insignificant_effects,
 )
 from pdeloop.process.one_thread import one_thread
@@ -64,6 +64,8 @@ FAR = 0.5
 """Share of the distance to the target left in the end from which there is a warning."""
 ASIDE = 0.05
 """Distance from a target of 0 at which a law comes to rest, relative to the variation, that is told."""
+UNSURE = 0.2
+"""Half of the interval of the effect of an input, relative to its size, from which on it is told."""
 OFFSET = 20.0
 """Standard deviations between 0 and the mean of a state that has a large offset."""
 UNLIKE = 1e3
@@ -93,7 +95,7 @@ class Identified:
     identification "subspace"; fits: FIT of each number of the state, by what was simulated; refit: a
     model of other data by the same method and of the same sizes; method: "regression" or "dmdc", where
     there is no model in innovation form. pole, residuals and fits are those of the model whose law is
-    used (`kind`).
+    used (`kind`). uncertain: of the effect of each input, relative to its size (`uncertain_effects`).
     """
 
     model: ModelRows | ReducedModel
@@ -114,6 +116,7 @@ class Identified:
     fits: tuple[tuple[str, Array], ...] = ()
     refit: Callable[[list[Trajectory]], InnovationModel] | None = None
     method: str = "regression"
+    uncertain: tuple[float, ...] = ()
 
     @property
     def of_field(self) -> FieldLaw | None:
@@ -154,6 +157,13 @@ class Identified:
         """Warnings to read before the model is used."""
         found = [*self.remarks, *self.determined.remarks]
         loop, d = self.closed_loop, self.model.d
+        if poor := [j for j, part in enumerate(self.uncertain) if part > UNSURE]:
+            names = listed([self.channels.input(j) for j in poor])
+            size = max(self.uncertain[j] for j in poor)
+            found.append(
+                f"the data determine the effect of {names} to {size:.0%} only (95 % interval), as of "
+                "an input that moved once or little: move it more, and more often"
+            )
         if loop is not None and loop.ends[0] > FAR:
             found.append(
                 f"on the model the law ends {loop.ends[1]}: R a^2, which counts from a = 0, costs more "
@@ -220,6 +230,7 @@ class Identified:
             "spectral_radius": float(np.abs(poles).max()),
             "stable": stability(*self.pole[1:]),
             "spectral_radius_interval": [_finite(end) for end in self.pole[1:]],
+            "effects_uncertain": [_finite(part) for part in self.uncertain],
             "residuals": self.residuals and self.residuals.summary(),
             "fit": {name: [_finite(own) for own in fit.tolist()] for name, fit in self.fits},
             "rank": determined.rank,
@@ -305,6 +316,15 @@ class Identified:
             else "too few steps for an interval"
         )
         lines = [f"stable: {stability(low, high)}; largest pole {size:.4f}, {interval}"]
+        if self.uncertain:
+            shown = [
+                f"{100 * part:.2g} % ({self.channels.input(j)})"
+                for j, part in enumerate(self.uncertain[: 2 * SHOWN])
+            ]
+            many = len(self.uncertain) > len(shown)
+            worst = f", at worst {100 * max(self.uncertain):.2g} %" if many else ""
+            told = f"± {', '.join(shown)}{worst}"
+            lines.append(f"effects of the inputs in {LAGS} rows, 95 % intervals: {told}")
         if self.residuals and self.residuals.count:
             lines.append(self.residuals.text(self.channels))
         for name, fit in self.fits:
@@ -440,10 +460,9 @@ def _nonlinear(seen: Sequence[Trajectory], found: Measurements) -> list[str]:
             "operating points in one log; identify from a part where the plant is one"
         )
         told.append((ratio, text))
-    if product := products(seen):
-        told.append((product.of_linear, product.text(found.channels)))
-    if not other and (bend := disproportionate(seen)):
-        told.append((bend.ratio, bend.text(found.channels)))
+    looked_for = [products, rate_limited] if other else [products, rate_limited, disproportionate]
+    misfits = [misfit for look in looked_for if (misfit := look(seen, found.channels))]
+    told += [(misfit.ratio, misfit.text) for misfit in misfits]
     return [max(told)[1]] if told else []
 
 
@@ -674,6 +693,7 @@ def _identified(
         ),
         refit,
         "dmdc" if method == "dmdc" else "regression",
+        tuple(uncertain_effects(innovations or refit([*seen]), seen).tolist()),
     )
 
 

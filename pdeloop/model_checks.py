@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -52,21 +51,11 @@ LEAST = 4
 SLOW = 10.0
 """Time constants of a slow mode that the longest trajectory has, at most."""
 EVIDENCE = 20.0
-"""Log-likelihood of the effects on such a mode, or of products, from which on they count."""
+"""Log-likelihood of the effects on such a mode from which on they count."""
+MOST = 3e7
+"""Numbers from which on the information in the data on all of a model is not computed."""
 FIRST = 8
 """Measurements from which a filter finds the state."""
-CHANGED = 2.0
-"""Residuals of one model relative to those of one before a row and another after it, as squares, from
-which on the plant changed there."""
-PLACES = 20
-"""Rows at which this is looked for, beside the beginnings of trajectories."""
-BENT = 1.3
-"""Residuals of a model linear in an input relative to those of one piecewise linear in it, as squares,
-from which on the states do not follow it in proportion."""
-MODES = 4
-"""Leading modes of the state in products."""
-KNOTS = 0.1, 0.25, 0.5, 0.75, 0.9
-"""Where the pieces end: quantiles of the input."""
 
 
 Model: TypeAlias = ReducedModel | ModelRows | FieldModel
@@ -145,6 +134,54 @@ def largest_pole(
     return size, size - reach, size + reach
 
 
+def uncertain_effects(model: InnovationModel, trajectories: Sequence[Trajectory]) -> Array:
+    """Half of a 95 % interval of the effect of each input in `LAGS` steps, relative to it, (n_a,).
+
+    From the information in the innovations on A, B and d, each number of the state in units of its
+    variation; nothing where data are few or far too many for that. Source: Ljung, *System
+    Identification*, 2nd ed., 1999, section 9.4.
+    """
+    A, C, F, (n, n_a) = model.A, model.C, model.A - model.G @ model.C, model.B.shape
+    every, width = np.concatenate([z for z, _ in trajectories]), n * (n + n_a + 1)
+    if width * len(every) * len(C) > MOST:
+        return np.zeros(0)
+    parts = []
+    for z, a in trajectories:
+        v = z[:-1] @ model.U
+        begin = linalg.pinv(C) @ v[0][:, None]
+        x = driven(F, a @ model.B.T + model.drift + v @ model.G.T, begin)[:-1, :, 0]
+        causes = np.hstack([x, a, np.ones((len(x), 1))]).T
+        moved = [np.outer(cause, own) for cause in causes for own in np.eye(n)]
+        by = [driven(F, w, np.zeros((n, 1)))[:-1, :, 0] @ C.T for w in moved]
+        parts.append(np.stack([v - x @ C.T, *by], axis=2)[FIRST:])
+    seen = np.concatenate(parts)
+    if len(seen) <= width:
+        return np.zeros(0)
+    S = np.cov(seen[..., 0].T).reshape(len(C), len(C))
+    root = linalg.cholesky(S + ROUNDED * max(np.trace(S), 1e-300) * np.eye(len(C)), lower=True)
+    J = linalg.solve_triangular(
+        root, seen[..., 1:].transpose(1, 0, 2).reshape(len(C), -1), lower=True
+    )
+    J = J.reshape(-1, width)
+    unit = np.where(np.ptp(every, axis=0) > 0.0, every.std(axis=0), np.inf)[:, None]
+
+    def effects(change: Array) -> Array:
+        by_x, by_a, _ = np.split(change.reshape(-1, n), (n, n + n_a))
+        x = np.zeros_like(model.B)
+        for _ in range(LAGS):
+            x = (A + by_x.T) @ x + model.B + by_a.T
+        return np.asarray(model.U @ C @ x / unit)
+
+    size = np.maximum(linalg.norm(J, axis=0), 1e-300)
+    covariance = linalg.pinvh((J / size).T @ (J / size), rtol=ROUNDED**2) / np.outer(size, size)
+    known, small = effects(np.zeros(width)), 1e-6
+    D = np.stack([(effects(small * own) - known) / small for own in np.eye(width)], axis=2)
+    variance = np.einsum("ijp,pq,ijq->j", D, covariance, D)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = special.ndtri(0.5 + CONFIDENCE / 2) * np.sqrt(variance) / linalg.norm(known, axis=0)
+    return np.asarray(found)
+
+
 def without_insignificant_effects(
     model: InnovationModel, trajectories: Sequence[Trajectory]
 ) -> InnovationModel:
@@ -187,186 +224,6 @@ def _negative_log_likelihood(model: InnovationModel, trajectories: Sequence[Traj
         e = (v - x[:-1, :, 0] @ C.T)[FIRST:]
         total += 0.5 * float(np.sum(e * linalg.solve(model.innovations, e.T).T))
     return total
-
-
-def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, float] | None:
-    """Where the states begin to follow the inputs otherwise: trajectory, its step, ratio of squares.
-
-    Residuals of steps by regressions on two rows, of all data and of those before and after a step
-    (Chow, Econometrica 28(3), 1960), of the state for which that matters most.
-    """
-    every = [np.hstack([z[:-1], a]) for z, a in trajectories]
-    n_z, mean = trajectories[0][0].shape[1], np.concatenate(every).mean(axis=0)
-    unit = np.concatenate(every).std(axis=0)
-    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
-    width = 2 * len(mean) + 1
-    rows = np.array([(i, k) for i, x in enumerate(every) for k in range(1, len(x))])
-    if len(rows) < 4 * LEAST * width:
-        return None
-    parts = []
-    for (z, _), x in zip(trajectories, every, strict=True):
-        scaled, after = (x - mean) / unit, (z[2:] - z[1:-1]) / unit[:n_z]
-        parts.append(np.hstack([np.ones((len(after), 1)), scaled[1:], scaled[:-1], after]))
-    known = np.concatenate(parts)
-    begins = np.flatnonzero(rows[:, 1] == 1)
-    places = np.unique(np.r_[begins, np.arange(1, PLACES) * len(rows) // PLACES])[1:]
-    squares = [part.T @ part for part in np.split(known, places)]
-    before, total = np.cumsum(squares, axis=0), np.sum(squares, axis=0)
-
-    def missed(G: Array) -> Array:
-        own = linalg.lstsq(G[:width, :width], G[:width, width:], cond=1e-10)[0]
-        return np.asarray(np.diag(G)[width:] - np.sum(G[:width, width:] * own, axis=0))
-
-    least, one, best = ROUNDED * np.diag(total)[width:], missed(total), (0, 0, CHANGED)
-    for place, G in zip(places, before, strict=False):
-        if min(place, len(rows) - place) > LEAST * width:
-            two = np.maximum(missed(G) + missed(total - G), least)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = float(np.nanmax(one / two)) * (len(rows) - 2 * width) / (len(rows) - width)
-            if ratio > best[2]:
-                best = int(rows[place, 0]), int(rows[place, 1]), ratio
-    return None if best[2] == CHANGED else best
-
-
-@dataclass(frozen=True)
-class Bend:
-    """A state that does not follow an input in proportion.
-
-    ratio: of squares that a linear and a piecewise linear model miss; most, least: the effect of a unit
-    of the input in a step where it is largest and smallest in magnitude, with the ends of that piece.
-    """
-
-    state: int
-    input: int
-    ratio: float
-    most: tuple[float, float, float]
-    least: tuple[float, float, float]
-
-    def text(self, channels: Channels) -> str:
-        """One sentence."""
-        z, a = channels.state(self.state), channels.input(self.input)
-        (most, low, high), (least, other_low, other_high) = self.most, self.least
-        return (
-            f"{z} does not follow {a} in proportion (a linear model misses {self.ratio:.3g} times the "
-            f"squares of a piecewise linear one): in a step it moves by {most:.2g} per unit between "
-            f"{low:.4g} and {high:.4g}, and by {least:.2g} between {other_low:.4g} and "
-            f"{other_high:.4g}, as where an actuator saturates or has a dead band: log what it applies "
-            "or identify from rows in which it follows"
-        )
-
-
-def disproportionate(trajectories: Sequence[Trajectory]) -> Bend | None:
-    """The state and the input that a piecewise linear effect of the input explains best, if any.
-
-    Residuals of steps by regressions on two rows, with and without max(a - knot, 0); inputs of few
-    values do not tell.
-    """
-    known, n_z = [(z, a) for z, a in trajectories if len(a) > 1], trajectories[0][0].shape[1]
-    parts = [np.hstack([z[1:-1], z[:-2], a[1:], a[:-1]]) for z, a in known]
-    if not parts:
-        return None
-    X, after = np.concatenate(parts), np.concatenate([z[2:] for z, _ in known])
-    inputs = np.concatenate([a[1:] for _, a in known])
-    width = X.shape[1] + 1 + len(KNOTS)
-    if len(X) < LEAST * width:
-        return None
-    mean, unit = X.mean(axis=0), X.std(axis=0)
-    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
-    linear = np.hstack([np.ones((len(X), 1)), (X - mean) / unit])
-    rounding = len(X) * (ROUNDED * after.std(axis=0)) ** 2
-
-    def fitted(bends: Array) -> tuple[Array, Array]:
-        own = linalg.lstsq(np.hstack([linear, bends]), after, cond=1e-10)[0]
-        missed = after - linear @ own[: linear.shape[1]] - bends @ own[linear.shape[1] :]
-        return own, np.maximum(np.sum(missed**2, axis=0), rounding)
-
-    one, found = fitted(np.zeros((len(X), 0)))[1], None
-    for j, a in enumerate(inputs.T):
-        if len(np.unique(a)) < 2 * len(KNOTS):
-            continue
-        knots = np.unique(np.quantile(a, KNOTS))
-        own, two = fitted(np.maximum(a[:, None] - knots, 0.0) / unit[2 * n_z + j])
-        ratio = one / np.maximum(two, 1e-300) * (len(X) - width) / (len(X) - linear.shape[1])
-        i = int(ratio.argmax())
-        if ratio[i] > (found.ratio if found else BENT):
-            ends = np.r_[a.min(), knots, a.max()]
-            sizes = np.r_[own[1 + 2 * n_z + j, i], own[linear.shape[1] :, i]].cumsum()
-            sizes /= unit[2 * n_z + j]
-            pieces = list(zip(sizes.tolist(), ends.tolist(), ends[1:].tolist(), strict=False))
-            least, *_, most = sorted(pieces, key=lambda piece: abs(piece[0]))
-            found = Bend(i, j, float(ratio[i]), most, least)
-    return found
-
-
-@dataclass(frozen=True)
-class Products:
-    """A state that follows products of the state and inputs.
-
-    ratio: of squares that models without and with these products miss; of_linear: of a linear model and
-    that with all products of two numbers.
-    """
-
-    state: int
-    inputs: tuple[int, ...]
-    ratio: float
-    of_linear: float
-
-    def text(self, channels: Channels) -> str:
-        """One sentence."""
-        names = listed([channels.input(j) for j in self.inputs])
-        return (
-            f"{channels.state(self.state)} follows products of a state and {names} (a linear model "
-            f"misses {self.of_linear:.3g} times the squares of one with products), as where a flow "
-            "carries heat or a valve opens a path: poles and gains change with the point, and a "
-            "linear law holds near its target alone; identify from rows near it, or by the model of "
-            "the whole field, which has products (with a --target)"
-        )
-
-
-def products(trajectories: Sequence[Trajectory]) -> Products | None:
-    """The state that products of leading modes of the state and inputs explain best, if any.
-
-    Residuals of steps by regressions on two rows, with products of two modes and of two inputs, and
-    those of a mode and an input as well.
-    """
-    known = [(z, a) for z, a in trajectories if len(a) > 1]
-    n_z, n_a = (part.shape[1] for part in trajectories[0])
-    parts = [np.hstack([z[1:-1], z[:-2], a[1:], a[:-1]]) for z, a in known]
-    if not parts:
-        return None
-    X, after = np.concatenate(parts), np.concatenate([z[2:] for z, _ in known])
-    mean, unit = X.mean(axis=0), X.std(axis=0)
-    unit[unit <= ROUNDED**2 * np.abs(mean)] = np.inf
-    X = (X - mean) / unit
-    s, u = X[:, :n_z], X[:, 2 * n_z : 2 * n_z + n_a]
-    with one_thread():
-        s = s @ linalg.svd(s, full_matrices=False)[2][:MODES].T
-    pairs = [*combinations_with_replacement(range(s.shape[1]), 2)]
-    others = [*combinations_with_replacement(range(n_a), 2)]
-    without = np.column_stack(
-        [np.ones(len(X)), X, *(s[:, i] * s[:, j] for i, j in pairs)]
-        + [u[:, i] * u[:, j] for i, j in others]
-    )
-    mixed = [s * u[:, j : j + 1] for j in range(n_a)]
-    least = (ROUNDED * after.std(axis=0)) ** 2
-    width = without.shape[1] + n_a * s.shape[1]
-    if len(X) < LEAST * width:
-        return None
-
-    def missed(columns: Array) -> Array:
-        left = after - columns @ linalg.lstsq(columns, after, cond=1e-10)[0]
-        squares = np.sum(left**2, axis=0) / (len(X) - columns.shape[1])
-        return np.asarray(np.maximum(squares, least))
-
-    every = missed(np.hstack([without, *mixed]))
-    ratio = missed(without) / np.maximum(every, 1e-300)
-    i = int(ratio.argmax())
-    if not (ratio[i] > BENT and 0.5 * len(X) * np.log(ratio[i]) > EVIDENCE):
-        return None
-    fewer = [missed(np.hstack([without, *mixed[:j], *mixed[j + 1 :]]))[i] for j in range(n_a)]
-    told = [j for j in range(n_a) if fewer[j] > BENT * every[i]] or [int(np.argmax(fewer))]
-    linear = missed(without[:, : 1 + X.shape[1]])[i] / every[i]
-    return Products(i, tuple(told), float(ratio[i]), float(linear))
 
 
 def stability(low: float, high: float) -> str:

@@ -12,7 +12,7 @@ import pytest
 from pdeloop.cli import main
 from pdeloop.data_file import Measurements
 from pdeloop.identification import Identified, identify_data
-from pdeloop.model_checks import products
+from pdeloop.linearity import products
 from tests.method.test_input_delay import logged
 
 TARGET = np.array([60.0, 48.0])

@@ -9,8 +9,9 @@ import pytest
 from controller_node.identification import DesignSettings, designed
 from pdeloop.data_file import Measurements
 from pdeloop.identification import identify_data
+from pdeloop.linearity import structural_break
 from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
-from pdeloop.model_checks import structural_break, without_insignificant_effects
+from pdeloop.model_checks import without_insignificant_effects
 
 A = np.array([[0.92, 0.019], [0.014, 0.946]])
 B = np.array([[0.096, 0.02], [0.015, 0.073]])

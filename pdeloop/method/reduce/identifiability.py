@@ -171,7 +171,7 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
         none = {*range(y.shape[1] if len(y) > y.shape[1] + LEFT else 0)}
         while coarse and none:
             none -= _with_effect(steps_of(coarse), none)
-            coarse = [_means(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
+            coarse = [coarser(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
         modes = linalg.svd(data.after, full_matrices=False)[2][:PAST].T
         known = [_with_past(z @ modes, a) for z, a in trajectories if len(a) > 2 * PAST]
         lags = [j + i * y.shape[1] for j in none for i in range(PAST)]
@@ -227,7 +227,7 @@ def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
     return [int(j) for j in np.flatnonzero(own < FED_BACK)]
 
 
-def _means(z: Array, a: Array) -> Trajectory:
+def coarser(z: Array, a: Array) -> Trajectory:
     """Means of `COARSER` rows, and of the inputs from the middle of one to that of the next."""
     count, n, half = len(z) // COARSER, COARSER, COARSER // 2
     of_inputs = a[half : half + n * (count - 1)].reshape(count - 1, n, -1)

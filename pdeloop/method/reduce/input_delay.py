@@ -16,7 +16,8 @@ Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only for an in
 from its own past z_{k+n} does not improve (Granger), while the change to z_{k+n+1} does: the effect of
 an input that is logged late is in the states before its row, but not in those before it acted. One that
 follows from z_{k+n+1} alone is fed back. And
-another delay counts only if the inputs with the delay in use add nothing to it.
+another delay counts only if the inputs with the delay in use add nothing to it. Where both act, and the
+later one is such an input, rows are means over their time.
 
 References
 ----------
@@ -71,7 +72,7 @@ class DelayStudy:
     best: 0 of each where no other one is better beyond chance; error: of single steps with `best`,
     relative to that with the delays in use, the root of the mean square over channels; alike: other
     delays that the data do not tell apart from `best`, each with a likelihood within EVIDENCE of it;
-    at_end: those of `best` beyond which none was tried.
+    at_end: those of `best` beyond which none was tried; beside: whether the inputs as used act as well.
     """
 
     best: Delays
@@ -79,11 +80,22 @@ class DelayStudy:
     gain: float = 1.0
     alike: tuple[Delays, ...] = ()
     at_end: Delays = ()
+    beside: bool = False
 
     def text(self, channels: Channels = NUMBERED, sample_time: float | None = None) -> str:
         """One sentence on what is better than the delays in use; empty if nothing is."""
         if self.best == self.used:
             return ""
+        if self.beside:
+            names = listed(
+                [channels.input(j) for j, n in enumerate(self.best) if n != self.used[j]]
+            )
+            return (
+                f"the data fit {self.gain:.3g} times better with {names} of their own row as well, not "
+                "of the row before alone, as where rows are means over time or are read after the "
+                "inputs have changed: log what is read as they change, or give "
+                f"--input-delay={_value(self.best)}, with which a model in innovation form has both"
+            )
         moves = dict.fromkeys(np.subtract(self.best, self.used).tolist())
         parts = []
         for move in moves:
@@ -198,6 +210,11 @@ def _best(data: _Regression, used: Delays) -> DelayStudy:
         best = better
     # All steps together, of which each was.
     if best == used or not data.is_better(best, used) or data.acts_as_well(used, best):
+        told = free.get(-1, np.zeros((2, n_a), dtype=bool))
+        early = tuple(n - int(n == 0 and told[0][j] and told[1][j]) for j, n in enumerate(used))
+        both = (*used, *early)
+        if early != used and data.is_better(both, used):
+            return DelayStudy(early, used, data.gain(both, used), beside=True)
         return DelayStudy(used, used)
     near = data.likelihood(best) - EVIDENCE
     alike = tuple(other for other in others if other != best and data.likelihood(other) > near)
@@ -268,9 +285,10 @@ class _Regression:
         return {}
 
     def errors(self, delays: Delays) -> Array:
-        """Squared errors of each held-out fold and channel, (F, c)."""
+        """Squared errors of each held-out fold and channel, (F, c); delays: once or twice n_a."""
         if delays not in self._known:
-            columns = [*range(1 + 2 * self.n), *self._inputs(delays, range(self.n_a))]
+            inputs = self._inputs(delays, [j % self.n_a for j in range(len(delays))])
+            columns = [*range(1 + 2 * self.n), *dict.fromkeys(inputs)]
             self._known[delays] = self._held_out(columns, self.of_xy, self.of_yy)
         return self._known[delays]
 
