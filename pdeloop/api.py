@@ -401,7 +401,7 @@ def train(
         given = {**given, **named(source, parameters, given)}
         if model is not None:
             given["model"] = str(model) if isinstance(model, str | Path) else model
-        folder, values = begin(source, given, where, transport)
+        folder, values = begin(source, given, where.absolute(), transport)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         advice = f"continue with: {continuing(folder, values, transport)}"
         if out is None:

@@ -162,7 +162,7 @@ class Identified:
             size = max(self.uncertain[j] for j in poor)
             found.append(
                 f"the data determine the effect of {names} to {size:.0%} only (95 % interval), as of "
-                "an input that moved once or little: move it more, and more often"
+                "an input that moved once, little or with the state: move it more, and more often"
             )
         if loop is not None and loop.ends[0] > FAR:
             found.append(

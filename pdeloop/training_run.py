@@ -149,8 +149,9 @@ def begin(
     then gets the model with the gains for the plant's target.
 
     Mistakes that show without a compiler are refused before anything is compiled, as are options that
-    change nothing. transport: over topics, if not given.
+    change nothing. transport: over topics, if not given. A plant may change the working directory.
     """
+    here = Path.cwd()
     matrices = options.get("model", "")
     if not isinstance(matrices, str) or (matrices and not file_of_gains(matrices)):
         options = {**options, "model": GIVEN}
@@ -163,7 +164,7 @@ def begin(
     content = b""
     if matrices != "":
         content = with_gains(matrices, build_plant(values, compiled=False), values)
-        values["model"] = str((folder / GIVEN).absolute())
+        values["model"] = str(here / folder / GIVEN)
     with TemporaryDirectory() as temporary:
         # The run's folder is made after everything was looked at.
         own = {"model": str(Path(temporary) / GIVEN)} if content else {}
@@ -172,6 +173,7 @@ def begin(
         training = build_training({**values, **own})
     if not transport.in_process:
         check_messages(values, training)
+    folder = folder if Path.cwd() == here else here / folder
     RunFolder(folder).refuse_another()
     load_compiled(values, fits=True)
     RunFolder(folder).create(values)
@@ -228,6 +230,7 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     stream = sys.stderr if as_json else sys.stdout
     display = Display(values["seed"], values["seeds"], stream)
     started, again = time.monotonic(), continuing(folder, values, transport)
+    shown, folder = folder, folder.absolute()
     try:
         # Over topics every node that was started must be known, and every bag finished.
         with interruptible(again, at_once=transport.in_process) as check:
@@ -239,9 +242,9 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
         display.close()
     summary = RunFolder(folder).result()
     if as_json:
-        print_json({"folder": str(folder), **summary})
+        print_json({"folder": str(shown), **summary})
     else:
-        for text in narration.closing_lines(values["problem"], summary, folder):
+        for text in narration.closing_lines(values["problem"], summary, shown):
             display.line(text)
         display.line(f"  {time.monotonic() - started:.1f} s with start-up")
     for text in narration.warnings(summary):

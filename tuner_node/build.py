@@ -205,7 +205,18 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
 
 def remarks_on(values: Mapping[str, Any]) -> list[str]:
     """What to say before a training with these parameters begins."""
-    return [*_resting_remarks(values), *_sensor_remarks(values)]
+    return [*_following_remarks(values), *_resting_remarks(values), *_sensor_remarks(values)]
+
+
+def _following_remarks(values: Mapping[str, Any]) -> list[str]:
+    """A law that cannot follow a target that moves."""
+    cost = Cost.parse(values["cost"])
+    if cost is None or cost.target.ndim == 1 or law_of(values, kind_of(values)) is not Affine:
+        return []
+    return [
+        "the target moves, and the law 'affine' has one offset for all steps, that of its mean: take "
+        "feedforward, the default with model_based, which follows it"
+    ]
 
 
 def _resting_remarks(values: Mapping[str, Any]) -> list[str]:

@@ -287,6 +287,16 @@ def test_a_target_of_the_actions_beyond_their_bounds_is_told() -> None:
     assert not remarks_on(pdeloop.problem(plant=servo).values)
 
 
+def test_a_law_that_cannot_follow_a_target_that_moves_is_told_at_the_start() -> None:
+    servo = Servo()
+    assert not remarks_on(pdeloop.problem(plant=servo).values)
+    servo.target = np.sin(np.arange(servo.horizon + 1))[:, None] * np.ones(2)
+    assert not remarks_on(pdeloop.problem(plant=servo).values)
+    values = pdeloop.problem(plant=servo).values | {"law": "affine"}
+    (told,) = remarks_on(values)
+    assert told.startswith("the target moves, and the law 'affine' has one offset for all steps")
+
+
 def test_what_a_plant_declares_is_read_back_or_refused_at_the_start() -> None:
     servo = Servo()
     servo.divergence_bound = 1e9  # of pascals

@@ -66,3 +66,21 @@ def test_a_white_input_of_which_one_reading_shows_a_slow_effect_has_one() -> Non
     A, data = log(3, 16.0, 0.05)
     found = identify_data(data, {})
     assert found.pole[0] == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), abs=0.02)
+
+
+@pytest.mark.parametrize("target", [None, np.array([25.0, 25.0, 25.0])])
+def test_a_stable_machine_at_ambient_temperature_has_its_five_poles(
+    target: np.ndarray | None,
+) -> None:
+    """Five hidden states, three thermocouples with 0.05 K of noise, two heaters of up to 5 kW."""
+    rng, poles = np.random.default_rng(5), [0.3, 0.6, 0.85, 0.93, 0.97]
+    by = np.diag(poles[::-1])
+    by[0, 1], by[1, 2] = 0.1, 0.08
+    B, C = 0.3 * rng.standard_normal((5, 2)), rng.standard_normal((3, 5))
+    u, x, y = np.repeat(rng.uniform(0.0, 5.0, (120, 2)), 5, 0), np.zeros(5), np.empty((600, 3))
+    for k in range(600):
+        y[k] = C @ x + 0.05 * rng.standard_normal(3) + [20.0, 21.0, 22.0]
+        x = by @ x + B @ u[k] + 0.01 * rng.standard_normal(5)
+    found = identify_data(Measurements([(y, u[:-1])], target, 1.0), {})
+    np.testing.assert_allclose(np.sort(np.abs(found.poles)), poles, atol=0.01)
+    assert found.pole[1] < 0.97 < found.pole[2] < 1.0 and max(found.uncertain) < 0.02

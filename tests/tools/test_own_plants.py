@@ -446,3 +446,24 @@ def test_no_model_of_a_field_on_one_axis_is_fitted_to_a_plate(
     settings |= {"physical.nx": 6, "physical.ny": 4}
     run = pdeloop.train(plant=PLATE, rollouts=12, evaluation_fields=2, **settings)
     assert run.costs["adapted"].mean() < run.costs["lqt"].mean()
+
+
+@pytest.mark.parametrize("where", ["__init__", "initial_state"])
+def test_a_plant_that_changes_the_working_directory_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    other, plant = tmp_path / "other", tmp_path / "mover.py"
+    other.mkdir()
+    own = OWN.split("class Needy")[0]
+    method = next(line for line in own.splitlines() if f"def {where}" in line)
+    plant.write_text(
+        own.replace(method, f"{method}\n        __import__('os').chdir({str(other)!r})")
+    )
+    monkeypatch.chdir(tmp_path)
+    for out in (["--out", "run"], []):
+        monkeypatch.chdir(tmp_path)
+        words = ["train", "--plant", f"{plant}:Rod", "--rollouts", "6", "--in-process"]
+        assert main([*words, "--evaluation-fields", "2", *out]) == 0
+    assert Path.cwd() == other and not list(other.iterdir())
+    assert (tmp_path / "run" / "result.json").exists()
+    assert len(list((tmp_path / "runs").glob("*/result.json"))) == 1
