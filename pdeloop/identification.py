@@ -22,6 +22,7 @@ from controller_node.identification import DesignSettings, designed, examined, i
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 from pdeloop.linearity import disproportionate, products, rate_limited, structural_break
+from pdeloop.log_effects import fed_back, require_effects, require_motion
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
@@ -32,13 +33,7 @@ from pdeloop.messages.spec import ParameterError
 from pdeloop.messages.topics import COMPLETED, CostColumn, episode_name
 from pdeloop.method.reduce import regression
 from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, followed_the_state, listed
-from pdeloop.method.reduce.identifiability import (
-    Identifiability,
-    NotIdentifiableError,
-    fed_back,
-    require_effects,
-    require_motion,
-)
+from pdeloop.method.reduce.identifiability import Identifiability, NotIdentifiableError
 from pdeloop.method.reduce.input_delay import Delays, shifted, study_delays
 from pdeloop.method.reduce.reduced_model import ReducedModel, Samples, Trajectory, steps_of
 from pdeloop.method.reduce.regression import OrderStudy, study_orders

@@ -15,9 +15,9 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import linalg
 
+from pdeloop.log_effects import COARSER, coarser
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
-from pdeloop.method.reduce.identifiability import COARSER, coarser
 from pdeloop.method.reduce.reduced_model import Trajectory
 from pdeloop.process.one_thread import one_thread
 

@@ -21,7 +21,6 @@ from pdeloop.method.reduce.identifiability import (
     CLOSE,
     NotIdentifiableError,
     examine,
-    fed_back,
 )
 from pdeloop.method.reduce.regression import exact_regression, study_orders
 
@@ -268,11 +267,3 @@ def test_the_controller_refuses_an_exploration_that_excites_nothing() -> None:
         own = DesignSettings(**{**vars(settings), "identification": identification})
         with pytest.raises(ValueError, match="the input a2 never moved"):
             design_each(states[:, None], actions[:, None], [0], np.zeros(N_Z), own)
-
-
-def test_a_log_that_is_too_short_for_the_past_tells_no_feedback() -> None:
-    z = np.arange(27.0).reshape(9, 3) % 7
-    assert fed_back([(z, -z[:-1, :1])]) == []
-    rng = np.random.default_rng(0)
-    z = rng.normal(size=(200, 3))
-    assert fed_back([(z, np.column_stack([-z[:-1, 0], rng.normal(size=199)]))]) == [0]

@@ -11,7 +11,8 @@ import pytest
 
 from pdeloop.data_file import Measurements, read_measurements
 from pdeloop.identification import Identified, identify_data
-from pdeloop.method.reduce.identifiability import NotIdentifiableError, require_effects
+from pdeloop.log_effects import fed_back, require_effects
+from pdeloop.method.reduce.identifiability import NotIdentifiableError
 
 A = np.diag([0.86, 0.74, 0.74, 0.86]) + 0.12 * (np.eye(4, k=1) + np.eye(4, k=-1))
 B = np.zeros((4, 2))
@@ -215,3 +216,11 @@ def test_states_that_are_frozen_while_inputs_move_are_no_plant_at_rest() -> None
     own = Measurements([(np.full((ROWS, 4), 20.0), steps()[:-1])], None, 1.0)
     with pytest.raises(NotIdentifiableError, match=r"stands still: .* although a1 and a2 moved"):
         identify_data(own, {})
+
+
+def test_a_log_that_is_too_short_for_the_past_tells_no_feedback() -> None:
+    z = np.arange(27.0).reshape(9, 3) % 7
+    assert fed_back([(z, -z[:-1, :1])]) == []
+    rng = np.random.default_rng(0)
+    z = rng.normal(size=(200, 3))
+    assert fed_back([(z, np.column_stack([-z[:-1, 0], rng.normal(size=199)]))]) == [0]

@@ -93,17 +93,6 @@ def moved_together(name: str, terms: Mapping[str, float], offset: float) -> str:
     )
 
 
-def no_effect(names: Sequence[str], moves: Sequence[float], means: Sequence[float]) -> str:
-    """Message about inputs of whose effect the data show nothing; moves: standard deviations."""
-    pairs = list(zip(moves, means, strict=True))[:SHOWN]
-    own = ", ".join(f"{move:.2g} about {mean:.4g}" for move, mean in pairs)
-    it = "it" if len(names) == 1 else "them"
-    return (
-        f"beside their noise the states show no effect of {listed(names)}, which moved by {own}: move "
-        f"{it} more, give an --input-delay of more than ten rows, or leave {it} out of --inputs"
-    )
-
-
 def followed_the_state(names: Sequence[str]) -> str:
     """Message about inputs, or a combination of inputs, that are a function of the state."""
     one = len(names) == 1

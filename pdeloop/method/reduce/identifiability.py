@@ -23,7 +23,7 @@ regressors).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,20 +55,6 @@ RESOLVED = 1e-7
 """Relative size of a singular value that the square of a matrix still resolves."""
 ROUNDED = 0.35
 """Root mean square of what rounding leaves, in steps: 0.29 for one that is uniform in a step."""
-ROUNDING = 1e-10
-"""Size of a residual, relative to the states, that is rounding."""
-BY_CHANCE = 1e-4
-"""Probability with which one test takes an input without effect for one that has some."""
-COARSER = 4
-"""Rows of which the mean is taken, again and again, to see slow effects."""
-PAST = 8
-"""Rows whose inputs may have an effect on readings that do not show the whole state."""
-FED_BACK = 0.1
-"""Independence of the last `PAST` rows below which an input may be that of a controller."""
-RESTS, NEARLY = 1e-9, 1e-2
-"""Ranges of a channel, relative to its largest value, that are rounding, and that are small."""
-DIGITS = 3
-"""Steps in which a channel was written that a small range of one at rest has at most."""
 LEVELS = 10
 """Different values from which on an input counts as rounded; below it is switched."""
 
@@ -154,116 +140,6 @@ def examine_steps(data: Samples, U: Array, channels: Channels = NUMBERED) -> Ide
             f"{smallest:.1g} of the largest): take a lower order, or a longer log"
         )
     return Identifiability(unknowns, rank, smallest, independence, tuple(faults), tuple(remarks))
-
-
-def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> None:
-    """NotIdentifiableError for inputs that changed the states by no more than chance does.
-
-    From one row to the next, from one mean of 4, 16, ... rows to the next, where a slow effect in noise
-    shows, and by the inputs of `PAST` rows, whose effect on few readings takes its time. Inputs that
-    cannot be told apart are left to others.
-    """
-    data, coarse = steps_of(trajectories), list(trajectories)
-    y = data.actions
-    with one_thread():
-        if examine_steps(data, linalg.svd(data.after, full_matrices=False)[2][:1].T).faults:
-            return
-        none = {*range(y.shape[1] if len(y) > y.shape[1] + LEFT else 0)}
-        while coarse and none:
-            none -= _with_effect(steps_of(coarse), none)
-            coarse = [coarser(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
-        modes = linalg.svd(data.after, full_matrices=False)[2][:PAST].T
-        known = [_with_past(z @ modes, a) for z, a in trajectories if len(a) > 2 * PAST]
-        lags = [j + i * y.shape[1] for j in none for i in range(PAST)]
-        if none and known:
-            none -= {j % y.shape[1] for j in _with_effect(steps_of(known), lags)}
-    if none:
-        own = sorted(none)
-        names = [channels.input(j) for j in own]
-        moves, means = y.std(axis=0)[own].tolist(), y.mean(axis=0)[own].tolist()
-        raise NotIdentifiableError(words.no_effect(names, moves, means))
-
-
-def require_motion(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> None:
-    """NotIdentifiableError where no state moves by more than rounding.
-
-    That is double precision, or, of inputs that hardly move either, the last digits that were written.
-    """
-    states, inputs = (np.concatenate(own) for own in zip(*trajectories, strict=True))
-    moved, pushed = (_ranges(own) for own in (states, inputs))
-    digits = [np.diff(np.unique(x)).min(initial=np.inf) for x in states.T]
-    written = np.ptp(states, axis=0) <= DIGITS * np.array(digits)
-    still = bool((pushed <= NEARLY).all())
-    if not ((moved <= RESTS) | (still & written & (moved <= NEARLY))).all():
-        return
-    own = [channels.input(int(j)) for j in np.flatnonzero(pushed > NEARLY)]
-    other = f", although {words.listed(own)} moved" if own else ", nor an input by more than 1 %"
-    raise NotIdentifiableError(
-        f"in all of the log the plant stands still: no state moves by more than {moved.max():.1g} of "
-        f"its size, which is rounding{other}; log an experiment in which the inputs move the states"
-    )
-
-
-def _ranges(columns: Array) -> Array:
-    """That of each column, relative to its largest magnitude."""
-    size = np.abs(columns).max(axis=0)
-    return np.asarray(np.ptp(columns, axis=0) / np.where(size > 0.0, size, 1.0))
-
-
-def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
-    """The inputs that the states and inputs of the last `PAST` rows tell, as those of a controller.
-
-    With an integral part, at a constant set point, it has but noise that tells them from the state.
-    """
-    n_a, before, inputs = trajectories[0][1].shape[1], list[Array](), list[Array]()
-    for states, a in (_with_past(z, a) for z, a in trajectories if len(a) > PAST):
-        before.append(np.hstack([states[:-1], a[:, n_a:]]))
-        inputs.append(a[:, :n_a])
-    if not before:
-        return []
-    known = np.concatenate(before)
-    with one_thread():
-        own, _ = _inputs(Samples(known, np.concatenate(inputs), known), known[:, :1], NUMBERED)
-    return [int(j) for j in np.flatnonzero(own < FED_BACK)]
-
-
-def coarser(z: Array, a: Array) -> Trajectory:
-    """Means of `COARSER` rows, and of the inputs from the middle of one to that of the next."""
-    count, n, half = len(z) // COARSER, COARSER, COARSER // 2
-    of_inputs = a[half : half + n * (count - 1)].reshape(count - 1, n, -1)
-    return z[: n * count].reshape(count, n, -1).mean(axis=1), of_inputs.mean(axis=1)
-
-
-def _with_past(z: Array, a: Array) -> Trajectory:
-    """The last `PAST` states and inputs as those of each row."""
-    z, a = (np.hstack([x[PAST - 1 - i : len(x) - i] for i in range(PAST)]) for x in (z, a))
-    return z, a
-
-
-def _with_effect(data: Samples, asked: Iterable[int]) -> set[int]:
-    """Inputs of which z_{k+1} tells more than noise would: Hotelling's test of a column of B."""
-    from scipy import special  # here, as no training needs it
-
-    before, after, y = (
-        part - part.mean(axis=0) for part in (data.before, data.after, data.actions)
-    )
-    y = scaled(y)[0]
-    steps, n_a = y.shape
-    _, values, modes = linalg.svd(after, full_matrices=False)
-    most = min(numerical_rank(values, *after.shape), (steps - n_a - 1) // 4)
-    found = set[int]()
-    for n in sorted({min(2**i, most) for i in range(2, 2 + max(most, 0).bit_length())}):
-        for j in {*asked} - found if n > 0 else ():
-            known = np.hstack([before @ modes[:n].T, np.delete(y, j, axis=1)])
-            left = np.column_stack([y[:, j], after @ modes[:n].T])
-            left -= known @ linalg.lstsq(known, left)[0]
-            columns, sizes, _ = linalg.svd(left[:, 1:], full_matrices=False)
-            columns = columns[:, sizes > ROUNDING * values[0]]
-            told, r = float(linalg.norm(columns.T @ left[:, 0])) ** 2, columns.shape[1]
-            chance = special.betaincinv(r / 2, (steps - 1 - n - n_a - r) / 2, 1.0 - BY_CHANCE)
-            if r and told > chance * float(linalg.norm(left[:, 0])) ** 2:
-                found.add(j)
-    return found
 
 
 def _inputs(data: Samples, s: Array, channels: Channels) -> tuple[Array, list[str]]:
