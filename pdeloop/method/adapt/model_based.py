@@ -6,12 +6,8 @@
                                                             law improved on it (`renewal`)
     judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
 
-Where every episode begins alike and renewing gains nothing more, laws about the target follow, each
-rolled out once (`replay`); rollouts alone decide then.
-Where no model predicts the rollouts, laws are steps along measured ones (`replay`), each rolled out on
-the fields of the first law, and compared with no control as well; then rollouts alone decide.
-
-Sources and equations: docs/optimizers.md.
+Laws where no model predicts the rollouts, or about the target: `replay`. Sources and equations:
+docs/optimizers.md.
 """
 
 from __future__ import annotations

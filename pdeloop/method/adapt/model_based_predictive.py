@@ -1,18 +1,12 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`model_based` for a law that plans: first the affine law, then plans on its model, and rollouts.
 
-The law that it begins as is trained as ever; here it is called the affine one, also where it has an
-offset for each step. On the last model, plans are simulated in closed loop from a few measured initial
-fields. The cost to go that closes them is that of the linear problem, and far too high where bounded
-actuators can do little near the target. The last rollouts are of the law with the plan, from fresh
-fields, and the verdict is on these (`verdict`).
+The law that it begins as is here called the affine one, also where it has an offset for each step. The
+law `auto` keeps rollouts for plans only where the model says, after a renewal of the affine law, that
+the best inputs for an episode save enough of its cost; else it is the affine law to the bit.
 
-The law `auto` keeps rollouts for plans only where the model says, after a renewal of the affine law,
-that the best inputs for an episode save enough of its cost; else it is the affine law to the bit.
-
-With few sensors the law `extended_kalman` is trained in place of the affine one. Plans start from the
-estimate of its filter, on the equation of that. This may be wrong where no sensor is: the last rollouts
-are on fields of the trained law, and these pairs decide.
+With few sensors plans start from the estimate of the trained law's filter. Its equation may be wrong
+where no sensor is: the last rollouts are on fields of the trained law, and these pairs decide.
 """
 
 from __future__ import annotations

@@ -1,20 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`model_based` for a law that estimates the state, on a model of the field between few sensors.
 
-Where one equation reproduces the readings of the rollouts (`pdeloop.method.models.sensed`), the law is
-designed and improved on it as on a model of the whole field, from the initial fields estimated from the
-readings and draws from their distribution. The descent starts from the cheapest, on the model, of the
-current law and those that are designed on it (`sensed_loop`). Laws are compared on other draws. In
-simulations of the filter's own equation what trusts it looks too good: the cheapest law on an estimate
-gets a filter that trusts the equation less where it then costs hardly more. The last rollouts of the
-final law begin where those of the first law did, and these pairs decide between the two: an equation
-that reproduces the readings may be wrong where no sensor is. An earlier law that measured better than
-the final one is returned in its place. Where no equation reproduces the rollouts, it continues with a
-model of the readings (`ModelBasedReadings`), in short steps from measured laws, and tries again with
-more of them. A linear model of the readings describes the plant near the fields of one law, and its
-innovations change with the law. So a step stays close to its starting point, the law with the best
-measured cost, and replays the innovations of its rollouts. Under its own law a rollout is reproduced
-exactly. Measured costs decide, or of an accepted model those of both laws in the same rollouts.
+Where one equation reproduces the readings (`pdeloop.method.models.sensed`), laws are designed and
+improved on it, from the initial fields estimated from the readings and draws from their distribution,
+and compared on other draws. In simulations of the filter's own equation what trusts it looks too good,
+and it may be wrong where no sensor is: the filter of the cheapest law trusts it less where that costs
+hardly more, and pairs of rollouts from the same fields decide.
+
+A linear model of the readings (`ModelBasedReadings`) describes the plant near the fields of one law,
+and its innovations change with the law. So a step stays close to the law that measured best.
 """
 
 from __future__ import annotations

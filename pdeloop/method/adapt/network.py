@@ -1,20 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`model_based` for the law `neural`: first the affine law, then a network beside it, and rollouts.
 
-The last rollouts are of the law with the network, from fresh fields, and replace the affine law only if
-it is better by more than chance (`verdict`). With s = U^T z of mean m and covariance C in the episodes
-of the law a_k = K s_k + b_k,
+With s = U^T z of mean m and covariance C in the episodes of the law a_k = K s_k + b_k,
 
     a_k = K s_k + b_k + E (A x_k + c + D tanh(W [x_k; r_k] + w)),    x = (C + e |C| I)^-1/2 (s - m),
     E = share sqrt(J / T) G^-1/2,                                    G = R + B^T P B,
 
 so that no number depends on the units of states and actions. r_k is b_k in such coordinates, where it
-changes: what the target of that step and those to come ask for. D, A and c are zero at first. Two
-descents follow, both by Adam with a step length that falls as a cosine:
+changes. D, A and c are zero at first. Two descents follow, both by Adam:
 
-    imitation   mean |G^1/2 (a - a*)|^2 of the actions a* of the plans that the law `predictive` would
-                use on the same model, from the states of episodes that plans control, and of
-                others that the network controls (DAgger)
+    imitation   mean |G^1/2 (a - a*)|^2 of the actions a* of plans on the same model, from the states
+                of episodes that plans control, and of others that the network controls (DAgger)
     improvement mean over z_k of sum_{i < H} l_{k+i} + V(z_{k+H}), the cost of plans, with the exact
                 gradient through all steps of the model; z_k are states of episodes of the network
 

@@ -1,27 +1,21 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A new law from measurements: initial fields, and a descent from them on a model of the whole field.
 
-The distance that the law moves from the first one is chosen by cross-validation: for each part of the
-measured fields a law is made from the others, and fractions of the way to it are compared by their
-costs on the model from the fields left out. Costs differ far more between fields than between laws, and
-the saving of a law is proportional to the cost. So the cost of the first law is the control variate:
-chance is that of the ratio of mean costs.
+Costs differ far more between fields than between laws, and the saving of a law is proportional to the
+cost. So the distance that the law moves is chosen by cross-validation with the cost of the first law as
+the control variate: chance is that of the ratio of mean costs.
 
-The measured fields are those in which episodes began, of which the state of a chaotic plant soon
-becomes independent: there any measured state serves, and one rollout has many. On other plants the law
-is also improved on draws of a normal distribution, with the mean m of the n measured fields and the
-covariance
+Fields are drawn from a normal distribution with the mean m of the n measured ones and the covariance
 
     C = (1 + 1/n) ((1 - rho) S + rho P),        S = 1/(n - 1) sum (z_i - m)(z_i - m)^T,
 
 where P is the mean of S over all shifts along each component of the state: the covariance of a
-distribution that looks alike everywhere, of which a few fields tell much. The share rho is the one that
-is nearest to the true covariance in the mean: with Q the part of a matrix that is not invariant,
+distribution that looks alike everywhere, of which a few fields tell much. The share rho is nearest to
+the true covariance in the mean: with Q the part of a matrix that is not invariant,
 
     rho = E|Q S - E Q S|^2 / E|Q S|^2.
 
-It is 1 where fields look alike everywhere and falls as 1/n where they do not; 1 + 1/n is for the
-uncertainty of m. Draws have this mean and, in as many directions as they can, this covariance exactly.
+Draws have this mean and, in as many directions as they can, this covariance exactly.
 
 References
 ----------

@@ -15,14 +15,12 @@ that it improves stay there, too. In x = U^T (z - z_r), the samples of all rollo
     x_{k+1} = A x_k + B a_k + H (x_k x x_k)
 
 without a constant, as the target is taken for a steady state. The products account for what changes on
-the way to it, so that A and B are those at the target, and a = K x is the LQ law of these two. Where a
-rollout of it comes nearer, the next fit knows more of what is there.
+the way to it, so that A and B are those at the target, and a = K x is the LQ law of these two.
 
 References
 ----------
-Conn, Gould, Toint, "Trust-Region Methods", SIAM 2000, chapter 6.
-Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projection-based model
-reduction", CMAME 306, 2016.
+Conn, Gould, Toint, "Trust-Region Methods", SIAM 2000, chapter 6. Peherstorfer, Willcox, CMAME 306, 2016
+(operator inference).
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A model of the field between few sensors under laws that estimate it, and the design of such laws.
 
-The initial field of a rollout is estimated from its readings (`pdeloop.method.models.sensed_fit`). All
-designs begin with the best law of the whole field on the model, a = K x + b with x = V^T z and V the
-POD modes of simulated fields (`whole_field_law`).
-
-The law `extended_kalman` acts on the filter's estimate of the field as if that were the field:
-certainty equivalence.
+All designs begin with the best law of the whole field on the model, a = K x + b with x = V^T z and V
+the POD modes of simulated fields (`whole_field_law`). The law `extended_kalman` acts on its filter's
+estimate as if that were the field: certainty equivalence.
 
 The law `observer` combines it with a Kalman filter for the linear model that fits these simulations on
 average, by statistical linearisation,
@@ -16,14 +13,12 @@ average, by statistical linearisation,
 A, c, C, d by least squares, B that of the model at the target. w is the residual of the regression plus
 a share of the initial second moment per step, because a steady filter does not know when an episode
 begins; v is the noise plus the part of a reading that the modes do not represent. A linearisation at
-the target would have unstable modes in directions that no field takes.
+the target would have unstable modes in directions that no field takes. As p_0 = U^T y_0, coordinates
+are those in which this is the best linear estimate of x_0 from the first readings.
 
-Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So the
-law is compared with the best law of the newest readings, a = D y + b, found by a descent on the model
-from the regression of the actions on the readings.
-
-The law starts with p_0 = U^T y_0. The compensator's coordinates are those in which this is the best
-linear estimate of x_0 from the first readings.
+Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So it
+is compared with the best law of the newest readings, a = D y + b, found by a descent on the model from
+the regression of the actions on the readings.
 
 References
 ----------

@@ -1,17 +1,15 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint.
 
-Large states are coordinates in an orthonormal basis of the measured ones. The states of a trajectory,
-and those of all trajectories of one plant, have much in common: with orthonormal rows W that span them,
-z = W^T x, and all that a linear law, a model and a quadratic cost need of z is in x. Norms and white
-noise are the same in both. Work and memory then grow with n_z for W alone, and with the few numbers of
-x for everything else.
+Large states are coordinates in an orthonormal basis of the measured ones, as states of one plant have
+much in common: with orthonormal rows W that span them, z = W^T x, and all that a linear law, a model
+and a quadratic cost need of z is in x. Norms and white noise are the same in both. Work and memory then
+grow with n_z for W alone.
 
 References
 ----------
-Sirovich, "Turbulence and the dynamics of coherent structures", Quart. Appl. Math. 45, 1987 (snapshots).
-Brand, "Fast low-rank modifications of the thin singular value decomposition", Linear Algebra Appl. 415,
-2006 (a basis that grows).
+Sirovich, Quart. Appl. Math. 45, 1987 (snapshots). Brand, Linear Algebra Appl. 415, 2006 (a basis that
+grows).
 """
 
 from collections.abc import Sequence

@@ -1,33 +1,23 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The choice of the law to return: the first one, unless another is better by more than chance.
 
-Costs of different initial fields are compared through the model. The mean cost of a law over the
-distribution is
+Costs of different initial fields are compared through the model, a control variate. The mean cost of a
+law over the distribution is
 
     m + mean over its own rollouts of (measured - model),
 
 with m the mean of its model costs over the same measured fields for all laws, or held-out ones for the
-final law, which was made from these: the model is a control variate.
+final law, which was made from these. The costs of two laws in rollouts that an accepted model replays
+count where their difference has a smaller error (`Replays`), and rollouts alone, by pairs from the same
+fields, where no model predicts them (`evidence_of_rollouts`).
 
-Of an accepted model that replays rollouts, the costs of two laws in the same rollouts count where their
-difference has a smaller error than that of measured costs (`Replays`). Where no model predicts
-rollouts, they alone count (`evidence_of_rollouts`): as a mean over pairs from the same fields, in which
-cancels what a field costs with either law.
-
-A first law was designed for the plant, and is given up only for one that is better by more than chance
-(`Estimate`). No control was not: there it is enough that all that is known says the same.
-
-The standard error of a mean of k numbers is an estimate with k - 1 degrees of freedom. The mean is
-below zero at the one-sided level alpha if
+A mean of k numbers is below zero at the one-sided level alpha if
 
     mean + t(1 - alpha, k - 1) error < 0,        t: quantile of Student's distribution.
 
 Where errors of several origins add up, the degrees of their sum are those of Welch and Satterthwaite,
 
-    nu = (sum e_i^2)^2 / sum (e_i^4 / nu_i),
-
-so that the error of a control variate, known from many fields, counts as such, and that of three
-rollouts as one of three.
+    nu = (sum e_i^2)^2 / sum (e_i^4 / nu_i).
 
 References
 ----------

@@ -1,11 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A first law from a model of the whole field, linearised at the target.
+"""A first law from a model of the whole field, linearised near the target.
 
-POD modes of an exploratory episode are the directions in which its fields are large, but a law needs
-those that it senses, also for other fields. A model of the whole field (`pdeloop.method.models`) that
-predicts the episodes is linearised at the target, with e = z - z_r (if that is far outside of the data
-and the model not exact, at the measured state nearest to it) and at the action 0, or the mean one of an
-input whose actions were all above, or all below it,
+With e = z - z_r (`linearisation_point`) and the action a of `operating_inputs`,
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, a) - B a - z_r,
 
@@ -13,12 +9,7 @@ and the law a = K e + b that minimises the cost over the horizon senses only the
 are the first columns of U; the others are POD modes of the remainder of simulated states, with that law
 and without control. If U has too few columns for both, all are POD modes.
 
-No model is the only judge of its own law. The model of the whole field and the reduced one are accepted
-by their errors on parts of the data that they were not fitted to, relative to the variation of the data
-and to the error of the other one. Every accepted model predicts the cost of both laws, and the law with
-the lower of their worst predictions is used. Where neither is accepted, the model of the whole field is
-if it is the more accurate one, but what a law saves against no control may then be its error up to
-sqrt(E) of that cost. All errors are of numbers in units of their own variation.
+The model and the regression judge both laws, as docs/identification.md says.
 
 References
 ----------

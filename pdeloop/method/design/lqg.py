@@ -8,24 +8,22 @@ With P the stabilising solution of the filter's Riccati equation
     P = W + A P A^T - A P C^T (C P C^T + V)^{-1} C P A^T,
 
 the estimate x_k = p_k + M (y_k - C p_k), M = P C^T (C P C^T + V)^{-1}, of the prediction p_{k+1} =
-A x_k + B a_k has the least covariance. With the tracking gains of `pdeloop.method.design.lqt` it is the
-optimal law, LQG, by the separation of estimation and control.
+A x_k + B a_k has the least covariance. With tracking gains it is the optimal law, LQG.
 
 Where inputs act late, with delays n_j, s_{k+1} = A s_k + sum_j B_j a_{j,k-n_j} + d is a model without
 delays of the state with all inputs that have not acted yet,
 
-    x_k = [s_k; a_{j,k-1} .. a_{j,k-n_j} of every j],        x_{k+1} = A_x x_k + B_x a_k + d_x,
+    x_k = [s_k; a_{j,k-1} .. a_{j,k-n_j} of every j],        x_{k+1} = A_x x_k + B_x a_k + d_x.
 
-whose gains are optimal for the plant with its dead times. Of x the measurement determines s alone; the
-law `observer` remembers the rest, as it is what it answered.
+Of x the measurement determines s alone; the law `observer` remembers the rest, as it is what it
+answered.
 
 References
 ----------
-Anderson, Moore, "Optimal Filtering", 1979, sections 4.4 (steady state) and 8.2 (separation: "Optimal
-Control: Linear Quadratic Methods", 1990, chapter 8).
-Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic
-Control 15(2), 1970 (noise from the correlation of residuals).
-Åström, Wittenmark, "Computer-Controlled Systems", 3rd ed., section 2.3 (sampling systems with delays).
+Anderson, Moore, "Optimal Filtering", 1979, section 4.4 (steady state); "Optimal Control: Linear
+Quadratic Methods", 1990, chapter 8 (separation). Mehra, IEEE Trans. Automatic Control 15(2), 1970
+(noise from the correlation of residuals). Åström, Wittenmark, "Computer-Controlled Systems", 3rd ed.,
+section 2.3 (sampling systems with delays).
 """
 
 from __future__ import annotations

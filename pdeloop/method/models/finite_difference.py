@@ -14,16 +14,10 @@ in the measured state; the change z_{k+1} - z_k is then linear in the coefficien
 of its feature on the way. Coefficients are the sum of one that all points share and a part of each
 point's own, which a ridge holds at zero where the data say nothing of it.
 
-Of states that are values of cells, not fields, the features are all monomials of a few neighbours
-to begin with (`fit_neighbours`). Three things differ, as such plants are often chaotic, so that a small
-error of a step is a large one of a rollout:
-
-- After two passes, others regress what the model's own steps miss. The error of the means along its
-  paths has no effect on where they end: of a plant without noise the coefficients are exact.
-- Monomials that explain nothing are then left out, one by one, as long as the residual stays what it
-  is: they take time, and may mislead a law that goes beyond the data.
-- The fit ends after the first passes, which take a hundredth of the work, where these products do not
-  explain nearly all of a step.
+Of cells, not fields, the features are all monomials of a few neighbours to begin with
+(`fit_neighbours`). As such plants are often chaotic, a small error of a step is a large one of a
+rollout: after two passes, others regress what the model's own steps miss, on which the error of the
+means has no effect, and monomials that explain nothing are left out, one by one.
 
 References
 ----------

@@ -10,32 +10,25 @@ the least P_d over bands of short waves and orders is the largest sigma^2 that t
 short waves of a front that moves over several points between two states are white in time as well, but
 not in space, as they gather around it. A model decides then whether there is noise (`selection`).
 
-In the fit of an equation with constant coefficients to noisy rollouts (`fit_noisy`) the regression of
-`fit_spectral` fails: within one sampling time the plant changes the field hardly more than the noise
-does, and at wavenumbers without signal the noise of a state, absent from the next one, looks like fast
-decay. Therefore
+In the fit of an equation to noisy rollouts (`fit_noisy`) the regression of `fit_spectral` fails: at
+wavenumbers without signal the noise of a state, absent from the next one, looks like fast decay. So
 
 1. the terms of the equation are integrated along filtered states: at every wavenumber k a share g of
    the innovation, measured minus predicted, corrects the prediction,
 
-       F[zhat_{k+1}] = F[f(zhat_k, a_k)] + g F[z_{k+1} - f(zhat_k, a_k)].
+       F[zhat_{k+1}] = F[f(zhat_k, a_k)] + g F[z_{k+1} - f(zhat_k, a_k)],        g = P/(P + R),
 
-   With white noise of the power R the innovations have the power P + R, P being that of the error of
-   the prediction, and g = P/(P + R) minimises the error (the steady-state Kalman filter of independent
-   wavenumbers). So g is 1 while the model is poor and falls as it improves;
-2. the equation is compared with the measured states over windows of m sampling times with unknown
-   initial state x,
+   R being the power of the noise, and P that of the error of the prediction, as the innovations have
+   P + R (the steady-state Kalman filter of independent wavenumbers): g falls as the model improves;
+2. the equation is compared with the measured states over windows of m sampling times, longer ones as it
+   improves, with unknown initial state x,
 
        F[z_j] = e^{j L} x + sum_p sigma_p W_p(j) + sum_{i < j} e^{(j - 1 - i) L} phi_1(L) F[B a_i + c],
 
    j = 0 .. m, where W_p(j) is the integral of e^{L (j - s)} F[z(s)^p] from the beginning of the window;
-   x, and then B and c, are projected out at every wavenumber;
-3. only wavenumbers with clearly more power than the noise are compared;
-4. insignificant coefficients are removed one by one: their influence would be largest at wavenumbers
+   x, and then B and c, are projected out at every wavenumber with clearly more power than the noise;
+3. insignificant coefficients are removed one by one: their influence would be largest at wavenumbers
    that are not measured, where the equation could grow without bound.
-
-Windows become longer as the equation improves; the equation with the smallest innovations is
-selected.
 
 References
 ----------

@@ -1,30 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The selection of a model of the whole field.
+"""The selection of a model of the whole field, as docs/optimizers.md says.
 
-Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
-from their initial states, by cross-validation. A single rollout is split into pieces, or, if all points
-share their coefficients, used for both. The first kind with E of at most `reproduced`, or with noise of
-ten times its share of the states up to REPRODUCED_NOISY, is selected; if there is none, the one with
-the fewest unknowns that is not BETTER times worse than the best. A linear model is selected at a
-hundredth of that E, or if no other is, squares alone likewise. It is then fitted to all rollouts.
-`kinds_of` lists the kinds in the order in which they are tried, with the number of their unknowns.
+Kinds are judged by the error E of their prediction of rollouts that they were not fitted to, from the
+initial states. A single rollout is split into pieces, or, if all points share their coefficients, used
+for both. The first kind with a small E is selected; if there is none, the one with the fewest unknowns
+that is not BETTER times worse than the best, and it is fitted again to all rollouts.
 
-The model is that which predicts whole rollouts, where one is accepted, or else
-
-- one fitted for measurement noise that nobody declared (`Selection.undeclared_noise`), which is looked
-  for first, as any model that takes noise for the state seems to predict pieces;
-- of a chaotic plant, one that predicts pieces of rollouts, where small errors have not grown yet;
-- of an unstable plant, one that predicts the beginnings of rollouts, near to the target;
-- where the plant leaves the target at once, a linear model of short pieces near to it: the beginning
-  of a law that keeps it there, of which more is measured.
-
-A model that does not predict the change within single steps is not accepted either: any predicts what
-rests, as at a stop.
-
-Noise that nobody declared is accepted only where a model says so. It cannot be predicted: unless a
-model without noise predicts the rollouts better than noise of the level that their differences allow
-(`noise_level`) would let it, an equation is fitted for that noise. The noise is there if this equation
-predicts rollouts that it was not fitted to better than any model without noise.
+Noise that nobody declared is looked for before pieces or beginnings, as any model that takes noise for
+the state seems to predict pieces. It cannot be predicted: unless a model without noise predicts the
+rollouts better than noise of the level that their differences allow (`noise_level`) would let it, an
+equation is fitted for that noise. The noise is there if this equation predicts rollouts that it was not
+fitted to better than any model without noise.
 """
 
 from __future__ import annotations

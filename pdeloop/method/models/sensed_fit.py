@@ -19,14 +19,11 @@ rollout alone, it is eliminated,
 
 Whole rollouts are fitted again with the S that the last fit implies (empirical Bayes), without terms
 whose loss of J is small. Derivatives are finite differences: all equations that share their terms are
-one batch of the compiled solver, as what an action does is linear in the supports and their strengths,
-so that each row has inputs of its own. Equations with more terms are fitted from nothing where the
-first ones leave an error that is not noise.
+one batch of the compiled solver, as what an action does is linear in the supports and their strengths.
 
 References
 ----------
-Le Dimet, Talagrand, "Variational algorithms for analysis and assimilation of meteorological
-observations", Tellus A 38, 1986 (initial fields from readings: 4D-Var). Bock, "Recent advances in
+Le Dimet, Talagrand, Tellus A 38, 1986 (initial fields from readings: 4D-Var). Bock, "Recent advances in
 parameter identification techniques for ODE", 1983 (elimination of initial states). MacKay, "Bayesian
 interpolation", Neural Computation 4(3), 1992 (the deviations).
 """

@@ -6,8 +6,7 @@
 and, where coefficients depend on x, sum_l n_l F[h_l(x, z)] in addition, h_l = sum_p c_lp(x) z^p.
 F is the discrete Fourier transform, L, m_q and n_l numbers of every wavenumber, and time in sampling
 times. A sampling time is integrated by ETDRK4 in equal internal steps, the fewer the smaller the field,
-and the nonlinear part on a finer grid that has room for its products, by the solver of the plants
-(`pdeloop.solver.polynomial_step`).
+and the nonlinear part on a finer grid with room for its products (`pdeloop.solver.polynomial_step`).
 
 The fit of an equation with constant coefficients (`fit_spectral`) to steps of a plant: over a sampling
 time, the unit of time,
@@ -17,13 +16,11 @@ time, the unit of time,
 
 is linear in the symbols sigma_p and, through sigma_1 W_1, in a change of L. The path between two
 samples is integrated with the current equation (at first there is none), and corrected linearly in
-time so that it ends in the measured z_{k+1}. So a pass is a linear regression, and a few passes
-suffice without an initial guess. B and c are free at every wavenumber and are projected out first.
-Symbols are, by their number of unknowns: polynomials of ik with real coefficients (`poly`, and `front`
-with fewer terms), compared on low wavenumbers only, where a steep front has no influence; with a fifth
-derivative in L (`fifth`), or the Hilbert transforms of the others (`nonlocal`); free at every
-wavenumber (`free`). The equation with the smallest residual of all passes is selected, if the first
-ones explain half of the change.
+time so that it ends in the measured z_{k+1}. So a pass is a linear regression, of which B and c, free
+at every wavenumber, are projected out first. Symbols are, by their number of unknowns: polynomials of
+ik with real coefficients (`poly`, and `front` with fewer terms), compared on low wavenumbers only,
+where a steep front has no influence; with a fifth derivative in L (`fifth`), or the Hilbert transforms
+of the others (`nonlocal`); free at every wavenumber (`free`).
 
 References
 ----------

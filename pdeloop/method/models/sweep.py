@@ -12,16 +12,12 @@ eta_k and mu_k those by z_k and p_k,
     [eta; mu]_k = [(df/dz)^T eta_{k+1}; 0] + dJ/d[z; p]_k + K^T [g_k; mu_{k+1}],
 
 about three simulations' work. With rate limits P also depends on a_{k-1}, through which g_k has a part
-of g_{k+1}. Only a law whose memory is not linear in what it sees, the extended Kalman filter's, is
-simulated elsewhere (`pdeloop.method.adapt.sensed_loop`). All functions take M rows side by side, each
-with the same result as alone, and as with any number of threads.
+of g_{k+1}. All functions take M rows side by side, each with the same result as alone, and as with any
+number of threads.
 
 References
 ----------
 Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode).
-El Ghaoui, Oustry, AitRami, "A cone complementarity linearization algorithm for static output-feedback
-and related problems", IEEE Trans. Automatic Control 42(8), 1997, section IV (a law with memory is a
-static law of a larger plant).
 """
 
 from __future__ import annotations

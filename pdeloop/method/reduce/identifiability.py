@@ -1,24 +1,18 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Whether trajectories determine a linear model, and which inputs they cannot separate.
 
-The regressors of s_{k+1} = A s_k + B a_k are s_k = U^T z_k and a_k. The data determine the column of
-an input in B if it varied independently: not constant, not a combination of other inputs, and not a
-function of the state. So each input is regressed on
+The data determine the column of an input in B if it varied independently. So each input is regressed on
 
-    1, the other inputs, s_k, and the leading POD modes of z_k,
+    1, the other inputs, s_k = U^T z_k, and the leading POD modes of z_k,
 
 with every channel scaled to the norm 1. Its residual, relative to its own variation and per degree of
 freedom, is its *independence*: about 1 for white noise, 0 for feedback without excitation. The 1
 allows for drift of the plant, and the modes for feedback of the part of the state outside s.
 
-All of this is relative: the result does not depend on the units of time, state or inputs.
-
 References
 ----------
 Ljung, "System Identification: Theory for the User", 2nd ed., chapter 13 (informative experiments,
-closed loops).
-Belsley, Kuh, Welsch, "Regression Diagnostics", chapter 3 (collinearity, singular values of scaled
-regressors).
+closed loops). Belsley, Kuh, Welsch, "Regression Diagnostics", chapter 3 (collinearity).
 """
 
 from __future__ import annotations

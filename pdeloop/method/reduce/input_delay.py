@@ -2,8 +2,7 @@
 """Whether logged inputs act when the log says so: held-out errors with shifted inputs.
 
 With a delay of n steps the input of row k - n acts from z_k to z_{k+1}: n > 0 is a dead time, or a log
-whose inputs are early, and n < 0 a log whose inputs are late, as of a program that writes a row after
-its step. For each n
+whose inputs are early, and n < 0 a log whose inputs are late. For each n
 
     z_{k+1} - z_k = c + C_0 z_k + C_1 z_{k-1} + B a_{k-n}
 
@@ -15,9 +14,8 @@ delay of each input on its own follows by a search along single inputs.
 Where inputs are fed back, a_{k+1} knows z_{k+1}. So n < 0 counts only for an input a_k whose prediction
 from its own past z_{k+n} does not improve (Granger), while the change to z_{k+n+1} does: the effect of
 an input that is logged late is in the states before its row, but not in those before it acted. One that
-follows from z_{k+n+1} alone is fed back. And
-another delay counts only if the inputs with the delay in use add nothing to it. Where both act, and the
-later one is such an input, rows are means over their time.
+follows from z_{k+n+1} alone is fed back. Where both delays act, and the later one is of such an input,
+rows are means over their time.
 
 References
 ----------

@@ -1,40 +1,33 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A reduced linear model of the plant by least squares in reduced coordinates.
+"""A reduced linear model of the plant by least squares in reduced coordinates, and its order.
 
 With U the first n_s left singular vectors of Z' = [z_1 .. z_N], Z = [z_0 .. z_{N-1}] and
 Y = [a_0 .. a_{N-1}] (one column per step),
 
     [A B d] = argmin || U^T Z' - A U^T Z - B Y - d 1^T ||_F^2,
 
-with d = 0 unless a constant term predicts all held-out parts of the data better. The zero of a log in
-degrees and per cent is not the plant's rest, so it has one (`has_offset`) whatever the data say:
-without it a pole that they hardly tell from 1 is at 1.
-
-Data that do not determine it are refused (`pdeloop.method.reduce.identifiability`). Inputs are kept
-whole, so that there is no second rank to choose and nothing depends on their unit.
+with d = 0 unless a constant term predicts all held-out parts of the data better; a log has one
+(`has_offset`) whatever the data say: without it a pole that they hardly tell from 1 is at 1.
 
 The paper's method is DMD with control (DMDc): with the p-truncated SVD [Z; Y] ~ Psi Xi Lambda^T,
 
     A = U^T Z' Lambda Xi^{-1} Psi_Z^T U,        B = U^T Z' Lambda Xi^{-1} Psi_Y^T,
 
 where Psi_Z are the first n_z rows of Psi and Psi_Y its last n_a; with p < n_s + n_a it cuts into the
-inputs.
+inputs, which the regression keeps whole.
 
-The order n_s that the data support (`study_orders`) follows from errors of models on pieces of
-trajectories z_0 .. z_N that were held out,
+Errors by which orders are compared (`study_orders`) are, on pieces of trajectories that were held out,
 
     one step    z_{k+1} - U (A U^T z_k + B a_k)
-    rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0.
+    rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0,
 
-An error is the root of the sum of squares over all held-out steps, relative to that of z_{k+1} - z_k
-and of z_{k+1} - z_0: 1 is as good as a model in which nothing changes.
+the root of the sum of squares relative to that of z_{k+1} - z_k and of z_{k+1} - z_0: 1 is as good as a
+model in which nothing changes.
 
 References
 ----------
 Proctor, Brunton, Kutz, "Dynamic Mode Decomposition with Control", SIAM J. Appl. Dyn. Syst. 15(1),
-2016 (DMDc).
-Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
-arXiv:2403.01005.
+2016 (DMDc). Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005.
 Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projection-based model
 reduction", CMAME 306, 2016 (least squares on projected states).
 Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-validation).

@@ -5,7 +5,7 @@
 
 U holds the first r POD modes of the measurements z_k, at most as many as the order n. The innovations
 e_k are the part of a measurement that the past does not predict, so the model is its own steady-state
-filter. The state is defined by the prediction of the future from the past:
+filter.
 
 1. A vector ARX of p steps, by ridge regression whose weight generalised cross-validation chooses,
 
@@ -26,8 +26,6 @@ References
 Chiuso, "The role of vector autoregressive modeling in predictor-based subspace identification",
 Automatica 43(6), 2007 (1 to 3). Golub, Heath, Wahba, Technometrics 21(2), 1979 (generalised
 cross-validation).
-Van der Veen, van Wingerden, Bergamasco, Lovera, Verhaegen, "Closed-loop subspace identification
-methods: an overview", IET Control Theory & Applications 7(10), 2013.
 """
 
 from __future__ import annotations
