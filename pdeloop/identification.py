@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from controller_node.identification import DesignSettings, designed, examined, identify
+from pdeloop import field_report
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 from pdeloop.linearity import disproportionate, products, rate_limited, structural_break
@@ -136,7 +137,9 @@ class Identified:
     def poles(self) -> NDArray[np.complex128]:
         """The poles of that model, at the target where it is not linear."""
         used = self.of_field
-        A = used.determined(used.linear.A) if used and used.linear else self.model.A
+        A = self.model.A
+        if used and used.linear:
+            A = field_report.determined(used, used.linear.A)
         return np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
 
     @cached_property
@@ -237,7 +240,7 @@ class Identified:
             "singular_values": [] if study is None else study.singular_values.tolist(),
             "orders": self.orders,
             "closed_loop": loop and loop.summary(),
-            "field_model": self.field and self.field.summary(),
+            "field_model": self.field and field_report.summary(self.field),
         }
 
     def text(self) -> str:
@@ -289,7 +292,7 @@ class Identified:
         else:
             lines += ["", *["  of the regression:"] * bool(self.of_field), self.study.text()]
         if self.field is not None:
-            lines += ["", *self.field.text()]
+            lines += ["", *field_report.text(self.field)]
         return "\n".join([*lines, "", *self._law_lines()])
 
     @property
@@ -661,7 +664,7 @@ def _identified(
     acting = early
     if field and field.better and field.fitted and field.linear and field.refit:
         rollouts = [(np.asarray(own.states), own.actions) for own in field.fitted.rollouts]
-        again, part = field.refit, field.determined
+        again, part = field.refit, partial(field_report.determined, field)
         pole = largest_pole(part(field.linear.A), rollouts, lambda parts: part(again(parts)))
         checked, aligned, acting = field.fitted.model, trajectories, delays  # it has no memory
     else:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdeloop.field_report import determined
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.reduce.channels import SHOWN, Channels
@@ -124,7 +125,7 @@ def closed_loop(
     closed = A + B @ K
     if field is not None and field.linear is not None and field.fitted is not None:
         K, model = K @ law.U.T, field.fitted.model
-        closed = field.determined(field.linear.A + field.linear.B @ K)
+        closed = determined(field, field.linear.A + field.linear.B @ K)
     radius = float(np.abs(np.linalg.eigvals(closed)).max())
     needed = np.log(DECAYED) / np.log(min(max(radius, 0.01), 1.0 - 1e-9))
     steps = int(np.clip(np.ceil(needed), len(actions), LONGEST * len(actions)))

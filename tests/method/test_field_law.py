@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from controller_node.identification import Designed, DesignSettings, design_each, designed
+from pdeloop.field_report import summary, text
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows, unpack
@@ -132,7 +133,7 @@ def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     assert found is not None and found.fitted is not None and found.rows is None
     assert (
         found.fitted.error > IdentificationSettings().field_error
-        and "not accurate enough" in found.text()[-1]
+        and "not accurate enough" in text(found)[-1]
     )
     rows, plain = (designed(noisy, target, how).rows for how in (field, settings("regression")))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
@@ -158,8 +159,8 @@ def test_a_saving_within_the_error_of_a_model_is_none(
     begun, plain = (designed(noisy, target, field, or_no_control=own) for own in (True, False))
     assert begun.field is not None and begun.field.judges == (model.kind,)
     doubtful = (strength, error) != (1.0, 0.2)
-    assert begun.field.doubtful is begun.field.summary()["doubtful"] is doubtful
-    assert ("begins from no control" in begun.field.text()[-1]) is doubtful
+    assert begun.field.doubtful is summary(begun.field)["doubtful"] is doubtful
+    assert ("begins from no control" in text(begun.field)[-1]) is doubtful
     assert begun.rows.policy.any() is not doubtful and plain.rows.policy.any()
 
 
@@ -181,7 +182,7 @@ def test_stands_alone_where_the_regression_has_no_stabilising_gains(
         return
     found = designed([episode(true)], target, settings("field"))
     assert np.array_equal(found.rows.policy, expected.policy)
-    assert found.field is not None and "its law is used" in found.field.text()[-1]
+    assert found.field is not None and "its law is used" in text(found.field)[-1]
     with pytest.raises(DesignError, match="not stabilisable"):
         designed([episode(true)], target, settings("regression"))
 
@@ -234,11 +235,11 @@ def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
             total += Q * np.sum(z**2) + R * np.sum(a**2)
             z = true.step(z, a)
         assert predicted == pytest.approx(total / STEPS, rel=1e-2)
-    told, known = "\n".join(found.text()), found.summary()
+    told, known = "\n".join(text(found)), summary(found)
     assert all(kind in told for kind, _ in found.fitted.candidates)
     assert ("its law is used" in told) is found.better is (known["law"] == "field")
     nothing = FieldLaw(None)
-    assert "regression" in nothing.text()[0] and nothing.summary()["predicted_cost"] is None
+    assert "regression" in text(nothing)[0] and summary(nothing)["predicted_cost"] is None
 
 
 ROD = np.array([[0.9, 0.05, 0, 0], [0.05, 0.85, 0.05, 0], [0, 0.05, 0.85, 0.05], [0, 0, 0.05, 0.9]])

@@ -11,6 +11,7 @@ import pytest
 import pdeloop
 from controller_node.identification import Designed, DesignSettings, designed
 from pde_sim_node.build import build_plant
+from pdeloop.field_report import summary, text
 from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.model_rows import pack
 from pdeloop.method.models import Measured
@@ -128,8 +129,8 @@ def test_noise_that_is_found_is_told_and_makes_no_first_law() -> None:
 
     found = law(identification="field")
     assert found.field is not None and not found.field.better
-    assert found.field.noise == found.field.summary()["noise"] == pytest.approx(sigma, rel=0.1)
-    told = "\n".join(found.field.text())
+    assert found.field.noise == summary(found.field)["noise"] == pytest.approx(sigma, rel=0.1)
+    told = "\n".join(text(found.field))
     assert f"noise of about {found.field.noise:.2g} was found" in told and "declare it" in told
     assert same_bits(pack(found.rows), pack(law(identification="regression").rows))
     right = law(identification="field", measurement_noise=found.field.noise)

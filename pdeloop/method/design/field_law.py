@@ -21,8 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import partial
 
 import numpy as np
 from scipy import linalg
@@ -37,7 +36,6 @@ from pdeloop.method.models.base import DEFAULTS as MODEL_DEFAULTS
 from pdeloop.method.models.base import Law, pieces, predicted, samples_of, saturated
 from pdeloop.method.models.linear import LinearModel, ProjectedModel
 from pdeloop.method.models.noise import smoothed
-from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.selection import (
     BETTER,
     UNKNOWN,
@@ -74,9 +72,6 @@ EQUAL = 1e-4
 """Relative difference up to which costs are the same: the law of the regression is used then."""
 EXACT = 1e-6
 """E of a model that counts as exact."""
-EXCITED = 3e-3
-"""Variation in a direction, relative to the largest, from which on the data say how it decays: ridges
-are up to the square of that."""
 FAR = 3.0
 """Distance of the target from the mean state, relative to that of the farthest measured state, above
 which it is outside of the data."""
@@ -120,100 +115,6 @@ class FieldLaw:
     def better(self) -> bool:
         """True if its law is cheaper on the model than the other one, by more than nothing."""
         return self.rows is not None and self.cost < (1.0 - EQUAL) * self.other_cost
-
-    def determined(self, A: Array) -> Array:
-        """What the data determine of a matrix of the whole state: S A P."""
-        if self._excited is None:
-            return A
-        S, P = self._excited
-        return S @ A @ P
-
-    @cached_property
-    def _excited(self) -> tuple[Array, Array] | None:
-        """S and P, S P = I: onto the directions in which the data move, and back; None: all.
-
-        In others the ridge of a model decides whose coefficients no points share.
-        """
-        model = self.fitted.model if self.fitted else None
-        if not isinstance(getattr(model, "inner", model), LinearModel | PolynomialModel):
-            return None
-        assert self.fitted is not None
-        states = [np.asarray(own.states) for own in self.fitted.rollouts]
-        scale = scale_of(states)
-        gram = sum(y.T @ y for y in ((own - scale.reference) / scale.units for own in states))
-        with one_thread():
-            squares, vectors = linalg.eigh(gram)
-        W = vectors[:, squares > EXCITED**2 * squares[-1]]
-        return W.T / scale.units, W * scale.units[:, None]
-
-    def summary(self) -> dict[str, Any]:
-        """The report as data."""
-        fitted = self.fitted
-        return {
-            "kind": fitted and fitted.model.kind,
-            "error": fitted and fitted.error,
-            "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
-            "own_error": fitted and _number(fitted.own.simulated),
-            "one_step_error": fitted and _number(fitted.own.one_step),
-            "regression_error": _number(self.regression.simulated),
-            "regression_one_step_error": _number(self.regression.one_step),
-            "believed": self.rows is not None,
-            "judges": list(self.judges),
-            "linearised": self.remark,
-            "noise": self.noise,
-            "predicted_cost": _number(self.cost),
-            "predicted_cost_of_regression": _number(self.other_cost),
-            "doubtful": self.doubtful,
-            "law": "field" if self.better else "regression",
-        }
-
-    def text(self) -> list[str]:
-        """The report as text."""
-        fitted = self.fitted
-        if fitted is None:
-            return ["no model of the whole field can be fitted: the law of the regression is used"]
-        of = f" of {self.part} steps near the target" if self.part else ""
-        lines = [
-            f"model of the whole field: {fitted.model.kind}{of}, error {fitted.error:.2g} in "
-            "predicting the data",
-            f"  relative to what the data do, on parts held out: {fitted.own.simulated:.2g}, "
-            f"regression {self.regression.simulated:.2g}; of single steps {fitted.own.one_step:.2g} "
-            f"and {self.regression.one_step:.2g}",
-            f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
-        ]
-        if self.remark:
-            lines.append(f"  {self.remark}")
-        if self.noise:
-            return [
-                *lines,
-                f"  undeclared measurement noise of about {self.noise:.2g} was found: the law of "
-                "the regression is used; declare it (measurement_noise) and explore again, as "
-                "strongly as it requires",
-            ]
-        if self.rows is None:
-            exact = "regression" in self.judges
-            reason = "the regression is more accurate" if exact else "it is not accurate enough"
-            return [*lines, f"  {reason}: the law of the regression is used"]
-        taken = "its law is used" if self.better else "the law of the regression is used"
-        costs = (
-            f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
-        )
-        by = f" by {' and '.join(self.judges)}, the worse one," if len(self.judges) > 1 else ""
-        lines.append(f"  predicted mean stage cost{by} {costs}: {taken}")
-        if self.doubtful:
-            lines.append(
-                "  what it saves against no control may be the model's error: a training begins from "
-                "no control"
-            )
-        return lines
-
-
-def _number(cost: float) -> float | None:
-    return cost if np.isfinite(cost) else None
-
-
-def _cost(cost: float) -> str:
-    return f"{cost:.4g}" if np.isfinite(cost) else "unbounded"
 
 
 def _spread(rollout: Measured, count: int) -> list[Measured]:
