@@ -22,6 +22,7 @@ from pdeloop.export import Parameters
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws.neural import Layers, Neural
+from tuner_node.results import step_times
 
 __all__ = ["run", "text"]
 
@@ -78,7 +79,7 @@ def timed(problem: str, neurons: int) -> dict[str, Any]:
         function.restype, numbers = ctypes.c_double, ctypes.POINTER(ctypes.c_double)
         pointers = [array.ctypes.data_as(numbers) for array in (z, a)]
         in_c = median(function(STEPS, *pointers) for _ in range(TURNS))
-    _, in_python = law.step_times(theta, z, STEPS)
+    _, in_python = step_times(law, theta, z, STEPS)
     row = {"problem": problem, "n_z": n_z, "n_s": n_s, "n_a": n_a}
     return row | {"us in C": 1e6 * in_c, "us in Python": 1e6 * in_python}
 

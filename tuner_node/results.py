@@ -6,12 +6,14 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping, Sequence
 from importlib import metadata
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 import scipy  # whose special functions, a tenth of a start, load when they are used
 from numpy.typing import NDArray
 
+from pdeloop.messages.arrays import Array
 from pdeloop.messages.topics import COMPLETED
 from pdeloop.method.laws import Affine
 from pdeloop.method.laws.linear import Extended
@@ -27,6 +29,8 @@ WORDS = ("event", "role", "model", "chosen", "reason", "early")
 LQT, ADAPTED = EVALUATED.index("lqt"), EVALUATED.index("adapted")
 DIFFERENCE = ("change", "low", "high", "fields")
 """Entries of a `difference`."""
+TIMED = 12
+"""Steps of a law that are timed."""
 CONFIDENCE = 0.95
 """Of the interval of a difference of costs."""
 NO_MORE = "the optimiser asked for no more"
@@ -134,6 +138,24 @@ def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:
     }
 
 
+def step_times(law: Extended, theta: Array, z: Array, steps: int = TIMED) -> tuple[float, float]:
+    """Seconds of the first step from a state (n_z,), and of one of the next, in the median.
+
+    The state stays, unless the law knows what follows it.
+    """
+    own = type(law)(law.model, law.horizon)
+    own.cost = law.cost
+    parts, memory, took = own.parts(theta), own.memory_start(), list[float]()
+    for k in range(max(min(steps, law.horizon), 2)):
+        began = perf_counter()
+        a = own.action(parts, z, memory, k)
+        if own.memory_size:
+            memory = own.memory_update(parts, z, memory, a, k)
+        took.append(perf_counter() - began)
+        z = own.followed(parts, z, memory, a)
+    return took[0], float(np.median(took[1:]))
+
+
 def acting(training: Training) -> list[dict[str, Any]]:
     """The law that acts of each seed, and the times (s) of its first step and of others, in the median.
 
@@ -146,7 +168,7 @@ def acting(training: Training) -> list[dict[str, Any]]:
         training.laws(), training.policies(), training.explorations, strict=True
     ):
         assert isinstance(law, Extended) and known is not None
-        first, others = law.step_times(policy, known.states[0])
+        first, others = step_times(law, policy, known.states[0])
         name = law.acting(policy)
         found.append({"law": name, "first_step": first, "step": others})
     return found

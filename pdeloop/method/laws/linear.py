@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, reduce
-from time import perf_counter
 from typing import ClassVar
 
 import numpy as np
@@ -24,8 +23,6 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.design.lqt import tracking_offsets
 from pdeloop.method.laws.base import Law, Parts
 
-TIMED = 12
-"""Steps that are timed."""
 Terms = Mapping[str, str]
 """The input of each part: s, p, s_r or 1; one of 1 is a vector, or has a row for each step."""
 
@@ -247,23 +244,6 @@ class Extended(Law):
     def acting(self, theta: Array) -> str:
         """The name of the law that a theta is one of."""
         return self.that_acts(theta)[0].name
-
-    def step_times(self, theta: Array, z: Array, steps: int = TIMED) -> tuple[float, float]:
-        """Seconds of the first step from a state (n_z,), and of one of the next, in the median.
-
-        The state stays, unless the law knows what follows it.
-        """
-        own = type(self)(self.model, self.horizon)
-        own.cost = self.cost
-        parts, memory, took = own.parts(theta), own.memory_start(), list[float]()
-        for k in range(max(min(steps, self.horizon), 2)):
-            began = perf_counter()
-            a = own.action(parts, z, memory, k)
-            if own.memory_size:
-                memory = own.memory_update(parts, z, memory, a, k)
-            took.append(perf_counter() - began)
-            z = own.followed(parts, z, memory, a)
-        return took[0], float(np.median(took[1:]))
 
     def followed(self, theta: Parts, z: Array, memory: Array, a: Array) -> Array:
         """What is measured after z and a, as far as theta tells; memory: after that step."""
