@@ -13,7 +13,6 @@ from pdeloop.method.adapt import ModelBased
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.sensed_loop import (
-    FILTER_MODES,
     UNPREDICTED,
     estimated_laws,
     least_trusting,
@@ -162,9 +161,10 @@ def test_the_designed_law_costs_little_more_than_that_of_the_whole_field() -> No
     others, equal = fields(20, seed=1), np.full(20, 1.0 / 20.0)
     none = loop.costs(loop.no_control, others) @ equal
     own = [loop.costs(theta, others) @ equal for theta in laws]
-    whole = whole_field_law(loop, every, weights, settings, FILTER_MODES)
-    assert whole is not None
-    best = whole.loop.costs(whole.theta, others) @ equal
+    found = whole_field_law(loop, every, weights, settings)
+    assert found is not None
+    whole, law = found
+    best = whole.costs(law.theta, others) @ equal
     assert best < 0.9 * none
     assert max(own) - best < 0.1 * (none - best)
 

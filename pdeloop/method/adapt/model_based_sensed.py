@@ -24,7 +24,6 @@ from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.improve import (
     FIRST_GAIN,
-    ModelBasedSettings,
     cheapest,
     curvature_of,
     improve,
@@ -34,14 +33,11 @@ from pdeloop.method.adapt.model_based import FIRST_RENEWAL, JUDGING, RENEWING, M
 from pdeloop.method.adapt.renewal import mixtures, weighted
 from pdeloop.method.adapt.replay import FEWEST, best_measured, costs_by_field, step
 from pdeloop.method.adapt.sensed_loop import (
-    SensedLoop,
-    compensators,
     estimated_laws,
     least_trusting,
     sensed_from,
     sensed_loop,
     to_be_fitted,
-    whole_field_law,
 )
 from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
@@ -210,9 +206,13 @@ class ModelBasedSensed(ModelBasedReadings):
         drawn, others = (self._drawn(fields, sets, which) for which in range(2))
         every, weights = weighted(fields, drawn)
         now = loop.theta(progress.policy)
+        # A linear estimate depends less on the equation.
         linear = now if now.ndim > 1 else loop.theta(self._first)
-        laws, steps = _observers(loop, linear, every, weights, settings, final)
-        if isinstance(law, ExtendedKalman):  # a linear estimate depends less on the equation
+        longer = replace(settings, iterations=settings.observer_iterations) if final else settings
+        gain = _OBSERVER_GAIN if final else FIRST_GAIN
+        found = improve(loop, linear, every, weights, curvature_of(loop), longer, gain)
+        laws, steps = ([found.theta], found.steps) if found else ([], 0)
+        if isinstance(law, ExtendedKalman):
             further, more = estimated_laws(loop, every, weights, settings)
             laws, steps = [*laws, *further], steps + more
         if not laws:
@@ -278,25 +278,3 @@ class ModelBasedSensed(ModelBasedReadings):
         self._progress.policy = pair[found.chosen].copy()
         row |= found.row
         return base
-
-
-def _observers(
-    loop: SensedLoop,
-    now: Array,
-    fields: Array,
-    weights: Array,
-    settings: ModelBasedSettings,
-    final: bool,
-) -> tuple[list[Array], int]:
-    """The cheapest law with an observer to begin with, the one after a descent, and its steps."""
-    longer = settings
-    if final:
-        iterations, gain = settings.observer_iterations, _OBSERVER_GAIN
-        longer = replace(settings, iterations=iterations, least_gain=gain)
-    laws = [now]
-    whole = whole_field_law(loop, fields, weights, settings, len(loop.law.model.A))
-    laws += [] if whole is None else compensators(loop, whole, longer if final else None)
-    start = cheapest(loop, laws, fields, weights)
-    gain = longer.least_gain if final else FIRST_GAIN
-    found = improve(loop, start, fields, weights, curvature_of(loop), longer, gain)
-    return ([], 0) if found is None else ([start, found.theta], found.steps)

@@ -1,38 +1,20 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A model of the field between few sensors under laws that estimate it, and the design of such laws.
 
-All designs begin with the best law of the whole field on the model, a = K x + b with x = V^T z and V
-the POD modes of simulated fields (`whole_field_law`). The law `extended_kalman` acts on its filter's
-estimate as if that were the field: certainty equivalence.
-
-The law `observer` combines it with a Kalman filter for the linear model that fits these simulations on
-average, by statistical linearisation,
-
-    x_{k+1} = A x_k + B a_k + c + w_k,    y_k = C x_k + d + v_k,
-
-A, c, C, d by least squares, B that of the model at the target. w is the residual of the regression plus
-a share of the initial second moment per step, because a steady filter does not know when an episode
-begins; v is the noise plus the part of a reading that the modes do not represent. A linearisation at
-the target would have unstable modes in directions that no field takes. As p_0 = U^T y_0, coordinates
-are those in which this is the best linear estimate of x_0 from the first readings.
-
-Where few readings tell little of a nonlinear plant, a law on the filter's estimate may run away. So it
-is compared with the best law of the newest readings, a = D y + b, found by a descent on the model from
-the regression of the actions on the readings.
+Laws on the estimate of an extended Kalman filter begin with the best law of the whole field on the
+model, a = K x + b with x = V^T z and V the POD modes of simulated fields (`whole_field_law`), and act
+on the estimate as if that were the field: certainty equivalence.
 
 References
 ----------
 Bar-Shalom, Tse, "Dual effect, certainty equivalence, and separation in stochastic control", IEEE
 Trans. Automatic Control 19(5), 1974.
-Booton, "Nonlinear control systems with random inputs", IRE Trans. Circuit Theory 1(1), 1954. Gelb
-(ed.), "Applied Optimal Estimation", 1974, section 6.4 (statistical linearisation).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -41,9 +23,12 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop, Simulation
-from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
-from pdeloop.method.design.lqg import kalman_filter
-from pdeloop.method.design.lqt import DesignError
+from pdeloop.method.adapt.improve import (
+    Improvement,
+    ModelBasedSettings,
+    curvature_of,
+    improve,
+)
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.plans import Act, Planner, simulated
@@ -74,14 +59,6 @@ _INDEPENDENT = 0.3
 covariance of those that were estimated."""
 UNPREDICTED = (6.0, 3.0)
 """Multiples of `filter_unpredicted` with which the cheapest law is tried again, one after the other."""
-SHARE = 0.1
-"""Share of the initial second moment that counts as process noise over an episode."""
-RIDGE = 1e-6
-"""Of the regressions, relative to the mean square of a mode."""
-TOLD = 1e-2
-"""Least singular value of the estimate of x_0 from readings, relative to the largest."""
-LEAST = 1e-8
-"""Least variance of a noise, relative to the mean square of a reading or a mode."""
 
 _SMOOTHED: WeakKeyDictionary[SensedModel, WeakKeyDictionary[Record, tuple[Array, float]]] = (
     WeakKeyDictionary()
@@ -127,9 +104,9 @@ class SensedLoop(LinearLoop):
         costs, states, actions = simulated(plan, fields, act)
         return Simulation(states.swapaxes(0, 1), actions.swapaxes(0, 1), costs, features)
 
-    def without_memory(self, U: Array, kind: type[ClosedLoop], noise: float = 0.0) -> ClosedLoop:
-        """The same model under laws a = K U^T z + b."""
-        return kind(U, self.cost, self.action_set, model=self.model, noise=noise)
+    def of_states(self, U: Array) -> ClosedLoop:
+        """The same model under laws a = K U^T z + b of its states."""
+        return ClosedLoop(U, self.cost, self.action_set, model=self.model)
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""
@@ -249,44 +226,23 @@ def from_estimates(of_fields: Act, known: SensedFilter, sigma: float) -> Act:
     return act
 
 
-@dataclass(frozen=True, eq=False)
-class WholeFieldLaw:
-    """The best law of the whole field on a model, theta = [K b]; the modes V are U of the loop.
-
-    simulation, weights: from fields of finite cost; steps: of L-BFGS.
-    """
-
-    loop: ClosedLoop
-    theta: Array
-    simulation: Simulation
-    weights: Array
-    steps: int
-
-
 def whole_field_law(
-    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings, modes: int
-) -> WholeFieldLaw | None:
-    """The best law of so many POD modes; None where none is finite."""
-    n, lqr = loop.model.n_z, loop.regulator
+    loop: SensedLoop, fields: Array, weights: Array, settings: ModelBasedSettings
+) -> tuple[ClosedLoop, Improvement] | None:
+    """The best law of the whole field, theta = [K b], on modes that are U of its loop; None: no finite.
+
+    The modes are those of simulations under the linear-quadratic law of the model.
+    """
+    lqr = loop.regulator
     if lqr is None:
         return None
-    K, b = lqr.K, lqr.b
-    first = loop.without_memory(np.eye(n), ClosedLoop)
-    simulation = first.simulate(np.column_stack([K, b]), fields)
-    seen = np.concatenate([fields, simulation.states[1:].reshape(-1, n)])
-    rows = linalg.svd(seen, full_matrices=False)[2][:modes]
-    whole = loop.without_memory(rows.T, ClosedLoop)
-    found = improve(
-        whole, np.column_stack([K @ rows.T, b]), fields, weights, curvature_of(whole), settings
-    )
-    if found is None:
-        return None
-    simulation = whole.simulate(found.theta, fields)
-    known = np.isfinite(simulation.costs)
-    if not known.any():
-        return None
-    share = weights[known] / weights[known].sum()
-    return WholeFieldLaw(whole, found.theta, simulation.of_fields(known), share, found.steps)
+    every, K, b = loop.of_states(np.eye(loop.model.n_z)), lqr.K, lqr.b
+    simulation = every.simulate(np.column_stack([K, b]), fields)
+    seen = np.concatenate([fields, simulation.states[1:].reshape(-1, loop.model.n_z)])
+    rows = linalg.svd(seen, full_matrices=False)[2][:FILTER_MODES]
+    whole, first = loop.of_states(rows.T), np.column_stack([K @ rows.T, b])
+    found = improve(whole, first, fields, weights, curvature_of(whole), settings)
+    return None if found is None else (whole, found)
 
 
 def estimated_laws(
@@ -296,22 +252,26 @@ def estimated_laws(
 
     That of the whole field, and one that is optimised with noise on what it sees.
     """
-    model = loop.model
-    whole = whole_field_law(loop, fields, weights, settings, FILTER_MODES)
-    if whole is None:
+    model, best = loop.model, whole_field_law(loop, fields, weights, settings)
+    if best is None:
         return [], 0
-    of_fields, noise = prior(fields, weights, _INDEPENDENT), noise_of_filter(model, settings)
-    known = SensedFilter(model, *of_fields, noise)
-    seen = replace(whole.loop, noise=_FILTER_SEEN * root_mean_square(model.spread))
-    found = improve(seen, whole.theta, fields, weights, curvature_of(seen), settings)
-    every = [(whole.theta, whole.steps), *([(found.theta, found.steps)] if found else [])]
+    whole, law = best
+    known = SensedFilter(
+        model, *prior(fields, weights, _INDEPENDENT), noise_of_filter(model, settings)
+    )
+    seen = replace(whole, noise=_FILTER_SEEN * root_mean_square(model.spread))
+    found = improve(seen, law.theta, fields, weights, curvature_of(seen), settings)
+    every = [law, *([found] if found else [])]
     laws = [
         loop.kalman.theta_of(
-            theta[:, :-1] @ seen.U.T, seen.constant_feature * theta[:, -1], known, loop.settings
+            own.theta[:, :-1] @ seen.U.T,
+            seen.constant_feature * own.theta[:, -1],
+            known,
+            loop.settings,
         )
-        for theta, _ in every
+        for own in every
     ]
-    return laws, sum(steps for _, steps in every)
+    return laws, sum(own.steps for own in every)
 
 
 def noise_of_filter(model: SensedModel, settings: ModelBasedSettings, times: float = 1.0) -> float:
@@ -359,114 +319,3 @@ def prior(fields: Array, weights: Array, independent: float) -> tuple[Array, Arr
 def root_mean_square(spread: Array) -> float:
     """That of fields with independent Fourier coefficients of these standard deviations."""
     return float(np.sqrt(spread[0] ** 2 + 2.0 * np.sum(spread[1:] ** 2)))
-
-
-def compensators(
-    loop: SensedLoop, law: WholeFieldLaw, settings: ModelBasedSettings | None = None
-) -> Iterator[Array]:
-    """Theta (`LinearLoop`) of the law on the estimates of a Kalman filter, or of the newest readings.
-
-    settings: of the descent to the latter, which without them is the regression's.
-    """
-    model = loop.model
-    z, a = law.simulation.states, law.simulation.actions
-    x, y = z @ law.loop.U, z[..., model.seen]
-    n_s, steps = x.shape[2], len(a)
-    weights = np.tile(law.weights / steps, steps)
-    before = np.column_stack([x[:-1].reshape(-1, n_s), np.ones(weights.size)])
-    B = law.loop.U.T @ model.linearise(loop.target, np.zeros(model.n_a))[1]
-    moved = (x[1:] - x[:-1]).reshape(-1, n_s) - a.reshape(-1, a.shape[2]) @ B.T
-    A, c, W = _regression(before, moved, weights)
-    A = A + np.eye(n_s)
-    C, d, V = _regression(before, y[:-1].reshape(-1, model.sensors), weights)
-    first = x[0].T @ (law.weights[:, None] * x[0])
-    noise = np.full(model.sensors, max(model.noise**2, LEAST * float(np.mean(y * y))))
-    V = V + np.diag(noise)
-    W = W + LEAST * np.trace(first) / n_s * np.eye(n_s)
-    seen = y[0].T @ (law.weights[:, None] * y[0]) + np.diag(noise)
-    guess = linalg.solve(seen, y[0].T @ (law.weights[:, None] * x[0]), assume_a="pos").T
-    read = np.column_stack([y[:-1].reshape(-1, model.sensors), np.ones(weights.size)])
-    D, own, _ = _regression(read, a.reshape(weights.size, -1), weights, np.append(noise, 0.0))
-    if settings is not None:
-        D, own = _of_readings(loop, D, own, z[0], law.weights, settings)
-    K, b = law.theta[:, :-1], law.loop.constant_feature * law.theta[:, -1]
-    try:
-        M = kalman_filter(A, C, W + SHARE / steps * first, V).M
-    except DesignError:
-        return
-    I_MC = np.eye(n_s) - M @ C
-    after = A @ I_MC, A @ M, c - A @ M @ d
-    for rows in ((K @ I_MC, K @ M, b - K @ M @ d), (np.zeros_like(K), D, own)):
-        yield law_theta(loop, B, guess, rows, after)
-
-
-class _WithOffset(ClosedLoop):
-    """A loop whose law has an offset of its own, whatever the target is."""
-
-    constant_feature: ClassVar[float] = 1.0
-
-
-def _of_readings(
-    loop: SensedLoop,
-    D: Array,
-    own: Array,
-    fields: Array,
-    weights: Array,
-    settings: ModelBasedSettings,
-) -> tuple[Array, Array]:
-    """The law a = D y + b of the newest readings of least cost on the model, from one to begin with."""
-    model = loop.model
-    static = loop.without_memory(model.at_sensors(np.eye(model.sensors)), _WithOffset, loop.noise)
-    theta = np.column_stack([D, own])
-    found = improve(static, theta, fields, weights, curvature_of(static), settings)
-    if found is not None:
-        theta = found.theta
-    return theta[:, :-1], theta[:, -1]
-
-
-def _regression(
-    features: Array, wanted: Array, weights: Array, noise: Array | float = 0.0
-) -> tuple[Array, Array, Array]:
-    """Matrix and constant of the weighted regression on [x; 1], and the covariance of its residual.
-
-    noise: variances of what will be added to the features.
-    """
-    weighted = features * weights[:, None]
-    moment = features.T @ weighted
-    n = len(moment) - 1
-    moment[np.diag_indices(n)] += RIDGE * np.trace(moment[:n, :n]) / n
-    moment[np.diag_indices(n + 1)] += noise
-    found = linalg.solve(moment, weighted.T @ wanted, assume_a="pos")
-    left = wanted - features @ found
-    return found[:n].T, found[n], left.T @ (weights[:, None] * left)
-
-
-def law_theta(
-    loop: SensedLoop,
-    B: Array,
-    guess: Array,
-    rows: tuple[Array, Array, Array],
-    after: tuple[Array, Array, Array],
-) -> Array:
-    """Theta of a = K x + D y + b, x+ = F x + G y + B a + c, with p in place of x.
-
-    guess (n_s, n_y): x_0 from y_0; rows [K D b]; after [F G c], without B a.
-    """
-    left, values, _ = linalg.svd(loop.law.model.U.T)
-    rank = int(np.sum(values > 1e-9 * values[0]))
-    inside, outside = left[:, :rank], left[:, rank:]
-    readings = linalg.pinv(loop.law.model.U.T)  # of s
-    # Readings that say nothing of x_0 move it a little, so that T has an inverse.
-    turned, told, back = linalg.svd(guess @ readings @ inside, full_matrices=False)
-    own = (turned * np.maximum(told, TOLD * told[0])) @ back
-    other = linalg.svd(own)[0][:, rank:]
-    # p = T x with p_0 = s_0.
-    T = inside @ linalg.pinv(own) + outside @ other.T / told[0]
-    back = linalg.inv(T)
-    (K, D, b), (F, G, c) = rows, after
-    K, D = K @ back, D @ readings
-    F, G = T @ F @ back, T @ G @ readings
-    # The law adds B a with the B of its own model.
-    moved = T @ B - loop.law.model.B
-    F, G, c = F + moved @ K, G + moved @ D, T @ c + moved @ b
-    return np.block([[D, K, b[:, None]], [G, F, c[:, None]]])
