@@ -146,7 +146,7 @@ def optimiser(kind: type[PredictiveKalman], rollouts: int) -> ModelBasedPredicti
     context = replace(context, law=law)
     own = ModelBased.for_context(context)
     assert own is ModelBasedPredictiveSensed
-    settings = ModelBasedSettings(iterations=5, observer_iterations=5, mixtures=2, judging=2)
+    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=2)
     return own(law.theta_start, seed=0, rollouts=rollouts, settings=settings, context=context)
 
 

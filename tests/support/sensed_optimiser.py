@@ -77,7 +77,7 @@ def optimiser(rollouts: int = 3, judging: int = 1, first: Array | None = None) -
     _, context = small()
     kind = ModelBased.for_context(context)
     assert kind is ModelBasedSensed
-    settings = ModelBasedSettings(iterations=5, observer_iterations=5, mixtures=2, judging=judging)
+    settings = ModelBasedSettings(iterations=5, mixtures=2, judging=judging)
     law = context.law
     assert law is not None
     start = law.theta_start if first is None else first

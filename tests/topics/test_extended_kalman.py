@@ -27,9 +27,7 @@ PARAMETERS = {
     "rollouts": 5,
     "evaluation_fields": 2,
 }
-SETTINGS = {
-    "optimizer_settings": {"iterations": 2, "observer_iterations": 2, "mixtures": 1, "judging": 1}
-}
+SETTINGS = {"optimizer_settings": {"iterations": 2, "mixtures": 1, "judging": 1}}
 
 
 def test_it_is_trained_over_topics_to_the_bits_of_one_process_and_recomputed_from_a_bag(

@@ -29,7 +29,7 @@ PARAMETERS = {
     "law": "predictive",
 }
 SETTINGS = {
-    "optimizer_settings": {"iterations": 5, "observer_iterations": 5, "mixtures": 2, "judging": 2},
+    "optimizer_settings": {"iterations": 5, "mixtures": 2, "judging": 2},
     "law_settings": {"first_iterations": 20, "starts": 2},
 }
 BEFORE_PLANS = 3

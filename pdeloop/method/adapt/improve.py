@@ -71,9 +71,6 @@ class ModelBasedSettings(Settings):
     enough_fields: int = setting(
         48, "number of measured fields at which improvements stop", 2, 1_000_000
     )
-    observer_iterations: int = setting(
-        400, "as iterations, for the last one of an observer of few sensors", 1, 10_000
-    )
     filter_unpredicted: float = setting(
         0.04,
         "share of a field's size that a filter adds to a reading's noise, 1 to 6 times",

@@ -145,10 +145,10 @@ class ModelBasedReadings(ModelBased):
 
 _ATTEMPTS = 5
 """Maximum number of times that an equation is looked for in vain."""
-_OBSERVER_GAIN = 3e-4
-"""As `least_gain`, for the last improvement of the law observer."""
-_OBSERVER_DRAWS = 2
-"""Sets of drawn initial fields, each of at most `mixtures`, for a law between few sensors."""
+# A law with memory has many parameters, and simulations cost no rollout.
+_LONGER, _LEAST_GAIN, _DRAWS = 4, 3e-4, 2
+"""Times `iterations`, `least_gain`, and sets of drawn initial fields, each of at most `mixtures`, of
+the last improvement of a linear law."""
 
 DRAWN_STREAM = 0x44524157  # "DRAW"
 OF_A_LAW = ("fraction", "steps", "predicted_change", "deviation")
@@ -201,15 +201,13 @@ class ModelBasedSensed(ModelBasedReadings):
             return
         loop, fields = sensed_loop(self._context, belief.model), self.fields
         progress, settings, law = self._progress, self._settings, self._context.law
-        # A law with memory has many parameters, and simulations cost no rollout.
-        sets = _OBSERVER_DRAWS if final else 1
-        drawn, others = (self._drawn(fields, sets, which) for which in range(2))
+        drawn, others = (self._drawn(fields, _DRAWS if final else 1, n) for n in range(2))
         every, weights = weighted(fields, drawn)
         now = loop.theta(progress.policy)
         # A linear estimate depends less on the equation.
         linear = now if now.ndim > 1 else loop.theta(self._first)
-        longer = replace(settings, iterations=settings.observer_iterations) if final else settings
-        gain = _OBSERVER_GAIN if final else FIRST_GAIN
+        longer = replace(settings, iterations=_LONGER * settings.iterations) if final else settings
+        gain = _LEAST_GAIN if final else FIRST_GAIN
         found = improve(loop, linear, every, weights, curvature_of(loop), longer, gain)
         laws, steps = ([found.theta], found.steps) if found else ([], 0)
         if isinstance(law, ExtendedKalman):
