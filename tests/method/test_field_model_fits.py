@@ -137,31 +137,6 @@ def test_what_a_linear_model_reproduces_is_given_to_no_other_kind():
     assert [kind for kind, _ in fitted.candidates] == ["linear"]
 
 
-def test_a_linear_plant_of_two_fields_is_a_convolution():
-    """z_tt = z_xx by its exact propagator, on two fields with unequal units."""
-    rng, n_x = np.random.default_rng(0), 32
-    k = 2 * np.pi * np.fft.rfftfreq(n_x) * n_x
-    c, s = np.cos(0.02 * k), np.sin(0.02 * k)
-
-    def step(z, a):
-        u, v = np.fft.rfft(z[:n_x]), np.fft.rfft(z[n_x:])
-        turned = c * u + np.where(k > 0, s / np.maximum(k, 1), 0.02) * v, -k * s * u + c * v
-        after = np.concatenate([np.fft.irfft(part, n_x) for part in turned])
-        after[n_x:] += np.repeat(a, n_x // 2)
-        return after
-
-    rollouts = []
-    for _ in range(2):
-        actions = rng.normal(size=(40, 2))
-        x = np.arange(n_x) / n_x
-        states = [np.concatenate([np.cos(2 * np.pi * (x - rng.random())), np.zeros(n_x)])]
-        for a in actions:
-            states.append(step(states[-1], a))
-        rollouts.append(Measured(np.array(states), actions))
-    fitted = fit_field_model(rollouts, np.zeros(2 * n_x))
-    assert fitted.model.kind == "two-convolution" and fitted.error < 1e-8
-
-
 @cache
 def in_own_units():
     """The model that the next test compares with."""
@@ -257,7 +232,7 @@ def test_kinds_for_large_states_have_no_matrix_of_their_size():
     small = {kind.name for kind in kinds_of(512, settings)}
     large = {kind.name for kind in kinds_of(514, settings)}
     near = {*NEAR_RIDGES, "two-near-shared"}
-    assert small - large == {"two-convolution"} | near
+    assert small - large == near
 
 
 def test_an_offset_changes_no_linear_model() -> None:

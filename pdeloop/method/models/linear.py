@@ -110,40 +110,6 @@ def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | No
     return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))
 
 
-def fit_convolution(
-    samples: Samples, *, kind: str, ridge: float, components: int
-) -> LinearModel | None:
-    """Least squares of each wavenumber: A is the same at every place of a ring, in circulant blocks."""
-    count, n_z = samples.before.shape
-    n_x, n_a = n_z // components, samples.actions.shape[1]
-
-    def transformed(states: Array) -> NDArray[np.complex128]:
-        """(wavenumbers, N, components)"""
-        spectrum = np.fft.rfft(states.reshape(count, components, n_x))
-        return np.ascontiguousarray(spectrum.transpose(2, 0, 1))
-
-    columns, change = transformed(samples.before), transformed(samples.after - samples.before)
-    inputs = np.hstack([samples.actions, np.ones((count, 1))]).astype(complex)
-    columns = np.concatenate([columns, np.broadcast_to(inputs, (len(columns), *inputs.shape))], 2)
-    scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=1))
-    # Fields have one unit at all wavenumbers, as else each would be fitted to its rounding.
-    scale[:, :components] = np.sqrt(np.mean(scale[:, :components] ** 2, axis=0))
-    scale = np.where(scale > 0.0, scale, 1.0)[:, None]
-    columns = columns / scale
-    gram = columns.conj().transpose(0, 2, 1) @ columns + ridge * np.eye(columns.shape[2])
-    found = np.linalg.solve(gram, columns.conj().transpose(0, 2, 1) @ change)
-    found = found / scale.transpose(0, 2, 1)  # (wavenumbers, unknowns, components)
-    rows = np.fft.irfft(found, n_x, axis=0).transpose(2, 1, 0)  # (components, unknowns, n_x)
-    if not np.isfinite(rows).all():
-        return None
-    places = (np.arange(n_x)[:, None] - np.arange(n_x)) % n_x
-    A = np.block([[rows[i, j][places] for j in range(components)] for i in range(components)])
-    B = rows[:, components : components + n_a].transpose(0, 2, 1).reshape(n_z, n_a)
-    constant = rows[:, -1].ravel()
-    A = np.eye(n_z) + A
-    return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))
-
-
 _LOW_RANK_RIDGE = 1e-12
 """Ridge of low-rank models."""
 _SNAPSHOTS = 400

@@ -45,7 +45,7 @@ from pdeloop.method.models.finite_difference import (
     fit_neighbours,
     neighbour_features,
 )
-from pdeloop.method.models.linear import fit_coarse, fit_convolution, fit_linear, fit_low_rank
+from pdeloop.method.models.linear import fit_coarse, fit_linear, fit_low_rank
 from pdeloop.method.models.noise import (
     NOISE_MISJUDGED,
     cleaned_states,
@@ -66,8 +66,6 @@ NEAR_NEEDED = 0.05
 """Least E of the other kinds above which models of neighbours are tried."""
 DENSE = 512
 """Largest state for the kinds whose cost grows with its square, and for models of neighbours."""
-_CONVOLUTION_RIDGE = 1e-9
-"""Ridge of convolution models."""
 
 FORMS = (
     Form(name="poly2", degree=2),
@@ -87,8 +85,6 @@ _LINEAR_RIDGE, _LINEAR_MODES = 1e-6, 64
 """Ridge of a linear model of the whole state; POD modes of one of a large state, at most."""
 FIRST_ENOUGH = 0.01
 """`enough` of a linear model, and of squares alone, as more may be small where it was measured."""
-SIMPLEST = 3
-"""Forms of the fewest unknowns, the first ones."""
 ACCURATE, TRIED = 5e-3, "front2"
 """E at which no kind after this form is tried: hardly one is `BETTER` times better."""
 
@@ -142,12 +138,7 @@ def kinds_of(
             several += _finite_difference(components, settings, prefix)
         if not rest and n_x >= _FEWEST_CELLS and n_z <= DENSE:
             near += _neighbours(components, prefix)
-    if n_z % 2 == 0 and 2 * _FEWEST_POINTS <= n_z <= DENSE:
-        # Linear ones are tried early, as that is quick.
-        given = {"ridge": _CONVOLUTION_RIDGE, "components": 2}
-        convolution = _of_samples("two-convolution", fit_convolution, (2.0, 0), **given)
-        spectral.insert(SIMPLEST, convolution)
-    # And equations of a high degree late, as that takes long.
+    # Equations of a high degree late, as that takes long.
     late = [kind for kind in spectral if kind.name == FORMS[-1].name]
     early = [kind for kind in spectral if kind.name != FORMS[-1].name]
     return linear + early + several + late + near + last
