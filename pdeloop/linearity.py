@@ -155,26 +155,29 @@ def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, floa
 
 
 def products(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) -> Misfit | None:
-    """Squares and products of leading modes and inputs, where these explain the steps better.
+    """Powers and products of leading modes and inputs, where these explain the steps better.
 
     Steps from one row to the next, and from one mean of 4, 16, ... rows, beside which noise is small.
     """
     best, parts = None, list(trajectories)
-    while parts:
-        rows = _Rows.of(parts)
+    while parts and (rows := _Rows.of(parts)).enough(0):
         with one_thread():
             s = rows.s @ linalg.svd(rows.s, full_matrices=False)[2][:MODES].T
         u = (rows.u - rows.u.mean(axis=0)) / np.maximum(rows.u.std(axis=0), 1e-300)
-        mixed = [s * u[:, j : j + 1] for j in range(u.shape[1])]
-        pairs = [
-            (x, *ij) for x in (s, u) for ij in combinations_with_replacement(range(x.shape[1]), 2)
-        ]
-        if not rows.enough(len(pairs) + s.shape[1] * u.shape[1]):
-            break
-        alone = np.column_stack([x[:, i] * x[:, j] for x, i, j in pairs])
-        every = rows.missed(alone, *mixed)
-        i, ratio = _ratio(rows.missed(), every)
-        if ratio > (best.ratio if best else BENT):
+        mixed, terms = [s * u[:, j : j + 1] for j in range(u.shape[1])], list[Array]()
+        for factors in ((s, s), (u, u)), ((s, s, s),):
+            terms += [
+                np.prod([x[:, i] for x, i in zip(kind, own, strict=True)], axis=0)
+                for kind in factors
+                for own in combinations_with_replacement(range(kind[0].shape[1]), len(kind))
+            ]
+            if not rows.enough(len(terms) + s.shape[1] * u.shape[1]):
+                break
+            alone = np.column_stack(terms)
+            every = rows.missed(alone, *mixed)
+            i, ratio = _ratio(rows.missed(), every)
+            if ratio <= (best.ratio if best else BENT):
+                continue
             fewer = [
                 _ratio(rows.missed(alone, *mixed[:j], *mixed[j + 1 :])[:, [i]], every[:, [i]])[1]
                 for j in range(len(mixed))
@@ -182,15 +185,15 @@ def products(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) 
             own = [j for j, lost in enumerate(fewer) if lost > BENT]
             if not own and _ratio(rows.missed(alone)[:, [i]], every[:, [i]])[1] > BENT:
                 own = [int(np.argmax(fewer))]
-            kind = "squares and products of states and inputs"
+            kind = "powers and products of states and inputs"
             like = "where an outflow goes with the root of a level or heat is radiated"
             if own:
                 kind = f"products of a state and {listed([channels.input(j) for j in own])}"
                 like = "where a flow carries heat or a valve opens a path"
             text = (
                 f"{channels.state(i)} follows {kind} (a linear model misses {ratio:.3g} times the "
-                f"squares of one with products), as {like}: poles and gains change with the point, and "
-                "a linear law holds near its target alone; identify from rows near it, or by the model "
+                f"squares of one with them), as {like}: poles and gains change with the point, and a "
+                "linear law holds near its target alone; identify from rows near it, or by the model "
                 "of the whole field, which has products (with a --target)"
             )
             best = Misfit(i, tuple(own), ratio, text)

@@ -52,7 +52,7 @@ SLOW = 10.0
 """Time constants of a slow mode that the longest trajectory has, at most."""
 EVIDENCE = 20.0
 """Log-likelihood of the effects on such a mode from which on they count."""
-MOST = 3e7
+MOST = 1e7
 """Numbers from which on the information in the data on all of a model is not computed."""
 FIRST = 8
 """Measurements from which a filter finds the state."""

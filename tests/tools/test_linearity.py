@@ -102,6 +102,20 @@ def test_products_are_told_behind_controllers_as_well(seed: int) -> None:
     assert found is not None and "products" in found.text
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_pendulum_that_swings_widely_is_told(noise: float) -> None:
+    """An odd function of the state, of which no square tells."""
+    u, z = held(800, 10, 0, -2.0, 2.0)[:, :1], np.zeros((801, 2))
+    for k, own in enumerate(u):
+        x = z[k]
+        for _ in range(20):
+            x = x + 0.005 * np.array([x[1], -9.8 * np.sin(x[0]) - 0.5 * x[1] + 2.0 * own[0]])
+        z[k + 1] = x
+    z += noise * np.random.default_rng(0).standard_normal(z.shape)
+    found = products([(z, u)])
+    assert found is not None and found.inputs == ()
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("rate", "noise"), [(0.7, 0.01), (0.7, 0.03), (2.0, 0.01)])
 def test_a_valve_with_a_rate_limit_is_told_with_its_rate(
