@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from controller_node.identification import DesignSettings, designed
+from pdeloop import field_report
 from pdeloop.data_file import Measurements
 from pdeloop.identification import identify_data
 from pdeloop.linearity import structural_break
@@ -73,7 +74,7 @@ def test_a_part_of_a_log_in_which_inputs_stood_still_gives_no_law() -> None:
     settings = DesignSettings(2, 2, 1.0, 1e-3, identification="field")
     found = designed([(z, u)], REST + 2.0, settings, constant=True)
     assert found.field is not None and found.field.part > 50
-    assert f"of {found.field.part} steps near the target" in found.field.text()[0]
+    assert f"of {found.field.part} steps near the target" in field_report.text(found.field)[0]
     np.testing.assert_allclose(found.rows.U @ found.rows.B, B, atol=0.02)
 
 
