@@ -293,8 +293,6 @@ _SIGNIFICANCE = 3.0
 
 PASSES = ((1, 8), (2, 8), (4, 4), (8, 4), (8, 4), (16, 4), (16, 4))
 """Of each pass, the sampling times of a window, and n: the lowest 1/n wavenumbers are compared."""
-STRICTNESS = (1.0, 3.0, 9.0, 27.0)
-"""Times the significance of a pass, the next where its equation grows beyond all bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,13 +300,12 @@ class WindowRegression(Regression):
     """The regression of a pass over windows; y and W of the wavenumbers that are compared alone.
 
     common (modes, N, n_a + 1) and free_of_common are of each wavenumber; lost: numbers of each that the
-    initial states take; strictness: multiple of the significance that a coefficient must have.
+    initial states take.
     """
 
     common: Spectrum
     free_of_common: Spectrum
     lost: int = 0
-    strictness: float = 1.0
 
     def rest(self, values: Spectrum) -> Spectrum:
         q = self.free_of_common[: values.shape[1]]
@@ -318,7 +315,7 @@ class WindowRegression(Regression):
 
     def coefficients(self, columns: Spectrum, values: Spectrum) -> Array:
         count = len(self.y) - self.lost - self.common.shape[2]  # complex numbers a wavenumber
-        return significant(columns, values, max(count / len(self.y), 0.1), self.strictness)
+        return significant(columns, values, max(count / len(self.y), 0.1))
 
     def inputs(self, left: Spectrum) -> Spectrum:
         """F of B and c (n_a + 1, modes), from (N, modes); 0 where B is no larger than its error."""
@@ -335,10 +332,10 @@ class WindowRegression(Regression):
         return found
 
 
-def significant(columns: Spectrum, values: Spectrum, free: float, strictness: float = 1.0) -> Array:
+def significant(columns: Spectrum, values: Spectrum, free: float) -> Array:
     """Real coefficients of complex columns, 0 where they are within a few standard errors of it.
 
-    free: share of the values that nothing else was fitted to; strictness: multiple of the significance.
+    free: share of the values that nothing else was fitted to.
     """
     scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -351,7 +348,7 @@ def significant(columns: Spectrum, values: Spectrum, free: float, strictness: fl
         own = inverse @ moment[kept]
         rest = max(total - float(own @ moment[kept]), 0.0)
         error = np.sqrt(rest / (2.0 * free * len(values)) * np.diag(inverse))
-        size = np.abs(own) - strictness * _SIGNIFICANCE * error
+        size = np.abs(own) - _SIGNIFICANCE * error
         if size.min() >= 0.0:
             break
         kept.pop(int(np.argmin(np.abs(own) / np.where(error > 0.0, error, 1.0))))
@@ -386,18 +383,12 @@ def fit_noisy(
         if data is None:
             break
         compared = replace(form, shares=(max(share, form.shares[-1]),))
-        for strictness in STRICTNESS:
-            strict = replace(data, strictness=strictness)
-            found = solved(strict, model, compared, 0)
-            if found is None:
-                continue
-            found = replace(found, substeps=substeps_of(found.symbols, largest, settings))
-            known = filtered(found, rollouts, first, shares)
-            if not known.lost:
-                break
+        found = solved(data, model, compared, 0)
         if found is None:
             break
-        model, error = found, np.maximum(known.power - noise_power, 0.0)
+        model = replace(found, substeps=substeps_of(found.symbols, largest, settings))
+        known = filtered(model, rollouts, first, shares)
+        error = np.maximum(known.power - noise_power, 0.0)
         miss = float(error[:cut].sum()) if not known.lost else np.inf
         if best is None or miss < least:
             best, least = model, miss
