@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdeloop.method.adapt import Context, Trajectory, model_based, renewal
+from pdeloop.method.adapt import Context, Trajectory, model_based
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.renewal import Renewal, renew_from_states
-from pdeloop.method.adapt.verdict import Estimate
 from pdeloop.method.models import FieldModel, FittedModel, Measured
 from pdeloop.method.models.base import errors
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, of_features
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, Selection
-from tests.method.test_model_based import N_A, N_Z, Plant, finished, make, measured
+from tests.method.test_model_based import N_Z, Plant, finished, make, measured
 from tests.support.small import same_bits
 
 SETTINGS = ModelBasedSettings()
@@ -116,44 +114,3 @@ def test_a_law_is_improved_on_a_model_of_pieces_from_measured_states(
     assert len(improved) == 2 and all(row["pieces"] for row in improved)
     assert not any("chaotic" in row for row in rows)
     assert rows[-1]["chosen"] == "adapted"
-
-
-class Costs:
-    """A loop in which the first law costs 100 from every state, and another one `gain` less."""
-
-    def __init__(self, gain: float) -> None:
-        self.gain = gain
-
-    def costs(self, theta: float, fields: np.ndarray) -> np.ndarray:
-        return np.full(len(fields), 100.0 - self.gain * theta)
-
-
-@pytest.mark.parametrize(
-    ("gains", "own", "counts"),
-    [
-        ([30.0], 60.0, [32]),
-        ([3.0, 30.0], 60.0, [32, 96]),
-        ([3.0], 3.5, [32]),
-        ([0.0, 0.0], 0.0, [32, 96]),
-    ],
-    ids=["clear", "in doubt", "in doubt, but as large as from their own states", "none"],
-)
-def test_more_states_are_taken_where_the_gain_from_few_is_in_doubt(
-    gains: list[float], own: float, counts: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[int] = []
-
-    def renewed(*known: Any, final: bool) -> Renewal:
-        _, first, improved, _, fields, *_ = known
-        assert improved == 0.0  # a law that is best from few states is no start from more
-        seen.append(len(fields))
-        gain = gains[len(seen) - 1]
-        change = Estimate(-gain, 1.0, 31.0)  # one standard error
-        return Renewal(first, improved + 1.0, [], float(gain > 1.0), change, 1)
-
-    monkeypatch.setattr(renewal, "renew", renewed)
-    rollout = Record(np.zeros((N_A, 2)), 1.0, np.zeros((200, N_Z)), np.zeros((199, N_A)))
-    known: Any = (Costs(own), 0.0, 0.0, [rollout], np.random.default_rng(0), SETTINGS)
-    found = renew_from_states(*known)
-    assert seen == counts
-    assert found is not None and found.change.value == -gains[-1]

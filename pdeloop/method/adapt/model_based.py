@@ -40,7 +40,6 @@ from pdeloop.method.adapt.base import (
 )
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.renewal import CHAOTIC_FIELDS
 from pdeloop.method.adapt.sensed_loop import can_be_sensed
 from pdeloop.method.adapt.trajectories import Records
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, ZERO, Estimate
@@ -584,18 +583,18 @@ class ModelBased(Optimizer):
         draw: renewal.Draw = partial(
             renewal.mixtures, rng=rng, components=belief.components, periodic=self._context.periodic
         )
-        data, settings, known = self._data(), self._settings, (loop, base, improved)
-        states = renewal.measured_states(data, CHAOTIC_FIELDS)
+        data, settings, parts = self._data(), self._settings, self._progress.parts
+        states = renewal.measured_states(data, renewal.CHAOTIC_TESTED)
         if belief.whole:
             chaotic = renewal.any_state_serves(loop, base, fields, states)
         else:  # of pieces, as also where it is wrong
             chaotic = renewal.is_chaotic(loop, states)
         if chaotic or not belief.whole:
             row["chaotic" if chaotic else "pieces"] = True
-            found = renewal.renew_from_states(*known, data, draw, settings, final=final)
-        else:
-            parts = self._progress.parts
-            found = renewal.renew(*known, parts, fields, draw, settings, final=final)
+            fields = renewal.measured_states(data, renewal.CHAOTIC_FIELDS)
+            # Others than last time, so that the laws of the parts may know those of their own part.
+            parts, settings = [], replace(settings, mixtures=0, most_mixtures=0)
+        found = renewal.renew(loop, base, improved, parts, fields, draw, settings, final=final)
         if found is None:
             self._replay(belief, row, final, "no improved law stays finite on the model")
             return

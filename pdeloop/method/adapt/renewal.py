@@ -49,20 +49,15 @@ from pdeloop.method.adapt.verdict import ZERO, Estimate, mean_change
 CONFIRMED = 0.5
 """Share of the gain on its own fields that a law must reach on those left out; otherwise it is made
 again on more drawn fields."""
-CHAOTIC_FIELDS = 32
-"""Measured states used as initial fields of a chaotic plant, for which no fields are drawn."""
+CHAOTIC_TESTED, CHAOTIC_FIELDS = 32, 96
+"""Measured states by which a plant is called chaotic, and those that are its initial fields, for which
+no fields are drawn."""
 PARTS = 2
 """Parts of the fields, each held out once to choose how far the law moves."""
 Draw: TypeAlias = Callable[[Array, int], Array]
 """From measured initial fields, at most so many further ones: `mixtures` with a generator."""
 FRACTIONS = 4
 """Equal steps from the first law to the improved one, among which one is chosen."""
-_CHAOTIC_MOST = 96
-"""Measured states of a chaotic plant if the gain from fewer is not clear on the others."""
-_CHAOTIC_CLEAR = 10.0
-"""Multiple of the standard errors of the verdict at which such a gain is clear."""
-_CHAOTIC_CONFIRMED = 0.8
-"""Share of its own gain that a law must reach on other states for few to suffice."""
 _DETUNED = 0.1
 """Share of the gains with which a descent begins again where actuators have rate limits."""
 _MEASURED_SHARE = 0.5
@@ -175,30 +170,6 @@ def own_gain(loop: ClosedLoop, first: Array, found: Renewal, fields: Array) -> f
         return 0.0
     gain = float(np.sum(before[known] - after[known])) / len(fields)
     return gain if gain > FIRST_GAIN * float(before[known].mean()) else 0.0
-
-
-def renew_from_states(
-    loop: ClosedLoop,
-    first: Array,
-    improved: Array,
-    records: Sequence[Record],
-    draw: Draw,
-    settings: ModelBasedSettings,
-    *,
-    final: bool = True,
-) -> Renewal | None:
-    """As `renew`, of a chaotic plant, from measured states: more where few leave a doubt."""
-    settings, found = replace(settings, mixtures=0, most_mixtures=0), None
-    for count in (CHAOTIC_FIELDS, _CHAOTIC_MOST):
-        fields = measured_states(records, count)
-        # Others than last time, so that the laws of the parts may know those of their own part.
-        found = renew(loop, first, improved, [], fields, draw, settings, final=final)
-        if found is None or found.change.is_negative(settings.confidence, _CHAOTIC_CLEAR):
-            break
-        gain = own_gain(loop, first, found, fields)
-        if gain > 0.0 and -found.change.value >= _CHAOTIC_CONFIRMED * gain:
-            break
-    return found
 
 
 def left_out_costs(loop: ClosedLoop, first: Array, parts: Sequence[Array], fields: Array) -> Array:

@@ -77,9 +77,9 @@ class Estimate:
     def __sub__(self, other: Estimate) -> Estimate:
         return self + Estimate(-other.value, other.error, other.degrees)
 
-    def is_negative(self, confidence: float, times: float = 1.0) -> bool:
-        """True if it is below 0 by `times` as much as chance: `confidence` exact standard errors."""
-        return self.value + times * errors_for(confidence, self.degrees) * self.error < 0.0
+    def is_negative(self, confidence: float) -> bool:
+        """True if it is below 0 by more than chance: `confidence` exact standard errors."""
+        return self.value + errors_for(confidence, self.degrees) * self.error < 0.0
 
 
 ZERO = Estimate()
