@@ -23,7 +23,7 @@ from pdeloop import field_report
 from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 from pdeloop.linearity import disproportionate, products, rate_limited, structural_break
-from pdeloop.log_effects import fed_back, require_effects, require_motion
+from pdeloop.log_effects import delay_text, fed_back, require_effects, require_motion
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
@@ -413,7 +413,7 @@ def identify_data(
     if input_delay is None:
         used = delays.best
     if input_delay is not None or delays.alike or delays.at_end:
-        better = delays.text(found.channels, found.sample_time)
+        better = delay_text(delays, found.channels, found.sample_time)
         found = replace(found, remarks=(*found.remarks, *([better] if better else [])))
     seen = shifted(found.trajectories, used)
     found = replace(found, remarks=(*found.remarks, *_nonlinear(seen, found)))

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether the inputs of a log move its states, and whether a controller made them, before any fit."""
+"""Whether and when the inputs of a log move its states, and whether a controller made them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy import linalg
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, SHOWN, Channels, listed, scaled
 from pdeloop.method.reduce.identifiability import LEFT, NotIdentifiableError, examine_steps
+from pdeloop.method.reduce.input_delay import Delays, DelayStudy
 from pdeloop.method.reduce.reduced_model import Samples, Trajectory, numerical_rank, steps_of
 from pdeloop.process.one_thread import one_thread
 
@@ -150,3 +151,57 @@ def no_effect(names: Sequence[str], moves: Sequence[float], means: Sequence[floa
         f"beside their noise the states show no effect of {listed(names)}, which moved by {own}: move "
         f"{it} more, give an --input-delay of more than ten rows, or leave {it} out of --inputs"
     )
+
+
+def delay_text(
+    found: DelayStudy, channels: Channels = NUMBERED, sample_time: float | None = None
+) -> str:
+    """One sentence on what is better than the delays in use; empty if nothing is."""
+    best, used = found.best, found.used
+    if best == used:
+        return ""
+    if found.beside:
+        names = listed([channels.input(j) for j, n in enumerate(best) if n != used[j]])
+        return (
+            f"the data fit {found.gain:.3g} times better with {names} of their own row as well, not "
+            "of the row before alone, as where rows are means over time or are read after the "
+            "inputs have changed: log what is read as they change, or give "
+            f"--input-delay={_value(best)}, with which a model in innovation form has both"
+        )
+    moves = dict.fromkeys(np.subtract(best, used).tolist())
+    parts = []
+    for move in moves:
+        own = [j for j in range(len(best)) if best[j] - used[j] == move]
+        names = listed([channels.input(j) for j in own]) if len(moves) > 1 else "the inputs"
+        if move:
+            way = "earlier" if move < 0 else "later"
+            least = "at least " if any(best[j] in found.at_end for j in own) else ""
+            parts.append(f"{names} {least}{_rows(abs(move))} {way}")
+    why = []
+    if max(best) > 0:
+        times = "" if sample_time is None else f" of {max(best) * sample_time:.3g} s"
+        why.append(f"the plant has a dead time{times}, or the log is ahead of it")
+    if min(best) < 0:
+        why.append("a row has the input that led to its state, logged late")
+    fit = f"the data fit {found.gain:.3g} times better with {' and '.join(parts)}, so "
+    if found.alike or found.at_end:
+        others = " or ".join(map(_value, found.alike[:3]))
+        unclear = (
+            f"the data do not tell {_value(best)} and {others} apart: log more steps or less noise"
+            if found.alike
+            else "more are not tried in a log of this length: log more steps"
+        )
+        return (
+            f"{fit}{' and '.join(why)}; how many rows is not clear, as {unclear}, or give the "
+            f"number that is known, as --input-delay={_value(best)}"
+        )
+    return f"{fit}{' and '.join(why)}: give --input-delay={_value(best)}"
+
+
+def _value(delays: Delays) -> str:
+    """Delays as --input-delay takes them."""
+    return ",".join(map(str, delays[:1] if len({*delays}) == 1 else delays))
+
+
+def _rows(count: int) -> str:
+    return "one row" if count == 1 else f"{count} rows"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from pdeloop.log_effects import delay_text
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.design.lqg import with_dead_time
@@ -91,7 +92,7 @@ def test_a_dead_time_beyond_the_range_is_looked_for_further_on_or_said_to_be_unc
     assert study_delays([logged((12, 12), held=5, steps=400)]).best == (12, 12)
     found = study_delays([logged((12, 12), held=5, steps=85)])
     assert found.best == found.at_end * 2 == (10, 10)
-    text = found.text()
+    text = delay_text(found)
     assert "at least 10 rows later" in text and "how many rows is not clear" in text
 
 
@@ -142,10 +143,10 @@ def test_the_gain_is_the_ratio_of_errors() -> None:
     found = study_delays([(z, a)])
     right = 0.02**2 * (1.0 + np.diag(A @ A.T))
     assert found.gain == pytest.approx(np.sqrt(np.mean(wrong / right)), rel=0.03)
-    text = found.text(sample_time=0.5)
+    text = delay_text(found, sample_time=0.5)
     assert "2 rows later" in text and "dead time of 1 s" in text and "--input-delay=2" in text
-    assert study_delays([(z, a)], (2, 2)).text() == ""
-    assert "one row earlier" in study_delays([(z, a)], (3, 3)).text()
+    assert delay_text(study_delays([(z, a)], (2, 2))) == ""
+    assert "one row earlier" in delay_text(study_delays([(z, a)], (3, 3)))
 
 
 @pytest.mark.parametrize("n", [1, 3])
@@ -223,7 +224,7 @@ def test_a_delay_that_the_data_do_not_tell_from_others_is_not_clear(
     sure = [study.best for study in found if any(study.best) and not study.alike]
     assert set(sure) <= {(3, 3)}
     for study in found:
-        assert ("not clear" in study.text()) == bool(study.alike)
+        assert ("not clear" in delay_text(study)) == bool(study.alike)
         assert study.best not in study.alike
     if held > 1:  # neighbouring delays have nearly the same inputs
         assert any(study.alike for study in found)

@@ -34,7 +34,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from pdeloop.messages.arrays import Array
-from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
 from pdeloop.method.reduce.identifiability import DEPENDENT
 from pdeloop.method.reduce.reduced_model import Trajectory, distinct
 from pdeloop.process.one_thread import one_thread
@@ -79,59 +78,6 @@ class DelayStudy:
     alike: tuple[Delays, ...] = ()
     at_end: Delays = ()
     beside: bool = False
-
-    def text(self, channels: Channels = NUMBERED, sample_time: float | None = None) -> str:
-        """One sentence on what is better than the delays in use; empty if nothing is."""
-        if self.best == self.used:
-            return ""
-        if self.beside:
-            names = listed(
-                [channels.input(j) for j, n in enumerate(self.best) if n != self.used[j]]
-            )
-            return (
-                f"the data fit {self.gain:.3g} times better with {names} of their own row as well, not "
-                "of the row before alone, as where rows are means over time or are read after the "
-                "inputs have changed: log what is read as they change, or give "
-                f"--input-delay={_value(self.best)}, with which a model in innovation form has both"
-            )
-        moves = dict.fromkeys(np.subtract(self.best, self.used).tolist())
-        parts = []
-        for move in moves:
-            own = [j for j in range(len(self.best)) if self.best[j] - self.used[j] == move]
-            names = listed([channels.input(j) for j in own]) if len(moves) > 1 else "the inputs"
-            if move:
-                way = "earlier" if move < 0 else "later"
-                least = "at least " if any(self.best[j] in self.at_end for j in own) else ""
-                parts.append(f"{names} {least}{_rows(abs(move))} {way}")
-        why = []
-        if max(self.best) > 0:
-            times = "" if sample_time is None else f" of {max(self.best) * sample_time:.3g} s"
-            why.append(f"the plant has a dead time{times}, or the log is ahead of it")
-        if min(self.best) < 0:
-            why.append("a row has the input that led to its state, logged late")
-        fit = f"the data fit {self.gain:.3g} times better with {' and '.join(parts)}, so "
-        if self.alike or self.at_end:
-            others = " or ".join(map(_value, self.alike[:3]))
-            unclear = (
-                f"the data do not tell {_value(self.best)} and {others} apart: log more steps or less "
-                "noise"
-                if self.alike
-                else "more are not tried in a log of this length: log more steps"
-            )
-            return (
-                f"{fit}{' and '.join(why)}; how many rows is not clear, as {unclear}, or give the "
-                f"number that is known, as --input-delay={_value(self.best)}"
-            )
-        return f"{fit}{' and '.join(why)}: give --input-delay={_value(self.best)}"
-
-
-def _value(delays: Delays) -> str:
-    """Delays as --input-delay takes them."""
-    return ",".join(map(str, delays[:1] if len({*delays}) == 1 else delays))
-
-
-def _rows(count: int) -> str:
-    return "one row" if count == 1 else f"{count} rows"
 
 
 def shifted(trajectories: Sequence[Trajectory], delays: Delays) -> list[Trajectory]:
