@@ -16,6 +16,7 @@ import pytest
 from pdeloop.cli import FAILED, main
 from pdeloop.commands import new
 from pdeloop.messages import array_files
+from pdeloop.messages.array_files import packed, unpacked
 from pdeloop.messages.files import FileError, make_folder, open_own, read_json, write_atomically
 from pdeloop.messages.spec import ParameterError, read_document
 from tuner_node import checkpoint
@@ -126,3 +127,23 @@ def test_a_part_that_a_crash_left_is_replaced(tmp_path):
     write_atomically(tmp_path / "file", b"new ", b"content")
     assert (tmp_path / "file").read_bytes() == b"new content"
     assert not (tmp_path / "file.part").exists()
+
+
+def test_arrays_come_back_from_numbers_to_the_bit() -> None:
+    arrays = {
+        "complex": np.array([[1.5 - 2j, 3j]]),
+        "text": np.array("a model of u²"),
+        "flag": np.array(True),
+        "count": np.array([3, -4]),
+        "large": np.array([1e300, -np.inf, 0.1, 5e-324]),
+        "none": np.empty((0, 2)),
+    }
+    numbers = packed(arrays)
+    assert ((numbers >= 0.0) & (numbers < 2.0**24)).all() and (numbers % 1.0 == 0.0).all()
+    found = unpacked(np.append(numbers, np.zeros(7)))
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype and found[name].shape == array.shape
+        assert found[name].tobytes() == array.tobytes()
+    with pytest.raises(ValueError, match="no arrays"):
+        unpacked(numbers[:20])

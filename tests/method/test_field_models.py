@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -14,16 +13,14 @@ from scipy.integrate import solve_ivp
 
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import read_only
-from pdeloop.method.models import FieldModel, Measured, affine_law
-from pdeloop.method.models.base import errors, model_of, pieces, predicted
+from pdeloop.method.models import FieldModel
+from pdeloop.method.models.base import model_of
 from pdeloop.method.models.finite_difference import advance, features_of, of_features
 from pdeloop.method.models.linear import LinearModel, add_products
 from pdeloop.method.models.sweep import sweep_of
 from pdeloop.solver import polynomial as compiled
 from pdeloop.solver import polynomial_integrals, polynomial_step, polynomial_sweep
-from pdeloop.training_run import load_compiled, resolve
-from tests.support.field_models import MODELS, linear, points, sensed, spectral
-from tests.support.small import SMALL
+from tests.support.field_models import MODELS, points, spectral
 
 
 @pytest.fixture(params=MODELS, scope="module")
@@ -96,15 +93,6 @@ def test_the_smaller_a_field_the_fewer_its_internal_steps():
         assert np.array_equal(model.step(z, a)[i : i + 1], alone.step(z[i : i + 1], a[i : i + 1]))
 
 
-def test_a_copied_model_that_was_used_is_a_model():
-    model = spectral()
-    z, a, _ = points(model)
-    expected = model.step(z, a)
-    copied = pickle.loads(pickle.dumps(model))
-    del model
-    assert np.array_equal(copied.step(z, a), expected)
-
-
 def test_a_model_comes_back_from_its_arrays_to_the_bit(model, tmp_path):
     np.savez(tmp_path / "model.npz", **model.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as arrays:
@@ -113,45 +101,6 @@ def test_a_model_comes_back_from_its_arrays_to_the_bit(model, tmp_path):
     assert again.kind == model.kind and (again.n_z, again.n_a) == (model.n_z, model.n_a)
     assert np.array_equal(again.step(z, a), model.step(z, a))
     assert np.array_equal(again.pull_back(z, a, y)[0], model.pull_back(z, a, y)[0])
-
-
-def test_a_field_is_cut_where_it_is_raised_to_powers():
-    z, a, _ = points(sensed())
-    assert np.abs(sensed(clip=0.7).step(z, a) - sensed().step(z, a)).max() > 1e-3
-    assert "coefficients" in sensed().arrays()
-
-
-def test_a_model_predicts_itself_under_actions_and_under_a_law():
-    model = linear()
-    model = LinearModel(model.kind, 0.1 * model.A, model.B, model.constant)
-    rng = np.random.default_rng(3)
-    law = affine_law(rng.normal(size=(2, 10)) * 0.1, rng.normal(size=2))
-    z, actions, states = rng.normal(size=(1, 10)), [], []
-    for k in range(7):
-        states.append(z[0])
-        actions.append(law(k, z)[0])
-        z = model.step(z, actions[-1][None])
-    whole = Measured(np.array([*states, z[0]]), np.array(actions))
-    closed = Measured(np.array(states), np.array(actions), law)
-    assert np.array_equal(predicted(model, [whole])[0], whole.states)
-    assert errors(model, [whole, closed], np.zeros(10), 2.0).tolist() == [0.0, 0.0]
-
-
-def test_a_rollout_is_cut_into_pieces_that_keep_their_law():
-    def law(k, z):
-        return np.full((len(z), 1), float(k))
-
-    states, actions = np.arange(8.0)[:, None], np.arange(7.0)[:, None]
-    parts = pieces(Measured(states, actions, law), 3)
-    assert [part.states.ravel().tolist() for part in parts] == [[0, 1, 2], [2, 3, 4], [4, 5, 6, 7]]
-    for part in parts:
-        assert part.law(1, np.zeros((1, 1)))[0] == part.actions[1]
-
-
-def test_a_model_that_overflows_counts_as_the_worst():
-    model = LinearModel("linear", 1e200 * np.eye(3), np.zeros((3, 1)), np.zeros(3))
-    rollout = Measured(np.ones((6, 3)), np.zeros((5, 1)))
-    assert errors(model, [rollout], np.zeros(3), 2.0).tolist() == [2.0]
 
 
 def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> None:
@@ -171,27 +120,6 @@ def test_arrays_of_any_order_and_permission_are_one_type_to_the_compiler() -> No
     for kernel in (add_products, advance):
         assert len(kernel.signatures) == 1
     assert z.flags.writeable
-
-
-@pytest.mark.parametrize(
-    ("options", "loaded"),
-    [
-        ({"optimizer": "model_based"}, True),
-        ({"optimizer": "two_point", "identification": "field"}, True),
-        ({"optimizer": "two_point"}, False),
-        ({"optimizer": "model_based", "sensors": 8}, False),
-    ],
-)
-def test_what_the_fits_of_a_training_call_is_compiled_before_it(
-    options: dict[str, Any], loaded: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[None] = []
-    monkeypatch.setattr(polynomial_step, "load_compiled", lambda: calls.append(None))
-    values = resolve(str(SMALL), options)
-    load_compiled(values)
-    assert not calls
-    load_compiled(values, fits=True)
-    assert bool(calls) == loaded
 
 
 def test_what_is_compiled_for_a_small_grid_serves_every_other() -> None:

@@ -12,15 +12,8 @@ import pdeloop
 from controller_node.identification import DesignSettings
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.messages.spec import (
-    FIELD_MODEL_SETTINGS,
-    IDENTIFICATION_SETTINGS,
-    OPTIMIZER_SETTINGS,
     ParameterError,
 )
-from pdeloop.method.adapt import Context, ModelBased, TwoPoint
-from pdeloop.method.adapt.base import Record
-from pdeloop.method.adapt.belief import believe
-from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
 from pdeloop.method.design.lqg import noise_of
 from pdeloop.method.laws.registry import OWN_LAWS, law_kind
 from pdeloop.method.models import FieldModelSettings, Measured
@@ -28,12 +21,8 @@ from pdeloop.method.reduce.reduced_model import IdentificationSettings
 from pdeloop.method.reduce.regression import study_orders
 from pdeloop.method.settings import Settings, setting
 from tests.support.fitted import fit_field_model
-from tests.support.interpreter import ROOT
 from tests.support.small import SMALL
-from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import training_parameters
-
-OPTIMIZERS = (ModelBased, TwoPoint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,21 +109,6 @@ def test_noise_has_to_show_by_as_many_standard_errors_as_are_set() -> None:
     assert found[100.0][1][0, 0] < 1e-3
 
 
-def test_the_constants_of_field_models_reach_controller_and_tuner() -> None:
-    values = training_parameters(str(SMALL), {"field_model_settings": {"largest_degree": 2}})
-    wanted = FieldModelSettings(largest_degree=2)
-    assert values["field_model_settings.folds"] == FieldModelSettings().folds
-    assert DesignSettings.of(values).field_models == wanted
-    assert build_training(values).settings.field_models == wanted
-    for wrong, words in (
-        ({"largest_degree": 1}, "is 1; expected"),
-        ({"degree": 2}, "unknown parameter"),
-    ):
-        with pytest.raises(ParameterError, match=f"{words}.*") as refused:
-            training_parameters(str(SMALL), {"field_model_settings": wrong})
-        assert "field_model_settings." in str(refused.value)
-
-
 def cubic(count: int) -> list[Measured]:
     """Rollouts of a damped cubic equation at every point, which no equation of degree 2 reproduces."""
     rng, found = np.random.default_rng(2), []
@@ -155,50 +129,3 @@ def test_kinds_of_a_higher_degree_than_is_set_are_not_tried() -> None:
         assert found is not None
         kinds[degree] = {kind for kind, _ in found.candidates}
     assert "poly3" in kinds[7] and "poly3" not in kinds[2] and "poly2" in kinds[2]
-
-
-def test_an_optimiser_fits_its_models_with_the_constants_of_its_context() -> None:
-    """A kind is tried until one reproduces the data: where any error is good enough, only the first."""
-    records = [Record(np.zeros((1, 2)), np.inf, own.states, own.actions) for own in cubic(3)]
-    first = (records[0].states, records[0].actions)
-    tried = {}
-    for reproduced in (0.0, 1.0):
-        settings = FieldModelSettings(reproduced=reproduced, worst=1.0)
-        context = Context(
-            np.eye(16)[:, :1], np.zeros(16), 1.0, 1.0, 40, first, field_models=settings
-        )
-        belief = believe(context, records, 0.05, "linear")
-        assert belief is not None
-        tried[reproduced] = belief.model.kind
-    assert tried[1.0] == "linear" != tried[0.0]
-
-
-def test_the_tables_of_settings_are_those_of_the_classes() -> None:
-    """One table for each method on one page, with every constant that can be set."""
-    assert {kind.name for kind in OPTIMIZERS} == set(OWN_OPTIMIZERS.shipped)
-    tables = [
-        (f"`{IDENTIFICATION_SETTINGS}NAME`", IdentificationSettings),
-        (f"`{FIELD_MODEL_SETTINGS}NAME`", FieldModelSettings),
-        *((f"`{OPTIMIZER_SETTINGS}NAME` of `{kind.name}`", kind.Settings) for kind in OPTIMIZERS),
-    ]
-    tables = [(title, kind) for title, kind in tables if kind.specs()]
-    text = (ROOT / "docs" / "reference" / "settings.md").read_text()
-    documented = {}
-    for section in text.split("\n## ")[1:]:
-        rows = [
-            [cell.strip(" `") for cell in line.split("|")[1:-1]] for line in section.splitlines()
-        ]
-        if settings := [tuple(row) for row in rows if len(row) == 4][2:]:
-            documented[section.splitlines()[0]] = settings
-    assert documented == {
-        title: [
-            (
-                spec.name,
-                str(spec.default),
-                spec.range.partition("from ")[2],
-                spec.description,
-            )
-            for spec in kind.specs()
-        ]
-        for title, kind in tables
-    }
