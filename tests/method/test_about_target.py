@@ -14,10 +14,8 @@ from pde_sim_node.plants import DynamicsPlant
 from pdeloop import rollout
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
-from pdeloop.method.adapt import ModelBased
-from pdeloop.method.adapt.base import Context, Record, Rollout, RolloutResult, Trajectory
-from pdeloop.method.adapt.model_based import JUDGING
-from pdeloop.method.adapt.replay import best_on_same_fields, designed_again, law_about_target
+from pdeloop.method.adapt.base import Context, Record, Trajectory
+from pdeloop.method.adapt.replay import designed_again, law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import FEW_FITS
@@ -55,17 +53,6 @@ def test_the_law_is_that_of_the_plant_linearised_at_the_target() -> None:
     assert np.array_equal(found[:, 2:], -found[:, :2])  # none at the target
 
 
-def test_actuators_of_limited_rate_begin_each_rollout_anew() -> None:
-    limits = ActionSet(1, rate=0.3)
-    records = [_record(seed, 8, 0.5, limits) for seed in range(20)]
-    found = law_about_target(_context(records[0], action_set=limits), records)
-    free = law_about_target(
-        _context(records[0]),
-        [replace(own, actions=limits.applied(own.actions)) for own in records],
-    )
-    assert found is not None and free is not None and np.array_equal(found, free)
-
-
 def test_there_is_no_law_of_few_samples_or_of_another_cost() -> None:
     short = _record(0, steps=5)  # six unknowns
     assert law_about_target(_context(short), [short]) is None
@@ -94,34 +81,6 @@ def test_a_first_law_that_diverges_is_designed_again_from_what_it_did() -> None:
     np.testing.assert_allclose(found, expected.policy_for(TARGET), atol=0.1)
     resting = designed_again(replace(known, target=np.zeros(2)), [explored, diverged])
     assert resting is not None and np.array_equal(resting[:, :2], found[:, :2])
-
-
-def test_where_the_first_law_diverges_the_cheapest_of_the_others_is_the_best() -> None:
-    costs = {0.0: np.inf, 1.0: 1617.0, 2.0: 9.0, 3.0: 30.0}
-    rolled = [
-        Record(np.full((1, 4), law), cost, np.ones((1, 2)), np.ones((0, 1)), field_seed=seed)
-        for law, cost in costs.items()
-        for seed in (1, 2)
-    ]
-    assert best_on_same_fields(rolled, np.zeros((1, 4)))[0, 0] == 2.0
-
-
-@pytest.mark.parametrize("diverged", [False, True])
-def test_the_final_law_is_compared_with_one_that_comes_to_an_end(diverged: bool) -> None:
-    first, last = np.ones((1, 4)), np.full((1, 4), 2.0)
-    record = _record(0)
-    optimizer = ModelBased(first, seed=0, rollouts=20, context=_context(record))
-    seen = RolloutResult(1.0, diverged, Trajectory(record.states, record.actions))
-    for seed, law in ((1, first), (2, first), (1, last), (2, last)):
-        told = seen if law is first else replace(seen, diverged=False)
-        optimizer._records.add([Rollout(law, seed)], [told])
-    progress = optimizer._progress
-    progress.replayed, progress.stage, progress.policy = True, JUDGING, last
-    asked = optimizer.ask()
-    others = [r for r in asked if not np.array_equal(r.policy, last)]
-    fields = {r.field_seed for r in asked} - {r.field_seed for r in others}
-    assert others and len(fields) <= 1
-    assert all(np.array_equal(r.policy, 0.0 * first if diverged else first) for r in others)
 
 
 @pytest.mark.filterwarnings("ignore::pdeloop.IdentifiabilityWarning")

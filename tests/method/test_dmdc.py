@@ -8,20 +8,9 @@ import pytest
 
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from pdeloop.method.reduce.regression import truncated_dmdc
-from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
+from tests.support.linear_system import lift, linear_system, trajectory
 
 N_S, N_A, STEPS = 3, 2, 40
-
-
-@pytest.mark.parametrize("n_z", [N_S, 20, 60])
-def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
-    A, B = linear_system(N_S)
-    onto = lift(n_z, N_S)
-    states, actions = trajectory(A, B, steps=STEPS)
-    model = truncated_dmdc([(states @ onto.T, actions)], p=N_S + N_A, n_s=N_S)
-    assert_recovered(model, A, B, onto, atol=1e-12)
-    np.testing.assert_allclose(model.U.T @ model.U, np.eye(N_S), atol=1e-13)
-    assert (model.n_z, model.n_s, model.n_a) == (n_z, N_S, N_A)
 
 
 def test_is_the_formula_of_the_paper() -> None:

@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.action_set import ActionSet
-from pdeloop.method.adapt import ModelBased
 from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
 from pdeloop.method.adapt.sensed_loop import (
     UNPREDICTED,
     estimated_laws,
     least_trusting,
     noise_of_filter,
-    prior,
-    root_mean_square,
     whole_field_law,
 )
 from pdeloop.method.laws import ExtendedKalman, Observer
@@ -28,7 +24,6 @@ from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     WAVES,
     SensedFilter,
-    coefficients_of,
     field_of,
 )
 from tests.support.estimated import (
@@ -40,15 +35,12 @@ from tests.support.estimated import (
     SIGMA,
     SPREAD,
     T,
-    context_of,
     fields,
     filter_of,
     loop_of,
     rows_of,
 )
 from tests.support.small import same_bits
-
-Array = np.ndarray
 
 
 def test_of_a_linear_equation_it_is_the_kalman_filter() -> None:
@@ -177,7 +169,7 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
     best = min(designed, key=lambda theta: float(loop.costs(theta, every).mean()))
     parts = dict(law.parts(best))
 
-    def theta_with(times: float) -> Array:
+    def theta_with(times: float) -> np.ndarray:
         noise = noise_of_filter(CUBIC, settings, times)
         return law.vector(parts | {"noise": np.array([noise])})
 
@@ -195,31 +187,3 @@ def test_a_filter_trusts_the_equation_less_where_the_law_costs_hardly_more() -> 
         assert same_bits(least_trusting(loop, best, every, settings), expected)
     lost = law.vector(parts | {"K_e": np.full((N_A, 64), np.inf)})
     assert least_trusting(loop, lost, every, settings) is lost
-
-
-def test_the_prior_has_the_moments_of_the_fields() -> None:
-    drawn, weights = fields(60) + 0.5, np.full(60, 1.0 / 60.0)
-    x = coefficients_of(drawn)
-    mean, factor = prior(drawn, weights, 0.3)
-    np.testing.assert_allclose(mean, x.mean(axis=0), atol=1e-12)
-    own = np.cov(x.T, bias=True)
-    waves = 0.5 * (np.diag(own)[1 : WAVES + 1] + np.diag(own)[WAVES + 1 :])
-    expected = own + 0.09 * np.diag([own[0, 0], *waves, *waves])
-    np.testing.assert_allclose(factor.T @ factor, expected, atol=1e-12)
-
-
-def test_the_size_of_a_field_is_that_of_its_waves() -> None:
-    drawn = fields(4000)
-    assert root_mean_square(SPREAD) == pytest.approx(np.sqrt(np.mean(drawn**2)), rel=0.03)
-
-
-def test_a_model_of_the_readings_steps_from_laws_without_an_estimate() -> None:
-    """Where no equation reproduces the rollouts any more."""
-    law = ExtendedKalman(rows_of(0.1), T)
-    context = context_of(law)
-    own = ModelBased.for_context(context)(
-        law.theta_start, seed=0, rollouts=12, settings=ModelBasedSettings(), context=context
-    )
-    assert isinstance(own, ModelBasedReadings)
-    estimated = law.theta_of(np.ones((N_A, 64)), np.zeros(N_A), filter_of(CUBIC), DEFAULTS)
-    assert not own._is_linear(estimated) and own._is_linear(law.theta_start)

@@ -16,7 +16,6 @@ from pdeloop.messages.model_rows import ModelRows, unpack
 from pdeloop.method.design import lqt
 from pdeloop.method.design.field_law import (
     FieldLaw,
-    aim_of,
     field_law,
     linearisation_point,
     states_under,
@@ -24,7 +23,6 @@ from pdeloop.method.design.field_law import (
 from pdeloop.method.design.lqt import DesignError, regulator
 from pdeloop.method.models import Measured, affine_law
 from pdeloop.method.models.finite_difference import features_of, of_features
-from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.selection import Accuracy, FittedModel, Selection
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import IdentificationSettings, ReducedModel
@@ -69,23 +67,6 @@ def law(true: SpectralModel, target: Array) -> ModelRows:
     found = field_law(trajectories, target, none, cost_to(target))
     assert found.better and found.rows is not None
     return found.rows
-
-
-def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
-    rng = np.random.default_rng(0)
-    A, B, d = rng.standard_normal((5, 5)), rng.standard_normal((5, 2)), rng.standard_normal(5)
-    P, p = np.zeros((5, 5)), np.zeros(5)
-    for _ in range(9):  # after the steps 7 .. 0 the law of one more, the first of eight
-        S = R * np.eye(2) + B.T @ P @ B
-        K, b = -np.linalg.solve(S, B.T @ P @ A), -np.linalg.solve(S, B.T @ (P @ d + p))
-        closed = A + B @ K
-        # a^T (R a + B^T (P (A e + B a + d) + p)) vanishes at the optimum
-        P, p = Q * np.eye(5) + A.T @ P @ closed, closed.T @ (P @ d + p)
-    cost = Cost(5, 2, 8, state_weight=Q, action_weight=R)
-    own = regulator(LinearModel("linear", A, B, d), cost)
-    assert own is not None
-    np.testing.assert_allclose(own.K, K, rtol=1e-8)
-    np.testing.assert_allclose(own.b, b, rtol=1e-8)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.3])
@@ -211,18 +192,6 @@ def test_two_explorations_give_one_law_for_the_fields_of_both() -> None:
     assert np.linalg.norm(ends[0]) < np.linalg.norm(ends[1])
 
 
-def test_the_regression_is_that_of_the_first_exploration() -> None:
-    """Pooled, it is worse: the modes of one field are not those of another."""
-    true, target = plant(), np.zeros(N_Z)
-    parts = zip(episode(true), episode(true, noise=0.01), strict=True)
-    states, actions = (np.stack(part, axis=1) for part in parts)
-    one, both = (
-        design_each(states, actions, numbers, target, settings("regression"))[0]
-        for numbers in ([0, 1], [0, 0])
-    )
-    assert np.array_equal(one, both)
-
-
 def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
     true, target = plant(), np.zeros(N_Z)
     regression = designed([episode(true)], target, settings("regression")).rows
@@ -337,18 +306,6 @@ def test_the_law_of_few_modes_is_taken_where_no_model_is_accepted_and_they_predi
     assert law.U.shape == (3, 3)  # which an adaptation may need all of
     assert np.array_equal(law.K_a[0], np.arange(3) < gains_of)
     assert np.array_equal(law.K_b, law.K_a)
-
-
-def test_what_costs_nothing_is_linearised_where_it_was_measured() -> None:
-    mean, target = np.array([278.0, 279.0, 3.0]), np.array([275.0, 0.0, 0.0])
-    for cost in (
-        Cost(3, 1, 5, state_weight=[2.0, 0.0, 0.0]),
-        Cost(3, 1, 5, state_weight=np.diag([2.0, 0.0, 0.0])),
-        Cost(3, 1, 5, output=[[3.0, 0.0, 0.0]]),
-    ):
-        assert cost.state_weights is not None
-        found = aim_of(mean, target, cost.state_weights)
-        np.testing.assert_allclose(found, [275.0, 279.0, 3.0], rtol=1e-12)
 
 
 def test_every_accepted_model_judges_every_law() -> None:

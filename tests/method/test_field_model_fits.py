@@ -17,8 +17,6 @@ from pdeloop.messages.action_set import ActionSet
 from pdeloop.method.models import FieldModelSettings, Measured
 from pdeloop.method.models.base import errors, samples_of
 from pdeloop.method.models.linear import fit_linear
-from pdeloop.method.models.selection import FORMS, NEAR_RIDGES, kinds_of
-from pdeloop.method.models.spectral import fit_spectral
 from tests.support.fitted import fit_field_model
 from tests.support.plants import plant_of
 
@@ -102,39 +100,20 @@ def test_equations_are_recovered(equation, sample_time, steps, kind, error):
 
 
 @pytest.mark.parametrize(
-    "name, count, variance, error",
+    "name, count, variance, error, degree",
     [
-        ("AllenCahnInhomogeneous", 5, 0.1, 1e-2),
-        ("BurgersBetweenWalls", 3, 0.1, 1e-3),
-        ("FitzHughNagumo", 3, 0.1, 1e-3),
-        ("CoupledPendulums", 3, 1.0, 1e-3),
-        ("RandomLinear", 3, 0.01, 1e-2),
+        ("AllenCahnInhomogeneous", 5, 0.1, 1e-2, 3),
+        ("BurgersBetweenWalls", 3, 0.1, 1e-3, 3),
+        ("FitzHughNagumo", 3, 0.1, 1e-3, 3),
+        ("CoupledPendulums", 3, 1.0, 1e-3, 7),
+        ("RandomLinear", 3, 0.01, 1e-2, 2),
     ],
 )
-def test_plants_that_are_no_periodic_equation_are_recovered(name, count, variance, error):
+def test_plants_that_are_no_periodic_equation_are_recovered(name, count, variance, error, degree):
     rollouts, target = rolled_out(name, count, variance)
-    fitted = fit_field_model(rollouts[:-1], target, settings=FieldModelSettings(folds=2))
+    few = FieldModelSettings(folds=2, largest_degree=degree)
+    fitted = fit_field_model(rollouts[:-1], target, settings=few)
     assert errors(fitted.model, rollouts[-1:], target, 2.0)[0] < error
-
-
-def test_numbers_that_are_no_field_have_no_equation_on_a_ring():
-    rollouts, _ = rolled_out("RandomLinear", 3, 0.01)
-    samples = samples_of(rollouts)
-    with np.errstate(all="ignore"):
-        assert all(fit_spectral(samples, form, FieldModelSettings()) is None for form in FORMS)
-
-
-def test_what_a_linear_model_reproduces_is_given_to_no_other_kind():
-    rng = np.random.default_rng(0)
-    A = 0.9 * np.linalg.qr(rng.normal(size=(16, 16)))[0]
-    rollouts = []
-    for _ in range(2):
-        actions, states = rng.normal(size=(60, 1)), [rng.normal(size=16)]
-        for a in actions:
-            states.append(A @ states[-1] + a)
-        rollouts.append(Measured(np.array(states), actions))
-    fitted = fit_field_model(rollouts, np.zeros(16))
-    assert [kind for kind, _ in fitted.candidates] == ["linear"]
 
 
 @cache
@@ -152,12 +131,6 @@ def test_units_change_neither_the_kind_nor_the_error(of_states, of_actions):
     before, after = in_own_units(), fit_field_model(scaled, size * target)
     assert after.model.kind == before.model.kind
     assert after.error == pytest.approx(before.error, rel=0.5)
-
-
-def test_the_same_rollouts_give_the_same_bits():
-    rollouts, target = explored(AllenCahnModes(), 0.01, 1, 2)
-    first, second = (fit_field_model(rollouts, target).model.arrays() for _ in range(2))
-    assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
 def test_an_input_that_is_never_used_and_a_constant_one_do_no_harm():
@@ -225,14 +198,6 @@ def test_a_field_that_rests_is_no_error():
     rollouts = [Measured(np.ones((31, 16)), np.zeros((30, 2)))] * 2
     fitted = fit_field_model(rollouts, np.zeros(16))
     assert fitted.error < 1e-6
-
-
-def test_kinds_for_large_states_have_no_matrix_of_their_size():
-    settings = FieldModelSettings()
-    small = {kind.name for kind in kinds_of(512, settings)}
-    large = {kind.name for kind in kinds_of(514, settings)}
-    near = {*NEAR_RIDGES, "two-near-shared"}
-    assert small - large == near
 
 
 def test_an_offset_changes_no_linear_model() -> None:

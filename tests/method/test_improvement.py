@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from pdeloop.method.design.lqt import track
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.models.spectral import SpectralModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
+from tests.method.test_plans import general_cost
 
 N_Z, N_S, N_A, T = 16, 5, 2, 12
 
@@ -57,19 +59,22 @@ def fields(count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("admissible", "noise"),
+    ("admissible", "others"),
     [
-        (ANY_ACTION, 0.0),
-        (ActionSet(limit=0.4), 0.0),
-        (ActionSet(low=-0.1), 0.0),
-        (ActionSet(N_A, -0.5, 0.3, zero_mean=True), 0.0),
-        (ActionSet(N_A, -0.5, 0.3, rate=0.2), 0.0),
-        (ActionSet(N_A, -0.5, 0.3, zero_mean=True, rate=[0.2, 0.1]), 0.0),
-        (ANY_ACTION, 0.3),
+        (ANY_ACTION, {}),
+        (ActionSet(limit=0.4), {}),
+        (ActionSet(low=-0.1), {}),
+        (ActionSet(N_A, -0.5, 0.3, zero_mean=True), {}),
+        (ActionSet(N_A, -0.5, 0.3, rate=0.2), {}),
+        (ActionSet(N_A, -0.5, 0.3, zero_mean=True, rate=[0.2, 0.1]), {}),
+        (ANY_ACTION, {"noise": 0.3}),
+        (ANY_ACTION, {"cost": general_cost(T)}),
     ],
 )
-def test_the_gradient_is_that_of_finite_differences(admissible: ActionSet, noise: float) -> None:
-    closed = replace(loop(), action_set=admissible, noise=noise)
+def test_the_gradient_is_that_of_finite_differences(
+    admissible: ActionSet, others: dict[str, Any]
+) -> None:
+    closed = replace(loop(), action_set=admissible, **others)
     start, weights = fields(3), np.array([0.5, 0.2, 0.3])
     theta = 0.3 * np.random.default_rng(3).normal(size=(N_A, N_S + 1))
     cost, gradient = closed.gradient(theta, start, weights)
@@ -95,16 +100,6 @@ def test_a_cost_is_the_mean_stage_cost_along_the_model() -> None:
         total += 1.5 * float(np.sum((z - closed.target) ** 2)) + 0.4 * float(np.sum(a**2))
         z = closed.model.step(z, a)
     assert closed.costs(theta, fields(1))[0] == pytest.approx(total / T, rel=1e-13)
-
-
-def test_without_a_target_in_the_basis_a_law_has_no_constant_part() -> None:
-    closed = replace(loop(), cost=Cost(N_Z, N_A, T, state_weight=1.5, action_weight=0.4))
-    theta = np.ones((N_A, N_S + 1))
-    same = theta * np.append(np.ones(N_S), 0.0)
-    np.testing.assert_array_equal(
-        closed.costs(0.1 * theta, fields(2)), closed.costs(0.1 * same, fields(2))
-    )
-    assert not closed.gradient(0.1 * theta, fields(2), np.full(2, 0.5))[1][:, -1].any()
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,35 +247,6 @@ def test_fields_between_walls_are_not_shifted() -> None:
     measured[:, :4] = rng.normal(size=(5, 4))
     assert mixtures(measured, 30, rng)[:, 4:].any()
     assert not mixtures(measured, 30, rng, periodic=False)[:, 4:].round(12).any()
-
-
-def test_one_field_or_equal_fields_have_no_mixtures() -> None:
-    rng = np.random.default_rng(7)
-    assert mixtures(fields(1), 5, rng).shape == (0, N_Z)
-    assert mixtures(np.ones((3, N_Z)), 5, rng).shape == (0, N_Z)
-
-
-@pytest.mark.parametrize("components", [1, 2, 3])
-def test_shifts_are_averaged_along_each_component(components: int) -> None:
-    deviations = np.random.default_rng(8).normal(size=(5, 12))
-    parts = deviations.reshape(5, components, -1)
-    shifted = [np.roll(parts, s, axis=2).reshape(5, 12) for s in range(parts.shape[2])]
-    expected = np.mean([d.T @ d for d in shifted], axis=0)
-    np.testing.assert_allclose(averaged_over_shifts(deviations, components), expected, atol=1e-12)
-
-
-def test_the_invariant_share_is_that_of_its_definition() -> None:
-    measured = np.random.default_rng(9).normal(size=(5, 8)) + np.arange(8)
-    deviations = measured - measured.mean(axis=0)
-
-    def rest(matrix: np.ndarray) -> np.ndarray:
-        turned = [np.roll(np.roll(matrix, s, axis=0), s, axis=1) for s in range(8)]
-        return matrix - np.mean(turned, axis=0)
-
-    parts = np.array([rest(np.outer(d, d)) for d in deviations])
-    spread = np.sum((parts - parts.mean(axis=0)) ** 2) / (5 * 4)
-    expected = spread / np.sum(parts.mean(axis=0) ** 2)
-    assert invariant_share(measured) == pytest.approx(min(expected, 1.0), rel=1e-10)
 
 
 def renewed(measured: np.ndarray, **constants: int) -> tuple[Renewal, float]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,80 +20,63 @@ from pdeloop.method.adapt.renewal import (
 )
 
 N_Z = 12
+Map = Callable[[np.ndarray], np.ndarray]
+FIELDS = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
 
 
 @dataclass
-class Logistic:
-    """z' = r z (1 - z) at every point, chaotic at r = 3.9 and at rest in 1 - 1/r at r = 2.5."""
+class Plant:
+    """z' = f(z) at every point."""
 
-    r: float
+    f: Map
     n_z, n_a = N_Z, 1
 
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return self.r * states * (1.0 - states)
+        return self.f(states)
 
 
-@pytest.mark.parametrize(("r", "chaotic"), [(3.9, True), (2.5, False)])
-def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) -> None:
-    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(r))  # type: ignore[arg-type]
-    fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
-    assert is_chaotic(loop, fields) == chaotic
-    assert not is_chaotic(loop, fields[:1])  # one field tells nothing
+def logistic(r: float) -> Map:
+    """Chaotic at r = 3.9, and at rest in 1 - 1/r at r = 2.5."""
+    return lambda z: r * z * (1.0 - z)
 
 
-class Decaying(Logistic):
-    """z' = z / r at every point."""
-
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return states / self.r
+def falling(z: np.ndarray) -> np.ndarray:
+    """Small changes grow, as of a chaotic plant, and from far it falls for good."""
+    return 1.1 * z + z**3
 
 
-def test_a_linear_plant_is_never_chaotic_however_far_its_fields_are_from_each_other() -> None:
-    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Decaying(1.1))  # type: ignore[arg-type]
-    field = np.random.default_rng(0).normal(size=N_Z)
-    assert not is_chaotic(loop, np.array([field, -field]))
+def loop_of(f: Map, target: float = 0.6) -> ClosedLoop:
+    return ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=target), model=Plant(f))  # type: ignore[arg-type]
 
 
-def test_fields_from_which_the_plant_diverges_say_nothing() -> None:
-    """z' = 3.9 z (1 - z) tends to minus infinity from outside of 0 .. 1."""
-    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(3.9))  # type: ignore[arg-type]
-    assert not is_chaotic(loop, np.full((2, N_Z), 3.0))
-
-
-@dataclass
-class Falling:
-    """z' = 1.1 z + z^3: small changes grow, as of a chaotic plant, and from far it falls for good."""
-
-    n_z, n_a = N_Z, 1
-
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return 1.1 * states + states**3
+@pytest.mark.parametrize(
+    ("f", "target", "fields", "chaotic"),
+    [
+        (logistic(3.9), 0.6, FIELDS, True),
+        (logistic(2.5), 0.6, FIELDS, False),
+        (logistic(3.9), 0.6, FIELDS[:1], False),  # one field tells nothing
+        (logistic(3.9), 0.6, np.full((2, N_Z), 3.0), False),  # from there it diverges
+        (lambda z: z / 1.1, 0.0, np.array([FIELDS[0], -FIELDS[0]]), False),  # linear
+    ],
+)
+def test_small_changes_grow_in_a_chaotic_plant_alone(
+    f: Map, target: float, fields: np.ndarray, chaotic: bool
+) -> None:
+    assert is_chaotic(loop_of(f, target), fields) == chaotic
 
 
 def test_states_of_a_plant_that_runs_away_do_not_serve_as_initial_fields() -> None:
-    near = np.random.default_rng(0).uniform(0.010, 0.011, (4, N_Z)) * np.array(
-        [[1], [-1], [1], [-1]]
-    )
-    falls = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Falling())  # type: ignore[arg-type]
-    none = falls.no_control
+    signs = np.array([[1], [-1], [1], [-1]])
+    near = np.random.default_rng(0).uniform(0.010, 0.011, (4, N_Z)) * signs
+    falls, stays = loop_of(falling, 0.0), loop_of(logistic(3.9))
     assert is_chaotic(falls, near)
-    assert not any_state_serves(falls, none, near, np.concatenate([near, 30.0 * near]))
-    stays = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40, target=0.6), model=Logistic(3.9))  # type: ignore[arg-type]
-    fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
-    states = 3.9 * fields * (1.0 - fields)
-    assert any_state_serves(stays, stays.no_control, fields, states)
-
-
-class Escaping(Logistic):
-    """z' = r z + (1 - r) z^3, which comes to rest from |z| < 1 and runs away from beyond."""
-
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return self.r * states + (1.0 - self.r) * states**3
+    assert not any_state_serves(falls, falls.no_control, near, np.concatenate([near, 30.0 * near]))
+    assert any_state_serves(stays, stays.no_control, FIELDS, logistic(3.9)(FIELDS))
 
 
 def test_a_stable_plant_is_not_chaotic_where_its_model_runs_away_from_some_fields() -> None:
     """As that of a heat exchanger without flow; close to where it does, small changes matter."""
-    loop = ClosedLoop(np.eye(N_Z, 3), Cost(N_Z, 1, 40), model=Escaping(0.8))  # type: ignore[arg-type]
+    loop = loop_of(lambda z: 0.8 * z + 0.2 * z**3, 0.0)
     fields = np.array([0.3, 0.4, 0.5, 0.6, 0.998, 1.2])[:, None] * np.ones(N_Z)
     costs = loop.costs(loop.no_control, fields)
     assert np.isinf(costs[-1]) and costs[-2] > 2.0 * costs[:-2].sum()

@@ -16,23 +16,17 @@ import pytest
 from pdeloop.method.adapt import (
     Context,
     ModelBased,
-    Record,
     Rollout,
     RolloutResult,
     Trajectory,
     renewal,
     replay,
 )
-from pdeloop.method.adapt.belief import believe
-from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.model_based import JUDGING
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
 from pdeloop.method.design.lqt import track
-from pdeloop.method.models import Measured
 from pdeloop.method.models.base import FieldModelSettings
 from pdeloop.method.reduce.reduced_model import ReducedModel
-from tests.support.fitted import fit_field_model
 from tests.support.small import same_bits
 
 N_Z, N_S, N_A, T = 7, 4, 2, 30
@@ -294,61 +288,6 @@ def test_a_first_law_that_leads_to_where_no_model_follows_is_no_obstacle() -> No
     assert rows[0]["mismatch"] < 1e-6
     assert rows[-1]["chosen"] == ADAPTED
     assert wild.cost(optimizer.policy) <= 1.05 * wild.cost(wild.best)
-
-
-def test_a_model_of_what_stays_near_predicts_laws_that_it_was_not_fitted_to() -> None:
-    """The plant runs away from its target and is random there; laws keep it where it is linear."""
-    plant = Plant(radius=1.15)
-    far = 8.0
-
-    def beyond(s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        random = 3.0 * far * rng.standard_normal(N_S) - plant.A @ s
-        return random if np.abs(plant.U @ s).max() > far else np.zeros(N_S)
-
-    wild = Plant(beyond, radius=1.15)
-    context = wild.context()
-    assert all(np.abs(known.states).max() > far for known in context.every_exploration)
-
-    def rolled(share: float, seeds: range) -> list[Record]:
-        found = []
-        for seed in seeds:
-            result = wild.run(share * wild.best, seed)
-            assert result.trajectory is not None
-            known = result.trajectory.states, result.trajectory.actions
-            found.append(Record(share * wild.best, result.cost, *known))
-        return found
-
-    explored = [
-        Record(0.0 * wild.best, np.inf, known.states, known.actions)
-        for known in context.every_exploration
-    ]
-    settings = ModelBasedSettings()
-    first, others = rolled(0.8, range(10, 14)), rolled(1.1, range(14, 18)) + rolled(0.9, range(4))
-    every = [*explored, *first, *others]
-    known = [Measured(own.states, own.actions) for own in every]
-    whole = fit_field_model(known, context.target)
-    assert whole is None or whole.error > settings.believed
-    found = believe(context, every, settings.believed)
-    assert found is not None and found.accepted and found.error < 1e-6
-    loop = found.loop(context)
-    for record in rolled(0.6, range(30, 34)):
-        predicted = loop.costs(loop.theta(record.policy), record.states[:1])[0]
-        assert predicted == pytest.approx(record.cost, rel=1e-3)
-
-
-def test_no_control_that_was_not_measured_is_not_returned_where_rollouts_alone_count(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The model knows nothing of the final law, and says that no control is better than the first."""
-    plant = Plant()
-    optimizer = make(plant, share=0.1)
-    while optimizer._progress.stage != JUDGING:
-        optimizer.tell(measured(plant, optimizer))
-    optimizer._progress.safe, best = False, optimizer.policy
-    monkeypatch.setattr(ClosedLoop, "costs", lambda _, theta, fields: np.full(len(fields), np.inf))
-    row = optimizer.tell(measured(plant, optimizer))
-    assert row["chosen"] == "adapted" and same_bits(optimizer.policy, best)
-    assert "less than the first law" in str(row["reason"])
 
 
 def test_a_large_budget_ends_once_the_fields_are_known() -> None:

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from pdeloop.method.adapt import (
-    ModelBased,
     Rollout,
     Trajectory,
     model_based_sensed,
 )
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import JUDGING
-from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings, ModelBasedSensed
+from pdeloop.method.adapt.model_based_sensed import ModelBasedSensed
 from pdeloop.method.adapt.sensed_loop import UNPREDICTED, noise_of_filter, sensed_from
 from pdeloop.method.laws import ExtendedKalman, Observer
 from pdeloop.method.models.sensed import SensedModel
@@ -101,25 +100,6 @@ def test_a_law_that_measured_better_is_returned_in_place_of_a_last_one_that_beat
     assert row["deviation"] == pytest.approx(error)
 
 
-@pytest.mark.parametrize("lost", [False, True])
-def test_the_first_law_is_returned_in_place_of_no_control_where_it_measured_better(
-    lost: bool,
-) -> None:
-    """Of a last law that beats no control, and of one that diverged once."""
-    own, *_ = told(better=True, rollouts=7, judging=3)
-    own._progress.safe, final = False, own._first + 1e-6
-    row = {"chosen": "adapted", "reason": "", "predicted_change": -1.0, "deviation": 0.1}
-    own._progress.policy, level = final, own._records.all()[0].cost
-    for law, costs in ((own._none, [9.0, 9.1, 9.2]), (final, [5.0, np.inf if lost else 5.1, 5.2])):
-        for seed, cost in enumerate(costs, start=1):
-            result = replace(measured(Rollout(law, seed)), cost=cost * level)
-            own._records.add([Rollout(law, -1)], [result])
-    first = [record.cost / level for record in own._of(own._first)]
-    own._look_back(row, own._none)
-    assert same_bits(own.policy, own._first) and row["chosen"] == "first"
-    assert row["predicted_change"] == pytest.approx(level * (np.mean(first) - 9.1))
-
-
 def test_a_training_uses_the_filter_that_trusts_the_equation_least_within_its_margin() -> None:
     _, results, _ = told()
     _, context = small()
@@ -179,9 +159,3 @@ def test_no_control_follows_a_law_that_runs_away_before_an_equation_is_found(far
     of_a_law = {"fraction", "steps", "predicted_change", "deviation"} & {*row}
     assert of_a_law == (set() if runs_away else {"steps"})
     assert {"role", "cost", "model"} <= {*row}  # of the rollouts, and of what reproduces them
-
-
-def test_readings_of_no_ring_get_a_model_of_the_readings_alone() -> None:
-    _, context = small()
-    other = replace(context, periodic=False)
-    assert ModelBased.for_context(other) is ModelBasedReadings

@@ -9,7 +9,7 @@ import pytest
 from pdeloop.method.models import FieldModelSettings, finite_difference
 from pdeloop.method.models.base import errors, samples_of
 from pdeloop.method.models.finite_difference import fit_neighbours
-from pdeloop.method.models.selection import NEAR_NEEDED, kinds_of
+from pdeloop.method.models.selection import NEAR_NEEDED
 from tests.support.fitted import fit_field_model
 from tests.support.ordinary import rolled_out
 
@@ -129,10 +129,6 @@ def test_cells_of_their_own_and_pairs_of_components_are_described(
     )
     assert len(model.table) == terms
     assert errors(model, rollouts[3:], np.zeros(n_z), 2.0)[0] < 1e-8
-
-
-def test_pairs_of_components_need_not_be_declared():
-    assert "two-near-shared" in {kind.name for kind in kinds_of(2 * N_X, SETTINGS)}
 
 
 def test_they_are_not_tried_where_another_kind_predicts_the_rollouts():

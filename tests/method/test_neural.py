@@ -190,17 +190,6 @@ def test_a_trained_network_costs_less_on_other_fields_and_is_the_law_of_its_thet
     np.testing.assert_allclose(actions_of(own, theta), expected, atol=1e-10)
 
 
-def test_a_network_sees_the_declared_noise_and_plans_that_it_imitates_do_not() -> None:
-    made, network, fields = training(ANY_ACTION, Neural(ROWS, T), noise=0.1)
-    numbers, none = network.first(RNG), np.zeros((len(fields), N_A))
-    seen = fields + 0.1 * np.random.default_rng(0).standard_normal(fields.shape)
-    expected = network.forward(network.parts(numbers), seen, 0)[0]
-    assert np.array_equal(made.acts(numbers)(fields, none, 0), expected)
-    z, steps, labels = made._labelled(None)
-    first = z[steps == 0]
-    assert np.array_equal(labels[steps == 0], made._planner.step(none, first, 0)[0])
-
-
 def optimizer() -> ModelBasedNeural:
     """Of a plant that is the spectral model, judged by rollouts of it."""
     made = planned(kind=Neural, constants=NeuralSettings(neurons=H, iterations=10))

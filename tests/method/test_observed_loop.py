@@ -64,14 +64,6 @@ def some(loop: LinearLoop) -> np.ndarray:
     return loop.theta(law.theta_start + 0.1 * RNG.standard_normal(law.size))
 
 
-def test_theta_is_the_laws_vector_in_another_order() -> None:
-    loop = loop_of()
-    vector = RNG.standard_normal(loop.law.size)
-    assert np.array_equal(loop.policy(loop.theta(vector), vector), vector)
-    assert not loop.theta(np.zeros_like(vector)).any()
-    assert loop.no_control.shape == loop.theta(vector).shape
-
-
 def test_it_is_the_law_that_answers_with_its_memory_and_saturation() -> None:
     loop = loop_of(noise=0.0)
     theta = some(loop)
@@ -98,16 +90,6 @@ def test_the_gradient_agrees_with_differences(limit: float, any_cost: bool) -> N
         step = 1e-6 * direction
         up, down = (WEIGHTS @ loop.costs(theta + s, FIELDS) for s in (step, -step))
         assert np.sum(gradient * direction) == pytest.approx((up - down) / 2e-6, rel=1e-4)
-
-
-def test_without_a_filter_it_is_the_loop_of_the_affine_law() -> None:
-    rows = ModelRows(ROWS.A, ROWS.B, U, K_a, K_b, ROWS.s_r)
-    loop = loop_of(rows, noise=0.0, action_set=ActionSet(limit=0.0))
-    affine = ClosedLoop(U, COST, model=PLANT)
-    np.testing.assert_allclose(
-        loop.costs(loop.theta(loop.law.theta_start), FIELDS),
-        affine.costs(affine.theta(rows.policy), FIELDS),
-    )
 
 
 def test_where_few_numbers_are_seen_memory_wins_over_the_best_static_law() -> None:

@@ -13,7 +13,6 @@ from scipy.optimize import LinearConstraint, minimize
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
-from pdeloop.method.design.lqt import regulator
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.finite_difference import Feature, FiniteDifferenceModel, of_features
@@ -61,17 +60,17 @@ def planner(model: FieldModel, cost: Cost | None = None, **changed: object) -> P
     return Planner(model, **{**given, **changed})  # type: ignore[arg-type]
 
 
-def general_cost() -> Cost:
+def general_cost(horizon: int = T) -> Cost:
     """Matrices, outputs, a target over time and one of the actions, and a terminal weight."""
     rng = np.random.default_rng(3)
     C, root = rng.standard_normal((5, N_Z)), rng.standard_normal((2, 2))
     return Cost(
         N_Z,
         N_A,
-        T,
+        horizon,
         state_weight=np.arange(1.0, 6.0),
         action_weight=root @ root.T + np.eye(2),
-        target=rng.standard_normal((T, 5)),
+        target=rng.standard_normal((horizon, 5)),
         output=C,
         action_target=[0.2, -0.1],
         terminal_weight=2.0,
@@ -138,43 +137,6 @@ def test_plans_deviate_from_a_law_with_an_offset_for_each_step(around: bool) -> 
     d = rng.standard_normal(plan.shape)
     rise = own.costs(plan + 1e-5 * d, z, k) - own.costs(plan - 1e-5 * d, z, k)
     np.testing.assert_allclose((found * d).sum(axis=(1, 2)), rise / 2e-5, rtol=1e-5)
-
-
-def test_around_the_law_of_the_whole_state_the_affine_one_is_a_plan_like_others() -> None:
-    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
-    own = planner(spectral(), cost, regulated=True, first=0, starts=1)
-    affine = replace(own, regulated=False)
-    z = np.random.default_rng(8).standard_normal((2, N_Z))
-    none = np.zeros((2, 12, N_A))
-    plan = own._affine_plan(z, 0, 12)
-    assert plan.any() and not affine._affine_plan(z, 0, 12).any()
-    np.testing.assert_allclose(own.costs(plan, z, 0), affine.costs(none, z, 0), rtol=1e-9)
-    about = regulator(own.model, cost)
-    assert about is not None
-    a, found = own.step(none, z, 0)
-    np.testing.assert_allclose(a, z @ about.K.T + about.b, rtol=1e-6)
-    assert not found.any()
-    without = replace(own, terminal=False)
-    assert without.regulator is None
-    assert np.array_equal(
-        without.costs(none, z, 0), replace(affine, terminal=False).costs(none, z, 0)
-    )
-
-
-def test_bounded_actions_are_optimal_as_in_quadratic_programming() -> None:
-    """The Karush-Kuhn-Tucker conditions: no slope but outwards at a bound."""
-    actions = ActionSet(N_A, [-0.05, -np.inf], [0.02, 0.03])
-    own = planner(linear(radius=0.9), action_set=actions, around=False)
-    z = np.random.default_rng(6).standard_normal((1, N_Z))
-    v, _ = own.improved(np.zeros((1, 12, N_A)), z, 0, 300)
-    _, on_v, v = own.gradient(v, z, 0)
-    free = replace(own, action_set=ActionSet(N_A))
-    _, g, _ = free.gradient(v, z, 0)
-    low, high = v <= actions.low + 1e-9, v >= actions.high - 1e-9
-    assert low.any() and high.any() and not (low | high).all()
-    small = 1e-2 * np.abs(g).max()
-    assert np.abs(on_v).max() < small and np.abs(g[~(low | high)]).max() < small
-    assert g[low].min() > -small and g[high].max() < small
 
 
 RATED = ActionSet(N_A, [-0.4, -np.inf], [0.5, 0.6], rate=[0.3, 0.8])
@@ -257,18 +219,3 @@ def test_a_target_over_time_is_foreseen() -> None:
         a, plan = own.step(plan, z, k)
         plan, z, acted[k] = own.shifted(plan), model.step(z, a), a[0, 0]
     assert acted[T // 2 - 1] > 0.05 > abs(acted[0])
-
-
-def test_plans_side_by_side_are_those_of_each() -> None:
-    own = planner(spectral())
-    z = np.random.default_rng(8).standard_normal((3, N_Z))
-
-    def rolled(z: Array) -> Array:
-        plan, found = np.zeros((len(z), 12, N_A)), []
-        for k in range(3):
-            a, plan = own.step(plan, z, k)
-            plan, z = own.shifted(plan), own.model.step(z, a)
-            found.append(a)
-        return np.stack(found, axis=1)
-
-    np.testing.assert_allclose(rolled(z)[1:2], rolled(z[1:2]), rtol=1e-9)

@@ -15,14 +15,10 @@ from pdeloop.method.adapt.belief import believe
 from pdeloop.method.adapt.closed_loop import ReplayedLoop
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based_sensed import ModelBasedReadings
-from pdeloop.method.adapt.replay import best_measured, step
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,
-    ZERO,
-    Estimate,
     Replays,
-    evidence_of,
     evidence_of_rollouts,
     mean_of,
 )
@@ -151,20 +147,6 @@ def test_the_gradient_agrees_with_differences(moving: bool) -> None:
         assert np.sum(gradient * direction) == pytest.approx((up - down) / 2e-6, rel=1e-4)
 
 
-def test_of_replays_measured_costs_alone_decide() -> None:
-    """The model gives a rollout's own cost, whatever it says of other laws."""
-    loop, _, theta = loop_and_rollout()
-    first = first_law().theta_start
-    records = [rolled(20 + i, first_law(), law) for i in range(3) for law in (first, theta)]
-    fields = loop.beginnings(records)
-    laws, on_model = {FIRST: first, ADAPTED: theta}, Estimate(-1e3)
-    assert evidence_of(loop, laws, FIRST, records, fields, on_model) is None
-    found = evidence_of_rollouts(laws, FIRST, records)
-    own, before = (np.array([r.cost for r in records[i::2]]) for i in (1, 0))
-    assert found[ADAPTED].change == mean_of(own) - mean_of(before)
-    assert found[FIRST].change == ZERO
-
-
 def test_an_exact_model_tells_laws_apart_in_the_same_rollouts() -> None:
     """One that is wrong by as much as costs vary does not: measured costs decide."""
     loop, _, theta = loop_and_rollout()
@@ -213,26 +195,3 @@ def test_model_based_improves_a_law_of_few_readings_and_goes_on_with_the_same_bi
         for theta in (start, optimizer.policy)
     )
     assert after < 0.95 * before
-
-
-def test_a_step_begins_with_the_law_that_measured_best_and_is_held_to_it() -> None:
-    first, other = np.zeros(2), np.ones(2)
-
-    def cost(policy: np.ndarray, *costs: float) -> list[Record]:
-        return [Record(policy, c, np.zeros((2, 1)), np.zeros((1, 1))) for c in costs]
-
-    assert best_measured([], first) is first
-    # One rollout says too little, and one that diverged too much.
-    assert best_measured(cost(other, 1.0), first) is first
-    known = [*cost(first, 3.0, 3.0), *cost(other, 1.0, np.inf)]
-    assert best_measured(known, first) is first
-    assert best_measured([*cost(first, 3.0, 3.0), *cost(other, 4.0, 1.0)], first) is other
-    loop, record, theta = loop_and_rollout()
-    begun = loop.theta(theta)
-    lengths = []
-    for trust in (0.0, 1.0, 100.0):
-        fields = loop.beginnings([record, *explored()])
-        found = step(loop, fields, theta, ModelBasedSettings(iterations=30), trust)
-        assert found is not None
-        lengths.append(np.linalg.norm(loop.theta(found[0]) - begun))
-    assert lengths[0] > lengths[1] > lengths[2] > 0.0

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from pdeloop.method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED, fit_sensed, initial_field
+from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED, fit_sensed
 from pdeloop.method.models.spectral import SpectralModel
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
 
@@ -180,17 +179,6 @@ def test_noise_does_not_make_short_waves_grow() -> None:
     assert growth[-2] <= growth[0]
 
 
-def test_actuators_have_the_declared_width_unless_readings_say_otherwise() -> None:
-    n, shared = grid_points(SENSORS), np.zeros(unknowns(3))
-    centres, unequal = equally_spaced(3).centres, np.array([0.1, 0.2, 0.05])
-    for actuators, widths in (
-        (Actuators(centres, unequal), unequal),
-        (equally_spaced(3), 0.5 / 3),
-    ):
-        supports = SensedEquation(shared, n, actuators).supports
-        np.testing.assert_allclose(supports.mean(axis=0), widths)
-
-
 def _drawn(
     terms: dict[tuple[int, int], float],
     count: int,
@@ -270,25 +258,3 @@ def test_terms_beyond_the_first_ones_are_found_where_these_do_not_suffice() -> N
     assert found.error < 1e-5
     for term, value in equation.items():
         assert found.shared[TERMS.index(term)] == pytest.approx(value, rel=0.1)
-
-
-def test_the_initial_field_of_a_rollout_is_what_its_readings_came_from() -> None:
-    """It moves past the sensors, by three of their distances."""
-    readings, actions, fields = _drawn({(1, 0): 1.0, (1, 1): 80.0, (3, 0): -1.0}, 1, 0.0, [5.0] * 3)
-    shared = np.zeros(unknowns(3))
-    shared[[TERMS.index((1, 0)), TERMS.index((1, 1)), TERMS.index((3, 0))]] = 1.0, 80.0, -1.0
-    shared[COEFFICIENTS] = 5.0
-    model = sensed_model(shared, SENSORS, DECLARED, 4.0)
-    field, error = initial_field(model, readings[0], actions[0], np.zeros(SENSORS), np.nan)
-    assert error < 1e-6
-    assert np.linalg.norm(field - fields[0]) < 0.01 * np.linalg.norm(fields[0])
-
-
-def test_readings_may_be_taken_for_exact() -> None:
-    readings, actions, _ = _drawn(REACTION, 4, 0.0, [10.0] * 3)
-    with threadpool_limits(1):
-        found = fit_sensed(
-            readings, actions, DECLARED, settings=replace(DEFAULTS, sensed_unresolved=0.0)
-        )
-    assert found.error < 1e-7
-    np.testing.assert_allclose(found.shared[COEFFICIENTS], 10.0, rtol=1e-3)

@@ -20,11 +20,9 @@ from pdeloop.method.models.sensed import (
     SensedModel,
     sensed_model,
     unknowns,
-    well_posed,
 )
 from pdeloop.method.models.sensed_fit import Fitted, fit_sensed
 from tests.support.sensed import DECLARED, SENSORS, readings_of
-from tests.support.small import same_bits
 
 VARYING = {
     (1, 0, 2, True): 3.0,
@@ -110,30 +108,6 @@ def test_a_size_that_is_none_leaves_steps_that_can_be_made(largest: float) -> No
     assert np.isfinite(model.step(*(0.1 * rows for rows in _batch(model)))).all()
     with pytest.raises(ValueError, match="at least 1 internal step"):
         replace(model, substeps=0, fewer=np.empty((0, 2))).step(*_batch(model))
-
-
-def test_large_fields_and_short_waves_are_damped_at_every_x() -> None:
-    shared = _unknowns({(1, 2, 1, True): 9.0, (1, 2, 2, True): 9.0, (3, 0, 1, False): -0.5})
-    found = well_posed(shared)
-    of_D = [len(TERMS) + i for i, own in enumerate(VARIATIONS) if own[:2] == (1, 2)]
-    assert np.abs(found[of_D]).sum() == pytest.approx(12.0)
-    others = np.delete(np.arange(len(shared)), of_D)
-    assert same_bits(found[others], shared[others])
-    shared[TERMS.index((1, 2))] = 0.0
-    assert 0.0 < np.abs(well_posed(shared)[of_D]).sum() < 1e-4
-
-
-def test_the_bound_does_not_depend_on_where_x_begins() -> None:
-    """D = D_0 (1 + 0.9 cos(2 pi x - pi / 4)) is positive everywhere."""
-    size = 12.0 * 0.9 / np.sqrt(2.0)
-    shared = _unknowns({(1, 2, 1, False): size, (1, 2, 1, True): size})
-    assert same_bits(well_posed(shared), shared)
-
-
-def test_a_power_that_damps_more_leaves_the_third_free() -> None:
-    shared = _unknowns({(3, 0, 1, False): 0.5})
-    shared[[TERMS.index((3, 0)), TERMS.index((7, 0))]] = 1.0, -1.0
-    assert same_bits(well_posed(shared), shared)
 
 
 def _fitted(varying: dict[tuple[int, int, int, bool], float], count: int, sigma: float) -> Fitted:

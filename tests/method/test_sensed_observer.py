@@ -6,10 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from pdeloop.method.adapt import Context, Record, Trajectory
-from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.sensed_loop import SensedLoop, sensed_loop
 from pdeloop.method.laws import Observer
-from pdeloop.method.models.base import model_of
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     TERMS,
@@ -61,16 +59,6 @@ def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
     explored = Trajectory(np.zeros((T + 1, SENSORS)), none)
     context = Context(U, target, 1.0, 0.1, T, explored, sensors=SENSORS, law=Observer(rows, T))
     return sensed_loop(context, model)
-
-
-def test_the_model_survives_a_checkpoint() -> None:
-    model = model_with(CUBIC, 0.3)
-    again = Belief.of(Belief(model, 0.01).state())
-    assert again is not None and isinstance(again.model, SensedModel)
-    z, a = field(model, 1)[None], np.ones((1, N_A))
-    assert same_bits(again.model.step(z, a), model.step(z, a))
-    assert same_bits(again.model.shared, CUBIC) and again.model.noise == 0.3
-    assert isinstance(model_of(model.arrays()), SensedModel)
 
 
 def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> None:

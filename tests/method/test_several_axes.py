@@ -13,7 +13,7 @@ from pdeloop.method.models.finite_difference import (
     features_of,
     of_features,
 )
-from pdeloop.method.models.linear import ProjectedModel, coarse_points
+from pdeloop.method.models.linear import ProjectedModel
 from tests.support.fitted import fit_field_model
 
 NY, NX, N_A = 6, 8, 2
@@ -74,11 +74,3 @@ def test_a_reacting_plate_between_walls_is_predicted(
     assert isinstance(found.model, ProjectedModel) == (points < ny * nx)
     errors = dict(found.candidates)
     assert min(errors[kind] for kind in errors if not kind.startswith("x")) > believed
-
-
-def test_a_coarse_grid_has_equally_spaced_points() -> None:
-    points, few = coarse_points((24, 32), 256)
-    assert few == (12, 16)
-    rows, columns = np.unravel_index(points, (24, 32))
-    assert set(np.diff(np.unique(rows))) == {2} == set(np.diff(np.unique(columns)))
-    assert coarse_points((4, 4), 16)[1] == (4, 4)

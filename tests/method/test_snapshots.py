@@ -18,9 +18,9 @@ from pdeloop.method.adapt.trajectories import (
     LARGE,
     LowRankTrajectory,
     SnapshotBasis,
-    factored,
     kept,
 )
+from pdeloop.method.models.base import FieldModelSettings
 from tests.support.small import same_bits
 
 N_Z, RANK, N_A, N_S, T = LARGE + 52, 9, 2, 4, 12
@@ -69,6 +69,7 @@ CONTEXT = Context(
     further=[explored(1)],
     line=False,
     periodic=False,
+    field_models=FieldModelSettings(folds=2, largest_degree=2),
 )
 
 
@@ -79,14 +80,6 @@ def made(context: Context) -> ModelBased:
 
 def optimizer() -> InCoordinates:
     return InCoordinates(made, CONTEXT)
-
-
-def test_factors_make_the_states_again() -> None:
-    states = states_of(14)
-    coordinates, modes = factored(states)
-    assert modes.shape == (RANK, N_Z)
-    np.testing.assert_allclose(coordinates @ modes, states, atol=1e-12)
-    np.testing.assert_allclose(modes @ modes.T, np.eye(RANK), atol=1e-13)
 
 
 def test_a_basis_grows_by_what_it_lacks_and_not_by_noise() -> None:
@@ -101,12 +94,6 @@ def test_a_basis_grows_by_what_it_lacks_and_not_by_noise() -> None:
     x = basis.coordinates(states)
     np.testing.assert_allclose(x[:, : len(basis.rows)] @ basis.rows, states, atol=1e-9)
     assert x.shape == (3, CAPACITY) and not x[:, len(basis.rows) :].any()
-
-
-def test_a_basis_has_no_more_rows_than_its_capacity() -> None:
-    basis = SnapshotBasis(np.eye(CAPACITY - 2, N_Z))
-    basis.extend(RNG.standard_normal((7, N_Z)))
-    assert basis.rows.shape == (CAPACITY, N_Z)
 
 
 @pytest.mark.parametrize(

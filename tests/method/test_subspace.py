@@ -17,7 +17,7 @@ from pdeloop.method.design.lqt import DesignError, track_outputs
 from pdeloop.method.laws import Observer
 from pdeloop.method.reduce.channels import Channels
 from pdeloop.method.reduce.identifiability import NotIdentifiableError
-from pdeloop.method.reduce.subspace import InnovationModel, driven, subspace_model
+from pdeloop.method.reduce.subspace import InnovationModel, subspace_model
 
 N, N_A, N_Y = 4, 2, 3
 RNG = np.random.default_rng(2)
@@ -188,15 +188,3 @@ def test_a_stable_machine_at_ambient_temperature_is_stable() -> None:
     # At rest, with the heaters off, it predicts the ambient temperature.
     rest = model.U @ model.C @ np.linalg.solve(np.eye(len(A)) - model.A, model.d)
     np.testing.assert_allclose(rest, [20.0, 21.0, 22.0], atol=0.2)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 8, 50])
-def test_steps_in_blocks_are_those_one_after_the_other(count: int) -> None:
-    rng = np.random.default_rng(count)
-    w, x_0 = rng.standard_normal((count, N)), rng.standard_normal((N, 3))
-    x, found = x_0.copy(), driven(A, w, x_0)
-    assert found.shape == (count + 1, N, 3)
-    for k in range(count + 1):
-        np.testing.assert_allclose(found[k], x, rtol=1e-12, atol=1e-12)
-        x = A @ x
-        x[:, -1] += w[k] if k < count else 0.0

@@ -10,7 +10,6 @@ import pytest
 from scipy import linalg
 
 from pdeloop.messages.cost import Cost
-from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.design.lqt import regulator, track, track_horizon
 from pdeloop.method.models.linear import LinearModel
 from pdeloop.method.reduce.reduced_model import ReducedModel
@@ -77,27 +76,3 @@ def test_far_from_its_end_a_long_horizon_has_the_stationary_law() -> None:
     assert about is not None
     np.testing.assert_allclose(about.K, K[0], atol=1e-9)
     np.testing.assert_allclose(about.b, b[0], atol=1e-9)
-
-
-def test_a_diagonal_of_equal_numbers_designs_the_law_of_the_number() -> None:
-    target = RNG.standard_normal(N)
-    model = ReducedModel(A=A, B=B, U=np.eye(N))
-    weights = {"state_weight": 2.0, "action_weight": 0.3}
-    number = track(model, **weights)
-    cost = Cost(N, N_A, T, state_weight=np.full(N, 2.0), action_weight=0.3, target=target)
-    diagonal = track(model, **weights, cost=cost)
-    np.testing.assert_allclose(diagonal.K_a, number.K_a, atol=1e-10)
-    np.testing.assert_allclose(diagonal.K_b @ target, number.K_b @ target, atol=1e-10)
-
-
-def test_the_gradient_of_a_closed_loop_is_that_of_its_cost() -> None:
-    cost = Cost(N, N_A, T, **WHOLE)
-    model = LinearModel("linear", 0.5 * A, B, DRIFT)
-    loop = ClosedLoop(np.eye(N), cost, model=model)
-    theta, fields = RNG.standard_normal((N_A, N + 1)) / 4, RNG.standard_normal((3, N))
-    weights, step = np.full(3, 1 / 3), 1e-6
-    value, gradient = loop.gradient(theta, fields, weights)
-    assert value == pytest.approx(loop.costs(theta, fields).mean())
-    change = RNG.standard_normal(theta.shape)
-    plus, minus = (loop.costs(theta + s * change, fields).mean() for s in (step, -step))
-    assert np.sum(gradient * change) == pytest.approx((plus - minus) / (2 * step), rel=1e-6)

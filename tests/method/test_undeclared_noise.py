@@ -10,6 +10,7 @@ import pytest
 
 import pdeloop
 from controller_node.identification import Designed, DesignSettings, designed
+from pdeloop.field_report import summary, text
 from pdeloop.messages.model_rows import pack
 from pdeloop.method.models import Measured
 from pdeloop.method.models import selection as of_models
