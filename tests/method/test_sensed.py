@@ -168,7 +168,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
 def test_noise_does_not_make_short_waves_grow() -> None:
     """The readings are noise: a fit may only take it for fields of a well-posed equation."""
     rng = np.random.default_rng(1)
-    readings, actions = rng.standard_normal((1, 12, 4)), rng.standard_normal((1, 12, 2))
+    readings, actions = rng.standard_normal((1, 8, 4)), rng.standard_normal((1, 8, 2))
     with threadpool_limits(1):
         found = fit_sensed(list(readings), list(actions), equally_spaced(2), 0.5)
     assert found.error > SENSED_REPRODUCED and np.isfinite(found.fields).all()

@@ -29,7 +29,7 @@ def test_each_actuator_may_be_as_strong_as_it_is() -> None:
     shared[SHARED:] = 0.0, -10.0, -5.0
     model = sensed_model(shared, SENSORS, actuators, 4.0)
     x = np.arange(model.n_z) / model.n_z
-    actions = 5.0 * rng.standard_normal((2, 20, 3))
+    actions = 5.0 * rng.standard_normal((2, 14, 3))
     fields = [np.cos(2 * np.pi * x), 0.5 + np.sin(4 * np.pi * x)]
     readings = [readings_of(model, *pair) for pair in zip(actions, fields, strict=True)]
     with threadpool_limits(1):

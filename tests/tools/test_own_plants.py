@@ -25,7 +25,7 @@ from pdeloop.messages.own_code import OwnCodeError
 from pdeloop.messages.problem import load_parameters, read_problem
 from pdeloop.method.models import selection as kinds
 from tests.support.interpreter import ROOT, python
-from tests.support.small import FEW_STEPS, same_bits
+from tests.support.small import FEW_FITS, FEW_STEPS, same_bits
 
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
@@ -443,7 +443,8 @@ def test_no_model_of_a_field_on_one_axis_is_fitted_to_a_plate(
     for name in ("fit_spectral", "fit_finite_difference"):
         monkeypatch.setattr(kinds, name, lambda *_, **__: pytest.fail("was fitted"))
     settings = {"optimizer": "model_based", "horizon": 30}
-    settings |= {"physical.nx": 6, "physical.ny": 4}
+    settings |= {"physical.nx": 6, "physical.ny": 4, **FEW_FITS}
+    settings["field_model_settings.largest_degree"] = 3
     run = pdeloop.train(plant=PLATE, rollouts=12, evaluation_fields=2, **settings)
     assert run.costs["adapted"].mean() < run.costs["lqt"].mean()
 

@@ -72,13 +72,13 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
     # Stopped for longer than the action timeout, the void limit and the DDS lease of 4 s.
     running = start_pair(loop, max_repeats=20)
     out = tmp_path / "run"
-    running["tuner"] = start_tuner(loop, out, iterations=100)
-    until(lambda: adapted(out) >= 20, LIMIT, "iteration 20")
+    running["tuner"] = start_tuner(loop, out, iterations=60)
+    until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
     running[victim].send_signal(signal.SIGSTOP)
     time.sleep(5.0)
     running[victim].send_signal(signal.SIGCONT)
     loop.wait(running["tuner"], LIMIT)
-    assert_same_training(out, in_process(iterations=100))
+    assert_same_training(out, in_process(iterations=60))
 
 
 @pytest.mark.parametrize("ends", [False, True])

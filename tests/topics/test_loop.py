@@ -81,16 +81,16 @@ def test_one_tuner_is_served_by_several_pairs_with_the_same_result(loop: Process
 
 
 def test_nodes_restarted_between_and_within_episodes_change_nothing(loop: Processes, tmp_path):
-    iterations = 150
+    iterations = 90
     running = {name: loop.node(name, *PARAMETERS) for name in ("pde_sim_node", "controller_node")}
     out = tmp_path / "run"
     tuner = start_tuner(loop, out, iterations=iterations)
-    for count, name in ((15, "controller_node"), (45, "pde_sim_node"), (75, "controller_node")):
+    for count, name in ((6, "controller_node"), (18, "pde_sim_node"), (30, "controller_node")):
         until(lambda n=count: adapted(out) >= n, LIMIT, f"iteration {count}")
         running[name].send_signal(signal.SIGKILL)
         running[name].wait()
         running[name] = loop.node(name, *PARAMETERS)
-    until(lambda: adapted(out) >= 105, LIMIT, "iteration 105")
+    until(lambda: adapted(out) >= 42, LIMIT, "iteration 42")
     tuner.send_signal(signal.SIGKILL)
     tuner.wait()
     loop.wait(start_tuner(loop, out, iterations=iterations, resume="true"), LIMIT)

@@ -47,7 +47,7 @@ def test_a_controller_that_is_killed_under_a_law_with_memory_changes_nothing(
     loop: Processes, tmp_path: Path, given: dict[str, Any]
 ) -> None:
     out, problem = tmp_path / "run", tmp_path / "small.yaml"
-    lines, flags = SMALL.read_text(), ["--iterations", "60", "--record", "--out", str(out)]
+    lines, flags = SMALL.read_text(), ["--iterations", "30", "--record", "--out", str(out)]
     for name, value in given.items():
         if name == "action_bounds":
             lines += f"    {name}: {value}\n"
@@ -55,11 +55,11 @@ def test_a_controller_that_is_killed_under_a_law_with_memory_changes_nothing(
             flags += [f"--{name}", value]
     problem.write_text(lines)
     run = loop.pdeloop("train", str(problem), *flags)
-    until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
+    until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
     (pid,) = loop.pids("controller_node")
     os.kill(pid, signal.SIGKILL)
     told = loop.wait(run, LIMIT)
     assert "controller_node was killed by SIGKILL; starting it again" in told
-    assert_same_training(out, train_here(parameters(**given, iterations=60)))
+    assert_same_training(out, train_here(parameters(**given, iterations=30)))
     verified = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT)
     assert "no difference, to the bit" in verified

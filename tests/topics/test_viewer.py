@@ -25,7 +25,7 @@ from tests.support.small_loop import (
 from tests.viewer.test_layouts import named_topics
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 300
+ITERATIONS = 120
 
 WATCH = """
 import json, sys, time
