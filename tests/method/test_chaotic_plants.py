@@ -8,12 +8,9 @@ import pytest
 
 from pdeloop.method.adapt import model_based
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.models.linear import LinearModel
 from tests.method.test_model_based import N_Z, Plant, finished, make, measured
 from tests.support.small import same_bits
-
-SETTINGS = ModelBasedSettings()
 
 
 def in_pieces(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,6 @@ from pdeloop.method.adapt import (
     RolloutResult,
     Trajectory,
     renewal,
-    replay,
 )
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
@@ -213,20 +212,6 @@ def test_steps_are_compared_on_the_fields_of_the_first_law_and_with_no_control()
     none = [r.field_seed for r in asked if not r.policy.any()]
     assert own == known[: len(own)] and len(own) == 3 and none == known[:2]
     assert all(rollout.policy.any() for rollout in after)
-
-
-def test_a_law_that_no_step_changes_is_not_rolled_out_on_the_same_fields_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Without noise that would be the same rollout; fresh fields tell more of the plant."""
-    monkeypatch.setattr(replay, "step", lambda *_: None)
-    plant = Plant(chaotic)
-    optimizer = make(plant, rollouts=12)
-    known: list[tuple[bytes, int]] = []
-    while not optimizer.done:
-        known += [(asked.policy.tobytes(), asked.field_seed) for asked in optimizer.ask()]
-        optimizer.tell(measured(plant, optimizer))
-    assert len(set(known)) == len(known) == 12
 
 
 def test_where_no_law_stays_finite_on_the_model_steps_follow_measured_rollouts(

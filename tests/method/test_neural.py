@@ -17,13 +17,11 @@ from pdeloop.law_form import law_form
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
-from pdeloop.method.adapt.base import RolloutResult, Trajectory
 from pdeloop.method.adapt.network import ModelBasedNeural, Network, NetworkTraining
 from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner, simulated
-from pdeloop.method.laws.registry import action
 from pdeloop.model_files import matlab, onnx
 from tests.method.test_plans import N_A, N_Z, T, spectral
 from tests.method.test_predictive import (
@@ -31,7 +29,7 @@ from tests.method.test_predictive import (
     STATES,
     U,
     actions_of,
-    spectral_step,
+    measured,
     start,
 )
 from tests.method.test_predictive import (
@@ -200,23 +198,8 @@ def optimizer() -> ModelBasedNeural:
 @pytest.mark.usefixtures("small_samples")
 def test_an_optimiser_continues_from_its_state_to_the_bit() -> None:
     own, law, rows = optimizer(), Neural(ROWS, T), []
-    cost = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3)
     while not own.done:
-        results = []
-        for rollout in own.ask():
-            z, parts, total = (
-                start(rollout.field_seed),
-                law.parts(rollout.policy.ravel()),
-                np.zeros(1),
-            )
-            states, actions = [z], []
-            for k in range(T):
-                actions.append(action(law, parts, z, np.zeros(0), k))
-                cost.add(total, z[None], actions[-1][None], k)
-                z = spectral_step(z, actions[-1])
-                states.append(z)
-            known = Trajectory(np.array(states), np.array(actions))
-            results.append(RolloutResult(total[0] / T, False, known))
+        results = [measured(law, rollout) for rollout in own.ask()]
         rows.append(own.tell(results))
         other = optimizer()
         other.restore(own.state())

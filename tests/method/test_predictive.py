@@ -280,8 +280,7 @@ def spectral_step(z: np.ndarray, a: np.ndarray) -> np.ndarray:
     return PLANT.step(z[None], a[None])[0]
 
 
-def measured(own: ModelBasedPredictive, rollout: Rollout) -> RolloutResult:
-    law = own._law
+def measured(law: Law, rollout: Rollout) -> RolloutResult:
     parts, memory = law.parts(rollout.policy.ravel()), law.memory_start()
     cost, z = Cost(N_Z, N_A, T, action_weight=0.5, target=0.3), start(rollout.field_seed)
     states, actions, total = [z], [], np.zeros(1)
@@ -313,7 +312,7 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
             assert all(
                 np.array_equal(a.policy, b.policy) for a, b in zip(asked, other.ask(), strict=True)
             )
-        results = [measured(own, rollout) for rollout in asked]
+        results = [measured(own._law, rollout) for rollout in asked]
         rows.append(own.tell(results))
         other = optimizer(rollouts, kind)
         other.restore(own.state())

@@ -10,15 +10,11 @@ from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     SHARED,
     TERMS,
-    SensedEquation,
-    grid_points,
     sensed_model,
     unknowns,
 )
 from pdeloop.method.models.sensed_fit import fit_sensed
 from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
-
-Array = np.ndarray
 
 
 def test_each_actuator_may_be_as_strong_as_it_is() -> None:
@@ -55,25 +51,3 @@ def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_i
         found = fit_sensed(readings, list(actions), DECLARED)
     assert found.error < 1e-4
     np.testing.assert_allclose(found.fields[2:], fields, atol=0.02)
-
-
-def test_a_front_that_runs_past_several_points_in_a_sampling_time_is_followed() -> None:
-    """Burgers' equation, of which one internal step would be beyond the stability limit."""
-    shared = np.zeros(unknowns(1))
-    shared[[TERMS.index((1, 2)), TERMS.index((2, 1))]] = 40.0, -125.0
-    n, actuators = grid_points(16), equally_spaced(1)
-    equation, x = SensedEquation(shared, n, actuators), np.arange(n) / n
-    field, largest = 1.0 / np.cosh((x[None] - 0.5) / 0.08), np.ones(1)
-    (substeps,) = equation.substeps(largest)
-    assert 1 < substeps < 64 and equation.substeps(0.01 * largest) == 1
-
-    def after(substeps: int) -> Array:
-        step = equation.compiled(substeps, equation.supports)
-        z = step.spectra(field)
-        for _ in range(10):
-            step.advance(z, np.zeros((1, 2)))
-        return step.states(z)
-
-    exact, found = after(64), after(int(substeps))
-    assert np.abs(np.diff(exact)).max() > 0.1  # a front
-    np.testing.assert_allclose(found, exact, atol=1e-2)

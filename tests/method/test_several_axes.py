@@ -8,33 +8,12 @@ import pytest
 
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.models import Measured, linear
-from pdeloop.method.models.finite_difference import (
-    Feature,
-    features_of,
-    of_features,
-)
 from pdeloop.method.models.linear import ProjectedModel
 from tests.support.fitted import fit_field_model
 
 NY, NX, N_A = 6, 8, 2
 SHAPE, N_Z = (NY, NX), NY * NX
 RNG = np.random.default_rng(0)
-
-
-@pytest.mark.parametrize("order", range(5))
-def test_a_difference_is_along_one_axis_of_a_ring(order: int) -> None:
-    """Of a small step the change is the sampling time times the rate."""
-    features = features_of(1, axes=2)
-    C = np.zeros((len(features), 1, N_Z))
-    size = 1e-6
-    C[features.index(Feature((0,), order))] = size
-    own = of_features("x-shared", features, C, np.zeros((N_Z, N_A)), np.zeros(N_Z), 1, SHAPE)
-    z = RNG.standard_normal(SHAPE)
-    after = own.step(z.reshape(1, -1), np.zeros((1, N_A))).reshape(SHAPE)
-    axis = 1 if order in (1, 2) else 0
-    up, down = np.roll(z, -1, axis), np.roll(z, 1, axis)
-    expected = z if order == 0 else 0.5 * (up - down) if order % 2 else up - 2.0 * z + down
-    np.testing.assert_allclose((after - z) / size, expected, atol=1e-4)
 
 
 def plate(ny: int, nx: int, count: int) -> list[Measured]:
