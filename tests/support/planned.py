@@ -22,7 +22,7 @@ PLANNED: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "auto": {**SHARED, "horizon": 40, "rollouts": 15, "law_settings": FEW_STARTS},
         "neural": {
             **{**SHARED, "horizon": 25, "rollouts": 12, "seed": 1},
-            "law_settings": {"neurons": 8, "iterations": 80},
+            "law_settings": {"neurons": 8, "iterations": 40},
         },
     }
 )
