@@ -6,11 +6,13 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pde_sim_node.plants.kuramoto_sivashinsky_eight import KuramotoSivashinskyEight
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
     SHARED,
     TERMS,
     sensed_model,
+    unit,
     unknowns,
 )
 from pdeloop.method.models.sensed_fit import fit_sensed
@@ -51,3 +53,23 @@ def test_an_equation_that_the_calmest_rollouts_do_not_show_is_found_from_large_i
         found = fit_sensed(readings, list(actions), DECLARED)
     assert found.error < 1e-4
     np.testing.assert_allclose(found.fields[2:], fields, atol=0.02)
+
+
+def test_a_chaotic_equation_is_found_from_eight_noisy_sensors() -> None:
+    """Kuramoto-Sivashinsky, z_t = -z_xx / L^2 - z_xxxx / L^4 - z z_x / L in steps of 0.5."""
+    plant = KuramotoSivashinskyEight(sample_time=0.5, substeps=10, burn_in=100, first=1 / 16)
+    rng, seen = np.random.default_rng(1), plant.grid.measured(8)
+    z = np.stack([plant.initial_state(np.random.default_rng(100 + i)) for i in range(2)])
+    actions = np.clip(0.5 * rng.standard_normal((2, 60, 8)), -1.0, 1.0)
+    readings = np.empty((2, 60, 8))
+    for k in range(60):
+        readings[:, k] = z[:, seen] + 0.1 * rng.standard_normal((2, 8))
+        z = plant.step(z, actions[:, k])
+    with threadpool_limits(1):
+        found = fit_sensed(list(readings), list(actions), equally_spaced(8), 0.1)
+    length = plant.grid.axes[0].length
+    known = {(1, 2): -0.5 / length**2, (1, 4): -0.5 / length**4, (2, 1): -0.25 / length}
+    for i, term in enumerate(TERMS):
+        expected = known.get(term, 0.0) / unit(*term)
+        assert abs(found.shared[i] - expected) <= 0.05 * abs(expected), term
+    assert found.error < 1e-3

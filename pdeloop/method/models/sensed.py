@@ -80,6 +80,12 @@ SHARED = COEFFICIENTS + 4  # b, x_0, s and w
 _KEPT = 1e-6
 
 
+def unit(p: int, j: int) -> float:
+    """The coefficient of d^j(z^p)/dx^j whose unknown is 1."""
+    wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
+    return 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
+
+
 def unknowns(n_a: int) -> int:
     """Number of unknowns that all rollouts share."""
     return SHARED + n_a
@@ -262,9 +268,7 @@ class SensedEquation:
         """Of the powers 1, 2, ... of the field."""
         for i in used:
             p, j = TERMS[i]
-            wavenumber = _WAVENUMBER if j < 4 else _WAVENUMBER / 4
-            unit = 1.0 / (_TIME * wavenumber**j * _SIZE ** max(p - 3, 0))
-            self.symbols[p - 1] += unit * shared[i] * derivatives[j]
+            self.symbols[p - 1] += unit(p, j) * shared[i] * derivatives[j]
         of_x = shared[len(TERMS) : EQUATION]
         self.factors: Spectrum | None = None
         self.coefficients: Array | None = None

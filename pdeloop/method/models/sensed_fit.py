@@ -20,6 +20,8 @@ rollout alone, it is eliminated,
 Whole rollouts are fitted again with the S that the last fit implies (empirical Bayes), without terms
 whose loss of J is small. Derivatives are finite differences: all equations that share their terms are
 one batch of the compiled solver, as what an action does is linear in the supports and their strengths.
+Where no equation reproduces whole rollouts, one that drives long waves and damps short ones is fitted
+to pieces of them, as of a chaotic plant.
 
 References
 ----------
@@ -52,6 +54,7 @@ from pdeloop.method.models.sensed import (
     field_of,
     grid_points,
     interpolated,
+    unit,
     unknowns,
     well_posed,
 )
@@ -166,6 +169,10 @@ _LIBRARIES: tuple[tuple[tuple[int, ...], bool, float], ...] = (
 """Unknowns of the equations that are fitted one after the other; whether actuators differ in strength
 (few sensors tell little of it, and waves that they do not resolve would be taken for differences); and
 the error from which each is tried, beside what neither the grid nor chance explains."""
+_DRIVEN = TERMS.index((1, 2)), TERMS.index((1, 4))
+"""Second and fourth derivative."""
+_PIECES, _GROWTH = 4, 0.1
+"""Pieces of a rollout, and how much their strongest wave grows in a sampling time to begin with."""
 _BEGINNING, _SHORTEST, _LONGER = 0.05, 10, 1.5
 """Share of each rollout over which a fit begins, its least number of steps, and its growth."""
 _EARLY = 4
@@ -248,11 +255,8 @@ def fit_sensed(
     data = _Data(
         np.stack(readings), np.stack(actions), actuators, noise, target, distances, settings
     )
-    if start is not None:
-        own = np.flatnonzero(start[0][:EQUATION]).tolist()
-        fit = _Fit(data, own, bool(start[0][SHARED:].any()), *start).fitted()
-        if fit.error(data.steps) <= SENSED_REPRODUCED:
-            return fit.found
+    if start is not None and (fit := _continued(data, *start)).reproduces:
+        return fit.found
     first, best = _of_first_terms(data)
     for library, unequal, least in _LIBRARIES[1:]:
         error = best.error(data.steps)
@@ -263,7 +267,28 @@ def fit_sensed(
             fit = _Fit(data, library, unequal).fitted(first)
             if fit.error(data.steps) < most:
                 best = fit
-    return best.found
+    return (best if best.reproduces else _of_pieces(data)).found
+
+
+def _continued(data: _Data, shared: Array, spread: Array) -> _Fit:
+    """A fit of the terms of an equation that begins with it."""
+    own = np.flatnonzero(shared[:EQUATION]).tolist()
+    return _Fit(data, own, bool(shared[SHARED:].any()), shared, spread).fitted()
+
+
+def _of_pieces(data: _Data) -> _Fit:
+    """Of pieces of the rollouts, and then of all if it reproduces these.
+
+    Readings of a chaotic plant soon tell nothing of the initial field. It is driven in long waves and
+    damped in short ones, to which no descent leads from waves that none drives.
+    """
+    pieces = data.pieces
+    fit = _Fit(pieces, (*_FEW, _DRIVEN[1]), False)
+    fit.shared[[*_DRIVEN]] = pieces.driven
+    if not fit.fitted().reproduces:
+        return fit
+    whole = _continued(data, fit.shared, fit.spread)
+    return whole if whole.reproduces else fit
 
 
 def _of_first_terms(data: _Data) -> tuple[_Fit, _Fit]:
@@ -341,6 +366,24 @@ class _Data:
         self.interpolated = coefficients_of(first)
 
     @property
+    def pieces(self) -> _Data:
+        """The rollouts in pieces of equal lengths."""
+        m = max(self.steps // _PIECES, 1)
+        y, a = (
+            np.concatenate([own[:, k : k + m] for k in range(0, self.steps - m + 1, m)])
+            for own in (self.readings, self.actions)
+        )
+        return _Data(y, a, self.actuators, self.noise, None, None, self.settings)
+
+    @property
+    def driven(self) -> Array:
+        """Second and fourth derivatives that make the strongest wave of the readings grow most."""
+        power = np.mean(np.abs(np.fft.rfft(self.readings)) ** 2, axis=(0, 1))
+        k = 2.0 * np.pi * max(int(np.argmax(power[1:])) + 1 if len(power) > 1 else 1, 1)
+        second, fourth = (unit(*TERMS[i]) for i in _DRIVEN)
+        return -_GROWTH * np.array([2.0 / (second * k**2), 1.0 / (fourth * k**4)])
+
+    @property
     def lengths(self) -> list[int]:
         """Steps of the rollouts that are fitted one after the other."""
         found, m = list[int](), max(_SHORTEST, round(_BEGINNING * self.steps))
@@ -395,6 +438,8 @@ class _Fit:
                 self.deviations[i] = _WIDTH
             elif own >= SHARED:
                 self.deviations[i] = _UNEQUAL
+        # What was found before is as large as it is.
+        self.deviations = np.maximum(self.deviations, np.abs(self.shared[self.varied]))
 
     def fitted(self, other: _Fit | None = None) -> _Fit:
         """This one, over longer and longer parts, as long as it is better there than another one."""
@@ -416,6 +461,11 @@ class _Fit:
             if np.linalg.norm(self.spread - before) <= _SETTLED * np.linalg.norm(before):
                 break
         return self
+
+    @property
+    def reproduces(self) -> bool:
+        """True if it may be used."""
+        return self.error(self.data.steps) <= SENSED_REPRODUCED
 
     @property
     def lost(self) -> bool:
