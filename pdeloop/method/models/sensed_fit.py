@@ -379,7 +379,7 @@ class _Data:
     def driven(self) -> Array:
         """Second and fourth derivatives that make the strongest wave of the readings grow most."""
         power = np.mean(np.abs(np.fft.rfft(self.readings)) ** 2, axis=(0, 1))
-        k = 2.0 * np.pi * max(int(np.argmax(power[1:])) + 1 if len(power) > 1 else 1, 1)
+        k = 2.0 * np.pi * (1 + int(np.argmax(power[1:])) if len(power) > 1 else 1)
         second, fourth = (unit(*TERMS[i]) for i in _DRIVEN)
         return -_GROWTH * np.array([2.0 / (second * k**2), 1.0 / (fourth * k**4)])
 
