@@ -273,7 +273,10 @@ def fit_sensed(
 def _continued(data: _Data, shared: Array, spread: Array) -> _Fit:
     """A fit of the terms of an equation that begins with it."""
     own = np.flatnonzero(shared[:EQUATION]).tolist()
-    return _Fit(data, own, bool(shared[SHARED:].any()), shared, spread).fitted()
+    fit = _Fit(data, own, bool(shared[SHARED:].any()), shared, spread)
+    if _DRIVEN[1] in own:  # rates that nearly cancel are larger than those of other equations
+        fit.deviations = np.maximum(fit.deviations, np.abs(shared[fit.varied]))
+    return fit.fitted()
 
 
 def _of_pieces(data: _Data) -> _Fit:
@@ -438,8 +441,6 @@ class _Fit:
                 self.deviations[i] = _WIDTH
             elif own >= SHARED:
                 self.deviations[i] = _UNEQUAL
-        # What was found before is as large as it is.
-        self.deviations = np.maximum(self.deviations, np.abs(self.shared[self.varied]))
 
     def fitted(self, other: _Fit | None = None) -> _Fit:
         """This one, over longer and longer parts, as long as it is better there than another one."""
