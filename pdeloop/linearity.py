@@ -15,7 +15,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import linalg
 
-from pdeloop.log_effects import COARSER, coarser
+from pdeloop.log_effects import coarsened
 from pdeloop.messages.arrays import Array
 from pdeloop.method.reduce.channels import NUMBERED, Channels, listed
 from pdeloop.method.reduce.reduced_model import Trajectory
@@ -159,8 +159,11 @@ def products(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) 
 
     Steps from one row to the next, and from one mean of 4, 16, ... rows, beside which noise is small.
     """
-    best, parts = None, list(trajectories)
-    while parts and (rows := _Rows.of(parts)).enough(0):
+    best = None
+    for parts in coarsened(trajectories):
+        if not (rows := _Rows.of(parts)).enough(0):
+            break
+        linear = rows.missed()
         with one_thread():
             s = rows.s @ linalg.svd(rows.s, full_matrices=False)[2][:MODES].T
         u = (rows.u - rows.u.mean(axis=0)) / np.maximum(rows.u.std(axis=0), 1e-300)
@@ -175,7 +178,7 @@ def products(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) 
                 break
             alone = np.column_stack(terms)
             every = rows.missed(alone, *mixed)
-            i, ratio = _ratio(rows.missed(), every)
+            i, ratio = _ratio(linear, every)
             if ratio <= (best.ratio if best else BENT):
                 continue
             fewer = [
@@ -197,7 +200,6 @@ def products(trajectories: Sequence[Trajectory], channels: Channels = NUMBERED) 
                 "of the whole field, which has products (with a --target)"
             )
             best = Misfit(i, tuple(own), ratio, text)
-        parts = [coarser(z, a) for z, a in parts if len(z) >= 2 * COARSER]
     return best
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from scipy import linalg
@@ -38,15 +38,16 @@ def require_effects(trajectories: Sequence[Trajectory], channels: Channels = NUM
     shows, and by the inputs of `PAST` rows, whose effect on few readings takes its time. Inputs that
     cannot be told apart are left to others.
     """
-    data, coarse = steps_of(trajectories), list(trajectories)
+    data = steps_of(trajectories)
     y = data.actions
     with one_thread():
         if examine_steps(data, linalg.svd(data.after, full_matrices=False)[2][:1].T).faults:
             return
         none = {*range(y.shape[1] if len(y) > y.shape[1] + LEFT else 0)}
-        while coarse and none:
+        for coarse in coarsened(trajectories):
+            if not none:
+                break
             none -= _with_effect(steps_of(coarse), none)
-            coarse = [coarser(z, a) for z, a in coarse if len(z) >= 2 * COARSER]
         modes = linalg.svd(data.after, full_matrices=False)[2][:PAST].T
         known = [_with_past(z @ modes, a) for z, a in trajectories if len(a) > 2 * PAST]
         lags = [j + i * y.shape[1] for j in none for i in range(PAST)]
@@ -103,11 +104,20 @@ def fed_back(trajectories: Sequence[Trajectory]) -> list[int]:
     return [int(j) for j in np.flatnonzero(own < FED_BACK)]
 
 
-def coarser(z: Array, a: Array) -> Trajectory:
-    """Means of `COARSER` rows, and of the inputs from the middle of one to that of the next."""
-    count, n, half = len(z) // COARSER, COARSER, COARSER // 2
-    of_inputs = a[half : half + n * (count - 1)].reshape(count - 1, n, -1)
-    return z[: n * count].reshape(count, n, -1).mean(axis=1), of_inputs.mean(axis=1)
+def coarsened(trajectories: Sequence[Trajectory]) -> Iterator[list[Trajectory]]:
+    """The trajectories, and those of means of 4, 16, ... rows, as long as two means are left.
+
+    The inputs of a mean are those from its middle to that of the next one.
+    """
+    coarse, half = list(trajectories), COARSER // 2
+    while coarse:
+        yield coarse
+        finer, coarse = coarse, []
+        for z, a in finer:
+            if (count := len(z) // COARSER) >= 2:
+                inputs = a[half : half + COARSER * (count - 1)].reshape(count - 1, COARSER, -1)
+                rows = z[: COARSER * count].reshape(count, COARSER, -1)
+                coarse.append((rows.mean(axis=1), inputs.mean(axis=1)))
 
 
 def _with_past(z: Array, a: Array) -> Trajectory:

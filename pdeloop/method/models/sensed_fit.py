@@ -20,7 +20,7 @@ rollout alone, it is eliminated,
 Whole rollouts are fitted again with the S that the last fit implies (empirical Bayes), without terms
 whose loss of J is small. Derivatives are finite differences: all equations that share their terms are
 one batch of the compiled solver, as what an action does is linear in the supports and their strengths.
-Where no equation reproduces whole rollouts, one that drives long waves and damps short ones is fitted
+Where no equation reproduces whole rollouts, one in which long waves grow and short ones decay is fitted
 to pieces of them, as of a chaotic plant.
 
 References
@@ -169,8 +169,8 @@ _LIBRARIES: tuple[tuple[tuple[int, ...], bool, float], ...] = (
 """Unknowns of the equations that are fitted one after the other; whether actuators differ in strength
 (few sensors tell little of it, and waves that they do not resolve would be taken for differences); and
 the error from which each is tried, beside what neither the grid nor chance explains."""
-_DRIVEN = TERMS.index((1, 2)), TERMS.index((1, 4))
-"""Second and fourth derivative."""
+_INSTABILITY = TERMS.index((1, 2)), TERMS.index((1, 4))
+"""z_xx and z_xxxx: with coefficients below 0 long waves grow and short ones decay."""
 _PIECES, _GROWTH = 4, 0.1
 """Pieces of a rollout, and how much their strongest wave grows in a sampling time to begin with."""
 _BEGINNING, _SHORTEST, _LONGER = 0.05, 10, 1.5
@@ -274,7 +274,7 @@ def _continued(data: _Data, shared: Array, spread: Array) -> _Fit:
     """A fit of the terms of an equation that begins with it."""
     own = np.flatnonzero(shared[:EQUATION]).tolist()
     fit = _Fit(data, own, bool(shared[SHARED:].any()), shared, spread)
-    if _DRIVEN[1] in own:  # rates that nearly cancel are larger than those of other equations
+    if _INSTABILITY[1] in own:  # rates that nearly cancel are larger than those of other equations
         fit.deviations = np.maximum(fit.deviations, np.abs(shared[fit.varied]))
     return fit.fitted()
 
@@ -282,12 +282,12 @@ def _continued(data: _Data, shared: Array, spread: Array) -> _Fit:
 def _of_pieces(data: _Data) -> _Fit:
     """Of pieces of the rollouts, and then of all if it reproduces these.
 
-    Readings of a chaotic plant soon tell nothing of the initial field. It is driven in long waves and
-    damped in short ones, to which no descent leads from waves that none drives.
+    Readings of a chaotic plant soon tell nothing of the initial field. Its long waves grow and its
+    short ones decay, to which no descent leads from waves of which none grows.
     """
     pieces = data.pieces
-    fit = _Fit(pieces, (*_FEW, _DRIVEN[1]), False)
-    fit.shared[[*_DRIVEN]] = pieces.driven
+    fit = _Fit(pieces, (*_FEW, _INSTABILITY[1]), False)
+    fit.shared[[*_INSTABILITY]] = pieces.instability
     if not fit.fitted().reproduces:
         return fit
     whole = _continued(data, fit.shared, fit.spread)
@@ -379,11 +379,11 @@ class _Data:
         return _Data(y, a, self.actuators, self.noise, None, None, self.settings)
 
     @property
-    def driven(self) -> Array:
-        """Second and fourth derivatives that make the strongest wave of the readings grow most."""
+    def instability(self) -> Array:
+        """Coefficients of these terms with which the strongest wave of the readings grows most."""
         power = np.mean(np.abs(np.fft.rfft(self.readings)) ** 2, axis=(0, 1))
         k = 2.0 * np.pi * (1 + int(np.argmax(power[1:])) if len(power) > 1 else 1)
-        second, fourth = (unit(*TERMS[i]) for i in _DRIVEN)
+        second, fourth = (unit(*TERMS[i]) for i in _INSTABILITY)
         return -_GROWTH * np.array([2.0 / (second * k**2), 1.0 / (fourth * k**4)])
 
     @property
