@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pdeloop.identification import Identified
+from pdeloop.identified import Identified
 from pdeloop.messages.arrays import Array
 from pdeloop.model_checks import simulated
 from pdeloop.report.style import STYLE

@@ -11,7 +11,8 @@ import pytest
 
 from pdeloop.cli import main
 from pdeloop.data_file import Measurements
-from pdeloop.identification import Identified, identify_data
+from pdeloop.identification import identify_data
+from pdeloop.identified import Identified
 from pdeloop.linearity import products
 from tests.method.test_input_delay import logged
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from pdeloop.data_file import Measurements, read_measurements
-from pdeloop.identification import Identified, identify_data
+from pdeloop.identification import identify_data
+from pdeloop.identified import Identified
 from pdeloop.linearity import Misfit, disproportionate, products, rate_limited, structural_break
 from pdeloop.method.reduce.input_delay import study_delays
 from pdeloop.method.reduce.reduced_model import Trajectory, steps_of

@@ -10,7 +10,8 @@ import pytest
 from scipy import linalg
 
 from pdeloop.data_file import Measurements
-from pdeloop.identification import Identified, identify_data
+from pdeloop.identification import identify_data
+from pdeloop.identified import Identified
 
 
 def log(

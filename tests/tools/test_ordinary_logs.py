@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pdeloop.data_file import Measurements, read_measurements
-from pdeloop.identification import Identified, identify_data
+from pdeloop.identification import identify_data
+from pdeloop.identified import Identified
 from pdeloop.log_effects import fed_back, require_effects
 from pdeloop.method.reduce.identifiability import NotIdentifiableError
 
