@@ -35,6 +35,7 @@ from pdeloop.method.models.base import (
     StoredModel,
     errors,
     pieces,
+    predicted,
     samples_of,
     usable,
 )
@@ -235,27 +236,10 @@ def _cut(rollouts: Sequence[Measured]) -> list[Measured]:
 
 
 def _errors(models: Sequence[PolynomialModel], parts: Sequence[Measured], scale: Array) -> Array:
-    """Mean square of the scaled error over parts, relative to their change, at most 1 each.
-
-    Of every model; all have the same features.
-    """
-    steps = np.array([len(own.actions) for own in parts])
-    actions = np.zeros((len(parts), int(steps.max()), models[0].n_a))
-    for row, own in zip(actions, parts, strict=True):
-        row[: len(own.actions)] = own.actions
-    z = np.tile(np.stack([own.states[0] for own in parts]), (len(models), 1, 1))
-    found = [z.copy()]
-    with np.errstate(all="ignore"):
-        for k in range(actions.shape[1]):
-            taken = np.tile(actions[:, k], (len(models), 1))
-            features = models[0].features(z.reshape(len(taken), -1), taken)
-            for model, own, rows in zip(models, z, np.split(features, len(models)), strict=True):
-                add_products(read_only(rows), read_only(model.coefficients), own)
-            found.append(z.copy())
-    simulated = np.stack(found, axis=2)  # (models, parts, steps + 1, n_z)
-    every = []
-    for part, (own, n) in enumerate(zip(parts, steps.tolist(), strict=True)):
-        states, alike = list(simulated[:, part, : n + 1]), [own] * len(models)
-        every.append(errors(models[0], alike, own.states[0], 1.0, 0.0, 1.0 / scale, states))
-    missed: Array = np.stack(every, axis=1).mean(axis=1)
+    """Mean square of the scaled error of each model over parts, relative to their change, at most 1."""
+    found = np.empty((len(models), len(parts)))
+    for row, model in zip(found, models, strict=True):
+        for i, (own, states) in enumerate(zip(parts, predicted(model, parts), strict=True)):
+            row[i] = errors(model, [own], own.states[0], 1.0, 0.0, 1.0 / scale, [states])[0]
+    missed: Array = found.mean(axis=1)
     return missed
