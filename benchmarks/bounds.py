@@ -34,7 +34,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.parameters import INSTRUMENTS
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import ModelBasedSettings, cheapest, curvature_of, improve
+from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
+from pdeloop.method.adapt.verdict import cheapest
 from pdeloop.method.seeds import Purpose, derive
 from pdeloop.process.one_thread import one_thread
 

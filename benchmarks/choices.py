@@ -33,9 +33,13 @@ from pdeloop.in_process import LocalPair, train
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.files import make_folder, write_atomically
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import ModelBasedSettings
+from pdeloop.method.adapt.improve import (
+    FRACTIONS,
+    ModelBasedSettings,
+    choose_fraction,
+    left_out_costs,
+)
 from pdeloop.method.adapt.model_based import CLOSE
-from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose, mean_of
 from pdeloop.method.models import affine_law
 from pdeloop.method.models.base import saturated

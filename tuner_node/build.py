@@ -20,8 +20,7 @@ from pdeloop.messages.parameters import measured_size, model_order, noisy
 from pdeloop.messages.protocol import design_digest
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt import Context, Optimizer
-from pdeloop.method.adapt.in_coordinates import InCoordinates, is_large
-from pdeloop.method.adapt.trajectories import LARGE
+from pdeloop.method.adapt.trajectories import LARGE, InCoordinates, is_large
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.linear import Extended
 from pdeloop.method.laws.neural import Neural

@@ -14,8 +14,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop, LinearLoop
-from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
-from pdeloop.method.adapt.renewal import renew
+from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve, renew
 from pdeloop.method.design.lqt import regulator, track_horizon
 from pdeloop.method.laws.linear import FeedForward
 from pdeloop.method.models.linear import LinearModel

@@ -13,11 +13,13 @@ import pytest
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
-from pdeloop.method.adapt.renewal import (
+from pdeloop.method.adapt.improve import (
     CONFIRMED,
+    ModelBasedSettings,
     Renewal,
     averaged_over_shifts,
+    curvature_of,
+    improve,
     invariant_share,
     mixtures,
     own_gain,

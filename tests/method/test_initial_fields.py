@@ -12,7 +12,7 @@ import pytest
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.renewal import (
+from pdeloop.method.adapt.improve import (
     any_state_serves,
     initial_fields,
     is_chaotic,

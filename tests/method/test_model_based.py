@@ -19,7 +19,7 @@ from pdeloop.method.adapt import (
     Rollout,
     RolloutResult,
     Trajectory,
-    renewal,
+    improve,
 )
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.verdict import ADAPTED, FIRST
@@ -217,7 +217,7 @@ def test_steps_are_compared_on_the_fields_of_the_first_law_and_with_no_control()
 def test_where_no_law_stays_finite_on_the_model_steps_follow_measured_rollouts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(renewal, "renew", lambda *_, **__: None)
+    monkeypatch.setattr(improve, "renew", lambda *_, **__: None)
     plant = Plant()
     optimizer = make(plant)
     rows = finished(plant, optimizer)

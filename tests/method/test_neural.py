@@ -17,8 +17,8 @@ from pdeloop.law_form import law_form
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
+from pdeloop.method.adapt.improve import mixtures
 from pdeloop.method.adapt.network import ModelBasedNeural, Network, NetworkTraining
-from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner, simulated

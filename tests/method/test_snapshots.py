@@ -12,10 +12,11 @@ import pytest
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt import Context, ModelBased, RolloutResult, Trajectory
 from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.in_coordinates import CostInCoordinates, InCoordinates
 from pdeloop.method.adapt.trajectories import (
     CAPACITY,
     LARGE,
+    CostInCoordinates,
+    InCoordinates,
     LowRankTrajectory,
     SnapshotBasis,
     kept,

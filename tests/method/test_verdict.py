@@ -11,8 +11,12 @@ import pytest
 
 from pdeloop.method.adapt import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import ModelBasedSettings
-from pdeloop.method.adapt.renewal import FRACTIONS, choose_fraction, left_out_costs
+from pdeloop.method.adapt.improve import (
+    FRACTIONS,
+    ModelBasedSettings,
+    choose_fraction,
+    left_out_costs,
+)
 from pdeloop.method.adapt.verdict import (
     ADAPTED,
     FIRST,

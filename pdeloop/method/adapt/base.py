@@ -293,7 +293,7 @@ class Optimizer(Protocol):
     """True if it always compares the first law with no control itself."""
     in_coordinates: ClassVar[bool] = False
     """True if it can work on coordinates in an orthonormal basis of the measured states in place of
-    states of more than 2,048 numbers (`pdeloop.method.adapt.in_coordinates`)."""
+    states of more than 2,048 numbers (`pdeloop.method.adapt.trajectories`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
     law_with_constants: ClassVar[str] = ""

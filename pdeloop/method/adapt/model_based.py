@@ -3,7 +3,7 @@
 
     stage       rollouts                                    afterwards
     renewing    the current law, each on a fresh field      a model is fitted to all rollouts and the
-                                                            law improved on it (`renewal`)
+                                                            law improved on it (`improve`)
     judging     the final law, each on a fresh field        the best of all measured laws (`verdict`)
 
 Laws where no model predicts the rollouts, or about the target: `replay`. Sources and equations:
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pdeloop.messages.array_files import checked_array
 from pdeloop.messages.arrays import Array
-from pdeloop.method.adapt import renewal, replay, verdict
+from pdeloop.method.adapt import improve, replay, verdict
 from pdeloop.method.adapt.base import (
     Context,
     Optimizer,
@@ -371,7 +371,7 @@ class ModelBased(Optimizer):
         own, known = self._records.count, self._measurements()
         if self._repeats:
             return min(own + 1, self._schedule.last)
-        if own == 0 and len(known) > 1 and not self._context.noise and renewal.begin_alike(known):
+        if own == 0 and len(known) > 1 and not self._context.noise and improve.begin_alike(known):
             return min(2, self._schedule.last)  # whether they are the same
         return self._scheduled(own)
 
@@ -384,7 +384,7 @@ class ModelBased(Optimizer):
         """True if a law's rollouts are all the same one: every episode begins alike, without noise."""
         laws = [[record.cost for record in own] for own in by_law(self._records.all())]
         pairs = [own for own in laws if len(own) > 1 and np.isfinite(own).all()]
-        if self._context.noise or not pairs or not renewal.begin_alike(self._measurements()):
+        if self._context.noise or not pairs or not improve.begin_alike(self._measurements()):
             return False
         return all(np.ptp(own) <= _REPEATS * abs(own[0]) for own in pairs)
 
@@ -453,7 +453,7 @@ class ModelBased(Optimizer):
         belief = self._progress.belief
         if belief is None or not belief.whole or self._context.of_readings:
             return True
-        return renewal.is_chaotic(belief.loop(self._context), self.fields)
+        return improve.is_chaotic(belief.loop(self._context), self.fields)
 
     def _data(self) -> list[Record]:
         """All rollouts, denoised."""
@@ -479,7 +479,7 @@ class ModelBased(Optimizer):
     @property
     def fields(self) -> Array:
         """The initial fields of all rollouts, (n, n_z)."""
-        fields = renewal.initial_fields(self._data())
+        fields = improve.initial_fields(self._data())
         return fields[:1] if self._repeats else fields
 
     def _renew(self, row: Row) -> None:
@@ -580,21 +580,21 @@ class ModelBased(Optimizer):
         self._progress.safe = safe
         improved = base if self._progress.improved is None else self._progress.improved
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
-        draw: renewal.Draw = partial(
-            renewal.mixtures, rng=rng, components=belief.components, periodic=self._context.periodic
+        draw: improve.Draw = partial(
+            improve.mixtures, rng=rng, components=belief.components, periodic=self._context.periodic
         )
         data, settings, parts = self._data(), self._settings, self._progress.parts
-        states = renewal.measured_states(data, renewal.CHAOTIC_TESTED)
+        states = improve.measured_states(data, improve.CHAOTIC_TESTED)
         if belief.whole:
-            chaotic = renewal.any_state_serves(loop, base, fields, states)
+            chaotic = improve.any_state_serves(loop, base, fields, states)
         else:  # of pieces, as also where it is wrong
-            chaotic = renewal.is_chaotic(loop, states)
+            chaotic = improve.is_chaotic(loop, states)
         if chaotic or not belief.whole:
             row["chaotic" if chaotic else "pieces"] = True
-            fields = renewal.measured_states(data, renewal.CHAOTIC_FIELDS)
+            fields = improve.measured_states(data, improve.CHAOTIC_FIELDS)
             # Others than last time, so that the laws of the parts may know those of their own part.
             parts, settings = [], replace(settings, mixtures=0, most_mixtures=0)
-        found = renewal.renew(loop, base, improved, parts, fields, draw, settings, final=final)
+        found = improve.renew(loop, base, improved, parts, fields, draw, settings, final=final)
         if found is None:
             self._replay(belief, row, final, "no improved law stays finite on the model")
             return

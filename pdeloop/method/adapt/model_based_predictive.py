@@ -36,7 +36,7 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import ModelBasedSettings, cheapest
+from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
@@ -53,6 +53,7 @@ from pdeloop.method.adapt.verdict import (
     PREDICTIVE,
     ZERO,
     Evidence,
+    cheapest,
     mean_change,
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman

@@ -24,13 +24,12 @@ from pdeloop.method.adapt.base import Record, Rollout, Row, of_law
 from pdeloop.method.adapt.belief import Belief, believe
 from pdeloop.method.adapt.improve import (
     FIRST_GAIN,
-    cheapest,
     curvature_of,
     improve,
-    index_of_cheapest,
+    mixtures,
+    weighted,
 )
 from pdeloop.method.adapt.model_based import FIRST_RENEWAL, JUDGING, RENEWING, ModelBased
-from pdeloop.method.adapt.renewal import mixtures, weighted
 from pdeloop.method.adapt.replay import FEWEST, best_measured, costs_by_field, step
 from pdeloop.method.adapt.sensed_loop import (
     estimated_laws,
@@ -39,7 +38,13 @@ from pdeloop.method.adapt.sensed_loop import (
     sensed_loop,
     to_be_fitted,
 )
-from pdeloop.method.adapt.verdict import ADAPTED, Estimate, mean_of
+from pdeloop.method.adapt.verdict import (
+    ADAPTED,
+    Estimate,
+    cheapest,
+    index_of_cheapest,
+    mean_of,
+)
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.models.sensed import SensedModel
 from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED

@@ -38,9 +38,8 @@ from numpy.typing import ArrayLike
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Row
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import curvature_of
+from pdeloop.method.adapt.improve import curvature_of, mixtures
 from pdeloop.method.adapt.model_based_predictive import Candidate, ModelBasedPredictive, share_saved
-from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.adapt.verdict import NEURAL
 from pdeloop.method.laws.neural import Layers, Neural
 from pdeloop.method.laws.plans import Act, Planner, planned, seen_with_noise, simulated

@@ -35,7 +35,6 @@ import numpy as np
 from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Record, Row, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import index_of_cheapest
 
 FIRST, ADAPTED, NONE = "first", "adapted", "none"
 PREDICTIVE, NEURAL = "predictive", "neural"
@@ -207,6 +206,27 @@ def size_of(law: str, change: Estimate, other: str) -> str:
     more = "less" if change.value < 0.0 else "more"
     size = f"{abs(change.value):.4g} (standard error {change.error:.2g})"
     return f"{law} costs {size} {more} than {other}"
+
+
+def cheapest(loop: ClosedLoop, laws: Sequence[Array], fields: Array, weights: Array) -> Array:
+    """The law that is finite from most of the fields, and cheapest where all of those are."""
+    if all(np.array_equal(law, laws[0]) for law in laws):
+        return laws[0]
+    return laws[index_of_cheapest(np.array([loop.costs(theta, fields) for theta in laws]), weights)]
+
+
+def index_of_cheapest(costs: Array, weights: Array) -> int:
+    """The row of costs (laws, F) that `cheapest` chooses, the first of several alike.
+
+    >>> index_of_cheapest(np.array([[np.inf, np.inf], [np.inf, 9.0]]), np.ones(2))
+    1
+    >>> index_of_cheapest(np.array([[2.0, np.inf, 0.5], [np.inf, 9.0, 1.0]]), np.ones(3))
+    0
+    """
+    lost = ~np.isfinite(costs) @ weights
+    common = np.isfinite(costs[lost <= lost.min()]).all(axis=0)
+    total = np.where(common, costs, 0.0) @ weights
+    return int(np.lexsort((total, lost))[0])
 
 
 def beats_no_control(loop: ClosedLoop, first: Array, fields: Array) -> bool:
