@@ -121,21 +121,16 @@ def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, floa
     Residuals of steps by regressions on two rows, of all data and of those before and after a step
     (Chow, Econometrica 28(3), 1960), of the state for which that matters most.
     """
-    every = [np.hstack([z[:-1], a]) for z, a in trajectories]
-    n_z, mean = trajectories[0][0].shape[1], np.concatenate(every).mean(axis=0)
-    unit = np.concatenate(every).std(axis=0)
-    unit[unit <= TINY * np.abs(mean)] = np.inf
-    width = 2 * len(mean) + 1
-    rows = np.array([(i, k) for i, x in enumerate(every) for k in range(1, len(x))])
-    if len(rows) < 4 * LEAST * width:
+    rows, sizes = _Rows.of(trajectories), [max(len(a) - 1, 0) for _, a in trajectories]
+    steps = [(i, k) for i, count in enumerate(sizes) for k in range(1, count + 1)]
+    width = rows.known.shape[1]
+    if len(steps) < 4 * LEAST * width:
         return None
-    parts = []
-    for (z, _), x in zip(trajectories, every, strict=True):
-        scaled, after = (x - mean) / unit, (z[2:] - z[1:-1]) / unit[:n_z]
-        parts.append(np.hstack([np.ones((len(after), 1)), scaled[1:], scaled[:-1], after]))
-    known = np.concatenate(parts)
-    begins = np.flatnonzero(rows[:, 1] == 1)
-    places = np.unique(np.r_[begins, np.arange(1, PLACES) * len(rows) // PLACES])[1:]
+    mean, unit = rows.after.mean(axis=0), rows.after.std(axis=0)
+    unit[unit <= TINY * np.abs(mean)] = np.inf
+    known = np.hstack([rows.known, (rows.after - mean) / unit])
+    begins = np.cumsum(sizes)[:-1]
+    places = np.unique(np.r_[begins, np.arange(1, PLACES) * len(steps) // PLACES])
     squares = [part.T @ part for part in np.split(known, places)]
     before, total = np.cumsum(squares, axis=0), np.sum(squares, axis=0)
 
@@ -145,12 +140,14 @@ def structural_break(trajectories: Sequence[Trajectory]) -> tuple[int, int, floa
 
     least, one, best = ROUNDED * np.diag(total)[width:], missed(total), (0, 0, CHANGED)
     for place, G in zip(places, before, strict=False):
-        if min(place, len(rows) - place) > LEAST * width:
+        if min(place, len(steps) - place) > LEAST * width:
             two = np.maximum(missed(G) + missed(total - G), least)
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = float(np.nanmax(one / two)) * (len(rows) - 2 * width) / (len(rows) - width)
+                ratio = (
+                    float(np.nanmax(one / two)) * (len(steps) - 2 * width) / (len(steps) - width)
+                )
             if ratio > best[2]:
-                best = int(rows[place, 0]), int(rows[place, 1]), ratio
+                best = *steps[place], ratio
     return None if best[2] == CHANGED else best
 
 
