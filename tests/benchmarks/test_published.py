@@ -82,10 +82,10 @@ def test_copies_of_readings_are_readings_of_copies() -> None:
 
 
 def test_a_law_of_one_exploration_and_its_copies_transfers_less_heat_than_none() -> None:
-    """By a twentieth on 12 rows, with half an exploration in half an episode."""
+    """By a twentieth on 12 rows, with a third of an exploration in half an episode."""
     plant = layer.ConvectionLayer(48, 12, steps=100)
     seen = list(layer.copies(layer.read(plant, layer.explored(plant, 1))))
-    law = layer.of_states(plant, layer.linear(layer.identified(seen[::2], 60), 1e-4))
+    law = layer.of_states(plant, layer.linear(layer.identified(seen[::3], 60), 1e-4))
     start = plant.developed(layer.STARTS[0])[None]
     none = layer.followed(plant, lambda z: np.zeros((1, 12)), start)
     assert layer.followed(plant, law, start) < 0.95 * none
