@@ -38,7 +38,6 @@ from tests.support.estimated import (
     fields,
     filter_of,
     loop_of,
-    rows_of,
 )
 from tests.support.small import same_bits
 
@@ -89,16 +88,6 @@ def test_what_overflows_in_one_environment_leaves_the_other_alone() -> None:
     alone, _ = known.measured(x[1:], S[1:], y[1:])
     assert np.isnan(both[0]).all()
     np.testing.assert_allclose(both[1], alone[0], rtol=1e-12)
-
-
-def test_it_starts_as_the_law_observer() -> None:
-    rng, rows = np.random.default_rng(3), rows_of(1.0)
-    readings, actions = rng.standard_normal((T, SENSORS)), rng.standard_normal((T, N_A))
-    law, linear = ExtendedKalman(rows, T), Observer(rows, T)
-    assert not law.estimates(law.theta_start)
-    expected = along(linear, linear.theta_start, readings, actions)
-    assert expected.any()
-    assert same_bits(along(law, law.theta_start, readings, actions), expected)
 
 
 def test_it_has_no_derivative_to_be_trained_with() -> None:

@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 
 from pdeloop.messages.cost import Cost
-from pdeloop.method.adapt.base import Record
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import (
     any_state_serves,
-    initial_fields,
     is_chaotic,
-    measured_states,
 )
 
 N_Z = 12
@@ -81,13 +78,3 @@ def test_a_stable_plant_is_not_chaotic_where_its_model_runs_away_from_some_field
     costs = loop.costs(loop.no_control, fields)
     assert np.isinf(costs[-1]) and costs[-2] > 2.0 * costs[:-2].sum()
     assert not is_chaotic(loop, fields)
-
-
-def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:
-    rng = np.random.default_rng(1)
-    one, two = (rng.normal(size=(21, N_Z)) for _ in range(2))
-    records = [Record(np.zeros((1, 6)), 1.0, z, np.zeros((20, 1))) for z in (one, two, one)]
-    np.testing.assert_array_equal(initial_fields(records), [one[0], two[0]])
-    states = measured_states(records, 5)
-    np.testing.assert_array_equal(states[[0, -1]], [one[0], one[-1]])
-    assert len(states) == 5 and len(measured_states(records, 1000)) == 63

@@ -52,12 +52,6 @@ def test_the_parts_of_theta_are_the_whole_of_it(kind: type[Law]) -> None:
         assert np.array_equal(start[name], part)
 
 
-def test_the_affine_law_has_the_gains_side_by_side() -> None:
-    law = Affine(MODEL, T)
-    assert np.array_equal(law.theta_start.reshape(law.shape), np.hstack([K_a, K_b]))
-    assert np.array_equal(law.gains(law.theta_start), MODEL.policy)
-
-
 @pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
 def test_these_laws_start_as_the_law_of_lq_tracking(kind: type[Law]) -> None:
     """Without a filter gain the observer believes what is measured, whatever it predicted."""
@@ -65,6 +59,17 @@ def test_these_laws_start_as_the_law_of_lq_tracking(kind: type[Law]) -> None:
     law = kind(MODEL, T)
     expected = states @ U @ K_a.T + K_b @ MODEL.s_r
     np.testing.assert_allclose(along(law, law.theta_start, states, actions), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHIPPED if kind.needs_model])
+def test_a_law_that_an_optimiser_identifies_a_model_for_begins_as_another_one(
+    kind: type[Law],
+) -> None:
+    own, (states, actions) = kind(MODEL, T), trajectory()
+    plain = (Observer if own.filtered else Affine)(MODEL, T)
+    expected = along(plain, plain.theta_start, states, actions)
+    assert expected.any() and own.has_gains(own.theta_start) == plain.compiled
+    assert np.array_equal(along(own, own.theta_start, states, actions), expected)
 
 
 def test_a_feed_forward_is_added_at_its_step_and_the_last_one_stays() -> None:

@@ -19,7 +19,7 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.spec import ParameterError
 from pdeloop.method.adapt.improve import mixtures
 from pdeloop.method.adapt.network import ModelBasedNeural, Network, NetworkTraining
-from pdeloop.method.laws import Affine, FeedForward, Law, Neural, plans
+from pdeloop.method.laws import FeedForward, Law, Neural, plans
 from pdeloop.method.laws.neural import Layers, NeuralSettings
 from pdeloop.method.laws.plans import Planner, simulated
 from pdeloop.model_files import matlab, onnx
@@ -49,13 +49,6 @@ def with_network(law: Neural, scale: float = 0.3) -> np.ndarray:
     shapes = (H, n_s + n_a * law.depends_on_step), (H,), (n_a, H), (n_a,)
     layers = Layers(*(scale * rng.standard_normal(shape) for shape in shapes))
     return law.theta_of(law.theta_start, law.model.K_a, layers)
-
-
-def test_without_a_network_it_is_the_affine_law() -> None:
-    own, affine = Neural(ROWS, T), Affine(ROWS, T)
-    assert own.has_gains(own.theta_start) and own.acting(own.theta_start) == "affine"
-    acted = actions_of(own, own.theta_start)
-    assert np.array_equal(acted, actions_of(affine, affine.theta_start.reshape(affine.shape)))
 
 
 def test_zeros_at_the_end_of_theta_mean_nothing() -> None:

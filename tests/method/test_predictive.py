@@ -24,7 +24,7 @@ from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.model_based_predictive import (
     ModelBasedPredictive,
 )
-from pdeloop.method.laws import Affine, Law, Predictive
+from pdeloop.method.laws import Law, Predictive
 from pdeloop.method.laws.plans import Planner
 from pdeloop.method.laws.predictive import Auto
 from pdeloop.method.laws.registry import action, updated
@@ -69,15 +69,6 @@ def actions_of(own: Law, theta: np.ndarray, states: np.ndarray = STATES) -> np.n
     batch = LawBatch([own], np.ones(N_Z))
     batch.set(theta[None])
     return np.stack([batch.actions(k, z[None])[0] for k, z in enumerate(states)])
-
-
-def test_without_a_model_it_is_the_affine_law() -> None:
-    own, affine = law(), Affine(ROWS, T)
-    assert np.array_equal(own.theta_start, affine.theta_start)
-    expected = STATES @ U @ GAINS[:, :3].T + GAINS[:, 3:] @ ROWS.s_r
-    acted = actions_of(own, own.theta_start)
-    np.testing.assert_allclose(acted, expected, atol=1e-12)
-    assert np.array_equal(acted, actions_of(affine, affine.theta_start.reshape(affine.shape)))
 
 
 def test_in_a_batch_with_plans_the_affine_law_acts_as_alone() -> None:
