@@ -180,7 +180,7 @@ def best_inputs(
 
     def balanced(v: Array) -> tuple[float, Array]:
         cost, gradient = _mean(*inputs_cost(loop, theta, admissible.project(v), fields))
-        return cost, admissible.pull_back(v, gradient)
+        return cost, admissible.pull_back(v, gradient)[0]
 
     found = descend(
         balanced if admissible.zero_mean else lambda v: _mean(*inputs_cost(loop, theta, v, fields)),

@@ -291,27 +291,21 @@ class ActionSet:
             return self.low, self.high
         return np.maximum(self.low, after - self.rate), np.minimum(self.high, after + self.rate)
 
-    def pull_back(self, requested: Array, y: Array) -> Array:
-        """The transposed derivative of `project` at requested actions times y, all (..., n_a).
+    def pull_back(
+        self, requested: Array, y: Array, after: Array | None = None
+    ) -> tuple[Array, Array]:
+        """The transposed derivatives of `project` by requested actions and by `after`, times y.
 
-        At a bound it is that from inside.
+        All are (..., n_a); after: as for `project`. At a bound the derivative is that from inside, at a
+        rate limit that from the side to which -y points.
 
         Examples
         --------
-        >>> ActionSet(high=1.0).pull_back(np.array([0.5, 5.0]), np.array([3.0, 3.0]))
+        >>> ActionSet(high=1.0).pull_back(np.array([0.5, 5.0]), np.array([3.0, 3.0]))[0]
         array([3., 0.])
         """
         if not self.bounded:
-            return y
-        return self.pull_back_after(requested, y, None)[0]
-
-    def pull_back_after(
-        self, requested: Array, y: Array, after: Array | None
-    ) -> tuple[Array, Array]:
-        """`pull_back` where rate limits are of the actions before, and the same by those, times y.
-
-        At a rate limit it is that from the side to which -y points.
-        """
+            return y, np.zeros_like(y)
         low, high = self.within(after)
         moved = requested - self._shifts(requested, low, high) if self.zero_mean else requested
         below = (moved < low) | (moved == low) & (low > self.low) & (y > 0.0)

@@ -57,14 +57,16 @@ def test_the_derivative_is_that_of_differences(name: str) -> None:
     y, d = np.random.default_rng(5).standard_normal((2, *asked.shape))
     up, down = (allowed.project(asked + e * d) for e in (1e-7, -1e-7))
     slope = np.einsum("mi,mi->m", y, up - down) / 2e-7
-    pulled = np.einsum("mi,mi->m", allowed.pull_back(asked, y), d)
+    pulled = np.einsum("mi,mi->m", allowed.pull_back(asked, y)[0], d)
     np.testing.assert_allclose(pulled, slope, atol=1e-6)
 
 
 def test_at_a_bound_the_derivative_is_that_from_inside() -> None:
     # No control of heaters is at their bound: a descent from there must not stop.
     heaters, y = ActionSet(low=0.0, high=4.0), np.array([[1.0, 2.0, 3.0]])
-    np.testing.assert_array_equal(heaters.pull_back(np.array([[0.0, -1.0, 4.0]]), y), [[1, 0, 3]])
+    np.testing.assert_array_equal(
+        heaters.pull_back(np.array([[0.0, -1.0, 4.0]]), y)[0], [[1, 0, 3]]
+    )
     assert heaters.held_back(np.array([0.0, 2.0, 4.0])).tolist() == [True, False, True]
 
 

@@ -358,11 +358,8 @@ class NetworkTraining:
             with np.errstate(all="ignore"):
                 pulled, g = planner.model.pull_back(Z[:, i], A[:, i], eta)
                 g = g + on_actions[:, i] + later
-                if allowed.rated:
-                    before = A[:, i - 1] if i else allowed.start
-                    g, later = allowed.pull_back_after(requested, g, before)
-                else:
-                    g = allowed.pull_back(requested, g)
+                before = A[:, i - 1] if i else allowed.start
+                g, later = allowed.pull_back(requested, g, before)
                 by_numbers, by_z = network.backward(parts, into, hidden, g)
                 found += by_numbers
                 eta = pulled + by_z + on_states[:, i]

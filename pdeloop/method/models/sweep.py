@@ -101,14 +101,9 @@ class Sweep:
             pulled, g = self._model.pull_back(
                 self._states[:, k, :n_z], self._actions[:, k], eta[:, :n_z]
             )
-            g = g + on_actions[:, k] + np.einsum("mj,ji->mi", mu, self._B)
-            if self._set.rated:
-                before = self._actions[:, k - 1] if k else self._before
-                found[:, k, :n_a], later = self._set.pull_back_after(
-                    requested[:, k], g + later, before
-                )
-            else:
-                found[:, k, :n_a] = self._set.pull_back(requested[:, k], g)
+            g = g + on_actions[:, k] + np.einsum("mj,ji->mi", mu, self._B) + later
+            before = self._actions[:, k - 1] if k else self._before
+            found[:, k, :n_a], later = self._set.pull_back(requested[:, k], g, before)
             found[:, k, n_a:] = mu
             eta = on_states[:, k] + np.einsum("mj,ji->mi", found[:, k], K)
             eta[:, :n_z] += pulled
