@@ -302,8 +302,11 @@ def load_file(path: Path, word: str) -> ModuleType:
             exec(compile(source, path, "exec"), vars(module))
     except FAILURES as error:
         del sys.modules[module.__name__]
+        remedy = ""
+        if isinstance(error, ModuleNotFoundError):
+            remedy = f"; install what it imports for the Python that runs pdeloop, {sys.executable}"
         raise ValueError(
-            f"the {word} file {shown(str(path))} cannot be executed: {error}"
+            f"the {word} file {shown(str(path))} cannot be executed: {error}{remedy}"
         ) from error
     for kind in vars(module).values():
         own = isinstance(kind, type) and kind.__module__ == module.__name__

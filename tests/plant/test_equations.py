@@ -266,14 +266,17 @@ def test_an_equation_is_found_by_name_file_or_module(
         ("{heat}.py:Heat", "does not exist"),
         ("no.such.module:Heat", "the equation module 'no.such.module' cannot be imported"),
         ("{broken}:Heat", "cannot be executed"),
+        ("{lacking}:Heat", "No module named 'no_such'; install what it imports for the Python"),
     ],
 )
 def test_a_name_that_leads_nowhere_is_refused(heat: Path, name: str, words: str) -> None:
     broken = heat.with_name("broken.py")
     broken.write_text("1 / 0")
+    lacking = heat.with_name("lacking.py")
+    lacking.write_text("import no_such")
     modules = set(sys.modules)
     with pytest.raises(ValueError, match=words):
-        load_equation(name.format(heat=heat, broken=broken))
+        load_equation(name.format(heat=heat, broken=broken, lacking=lacking))
     assert not any("broken" in module for module in set(sys.modules) - modules)
 
 
