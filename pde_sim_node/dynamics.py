@@ -79,8 +79,9 @@ class Dynamics(ABC):
         between two bounds, else 0 or the point nearest to it (`pdeloop.messages.action_set`).
     zero_mean : bool
         Whether the actions of a step must have mean zero.
-    divergence_bound : float
-        A new state that is not finite or exceeds this magnitude anywhere ends the rollout.
+    divergence_bound : float or None
+        A new state that is not finite or exceeds this magnitude anywhere ends the rollout; None: 1000
+        times the target's magnitude, if that is above 1.
     supports : (n_z, n_a) or None
         Where each actuator acts, for pictures.
     batched : bool
@@ -111,7 +112,7 @@ class Dynamics(ABC):
     action_high: Any = np.inf
     action_rate: Any = np.inf
     zero_mean: bool = False
-    divergence_bound: float = 1e3
+    divergence_bound: float | None = None
     supports: Array | None = None
     batched: ClassVar[bool] = False
     stateful: ClassVar[bool] = False

@@ -21,6 +21,8 @@ from pdeloop.messages.grid import Grid
 from pdeloop.messages.own_code import OwnCodeError, called
 from pdeloop.process.one_thread import one_thread
 
+DIVERGED = 1e3
+"""`divergence_bound` unless it is set, for each unit of the target's magnitude, if that is above 1."""
 SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
 """Attributes that a problem may override; weights only where they are numbers."""
 WEIGHTS = ("state_weight", "action_weight")
@@ -61,9 +63,12 @@ class DynamicsPlant(BatchPlant):
             cost = self._declared_cost(grid, given)
             for name, number in zip(WEIGHTS, cost.size, strict=True):
                 given[name] = number
-            super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
             aim = cost.field_target if cost.output is not None else cost.target
-            if (largest := float(np.abs(aim).max())) > self.divergence_bound:
+            largest = float(np.abs(aim).max())
+            if given["divergence_bound"] is None:
+                given["divergence_bound"] = DIVERGED * max(1.0, largest)
+            super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
+            if largest > self.divergence_bound:
                 raise ValueError(
                     f"the target has the magnitude {largest:g}, and rollouts beyond divergence_bound, "
                     f"{self.divergence_bound:g}, count as diverged; set divergence_bound above it"

@@ -190,6 +190,12 @@ def test_a_parameter_that_a_class_takes_for_an_attribute_is_named(name: str, mea
         DynamicsPlant(type("Own", (Linear,), {name: 3.0})())
 
 
+@pytest.mark.parametrize(("target", "bound"), [(0.3, 1e3), (1150.0, 1.15e6), (-6e7, 6e10)])
+def test_a_bound_that_is_not_set_grows_with_the_target(target: float, bound: float) -> None:
+    own = {"target": np.array([0.0, target, 0.0]), "divergence_bound": None}
+    assert DynamicsPlant(type("Own", (Linear,), own)()).divergence_bound == bound
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_target_beyond_the_divergence_bound_is_told(moving: bool) -> None:
     """A furnace in degrees: each of its rollouts would count as diverged."""
