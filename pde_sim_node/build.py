@@ -10,25 +10,15 @@ import numpy as np
 from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Instruments, Plant
-from pde_sim_node.plants import SpectralPlant
 from pde_sim_node.plants.dynamics_plant import SETTABLE
 from pde_sim_node.plants.loading import PHYSICAL, Made, make, physical_of
+from pde_sim_node.plants.spectral import NUMBERS, SpectralPlant
 from pde_sim_node.plants.stateful_plant import plant_of
 from pdeloop.messages.actuators import extents
 from pdeloop.messages.cost import Cost
 from pdeloop.messages.parameters import INSTRUMENTS, table
 from pdeloop.messages.spec import ParameterError
 
-_GRID = (
-    "n_z",
-    "n_a",
-    "sample_time",
-    "integration_time",
-    "horizon",
-    "state_weight",
-    "action_weight",
-    "divergence_bound",
-)
 _FIXED = ("n_z", "n_a", "sample_time")
 """Parameters that a user's own plant supplies and a problem cannot change."""
 EXTENTS, BOUNDS = "actuator_extents", "action_bounds"
@@ -108,7 +98,7 @@ def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[st
 
 def _spectral_plant(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
     equation = build_equation(values)
-    grid = {name: values[name] for name in _GRID}
+    grid = {name: values[name] for name in NUMBERS}
     grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
     physical = asdict(equation)
     del physical["length"]

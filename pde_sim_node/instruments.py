@@ -63,8 +63,7 @@ def standard_normal(
     # The draws of one call count in the low words: no two calls ever share a counter.
     counter = np.array([0, 0, step, int(kind)], dtype=np.uint64)
     generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
-    draw: NDArray[np.float64] = generator.standard_normal(size)
-    return draw
+    return generator.standard_normal(size)
 
 
 class InstrumentedPlant:

@@ -60,8 +60,7 @@ def placed_supports(
             )
         distance = np.abs(np.arange(n_x)[:, None] / n_x - centres)
         distance = np.minimum(distance, 1.0 - distance)
-        shapes: NDArray[np.float64] = np.exp(-0.5 * (distance / width) ** 2)
-        return shapes
+        return np.exp(-0.5 * (distance / width) ** 2)
     supports = np.zeros((n_x, len(centres)))
     for j, ends in enumerate(placed_indicators(n_x, centres.tolist(), width * n_x)):
         supports[np.arange(*ends) % n_x, j] = 1.0

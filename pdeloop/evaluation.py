@@ -149,8 +149,7 @@ def mean_costs(
     ]
     batch = Batch(np.array(rows, dtype=np.float64), np.repeat(policies, len(starts), axis=0))
     result = pair.run(batch, values["max_batch"])
-    costs: Array = result.costs[:, CostColumn.MEAN].reshape(len(policies), len(starts))
-    return costs
+    return result.costs[:, CostColumn.MEAN].reshape(len(policies), len(starts))
 
 
 def _costs(run: FinishedRun, pair: LocalPair, seeds: int, **fields: Any) -> dict[str, Array]:

@@ -354,8 +354,7 @@ def merged(runs: Sequence[FinishedRun]) -> FinishedRun:
 
 def field_means(costs: Array) -> Array:
     """Means over the last axis, the fields; NaN where a rollout diverged."""
-    means: Array = np.where((costs < DIVERGED_COST).all(axis=-1), costs.mean(axis=-1), np.nan)
-    return means
+    return np.where((costs < DIVERGED_COST).all(axis=-1), costs.mean(axis=-1), np.nan)
 
 
 @dataclass(frozen=True)

@@ -113,8 +113,7 @@ class Frames:
         self._time.set_text(f"t = {step * self._plant.sample_time:.3g} s")
         with rc_context(STYLE):  # in which ticks are made
             self._canvas.draw()
-        drawn: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-        return drawn
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _begin(self, axes: Sequence[Axes], column: int, component: int, colour: str) -> Show:
         """A component of the field in one column, on the first of these axes or the first two."""

@@ -28,7 +28,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.laws.base import Law, differentiable
 from pdeloop.method.laws.registry import action, arithmetic_of_laws, updated
 
-__all__ = ["CostGradient", "Gradients", "features"]
+__all__ = ["CostGradient", "Gradients"]
 
 
 class CostGradient(NamedTuple):
@@ -140,29 +140,12 @@ class Gradients:
         gains = finite_array("policy", policy, (self.plant.n_a, 2 * n_s))
         s_r = basis.T @ self.plant.target
         theta = np.column_stack([gains[:, :n_s], gains[:, n_s:] @ s_r])
-        found = self.of_law(basis, theta, fields)
+        target = self.plant.target
+        episode = self._roll(fields, lambda _, z: features(basis, target, z) @ theta.T)
+        found = self._gradient(episode, theta, basis)
         by_theta = found.gradient
         by_policy = np.hstack([by_theta[:, :n_s], np.outer(by_theta[:, n_s], s_r)])
         return found._replace(gradient=by_policy)
-
-    def of_law(self, U: Array, theta: Array, fields: ArrayLike) -> CostGradient:
-        """J and dJ/dtheta of the law a = theta [U^T z; 1].
-
-        Parameters
-        ----------
-        U : (n_z, n_s)
-            Basis.
-        theta : (n_a, n_s + 1)
-            [K b]; b counts nothing where the target lies outside of U.
-        fields : (M,) int, or (M, n_z)
-            Initial fields.
-
-        Returns
-        -------
-        CostGradient
-            J, dJ/dtheta (n_a, n_s + 1) and dJ/dz_0 (M, n_z).
-        """
-        return self._gradient(self.law(U, theta, fields), theta, U)
 
     def of_theta(self, law: Law, theta: ArrayLike, fields: ArrayLike) -> CostGradient:
         """J and dJ/dtheta of any law that has derivatives, through its memory where it has one.
@@ -234,27 +217,6 @@ class Gradients:
                 mu[m] = on_memory + directly
         return CostGradient(float(episode.costs.mean.mean()), gradient, eta)
 
-    def law(self, U: Array, theta: Array, fields: ArrayLike) -> EpisodeRecord:
-        """An episode under the law a = theta [U^T z; 1].
-
-        Parameters
-        ----------
-        U : (n_z, n_s)
-            Basis.
-        theta : (n_a, n_s + 1)
-            [K b].
-        fields : (M,) int, or (M, n_z)
-            Initial fields.
-
-        Returns
-        -------
-        EpisodeRecord
-            Without states and with infinite costs where the law makes the actions overflow.
-        """
-        return self._roll(
-            fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
-        )
-
     def _roll(self, fields: ArrayLike, law: Actions) -> EpisodeRecord:
         def finite(k: int, z: Array) -> Array:
             a = law(k, z)
@@ -296,8 +258,7 @@ class Gradients:
         plant, M = self.plant, len(episode.costs.mean)
         if plant.cost.plain:
             return 0.0
-        slope: Array = plant.cost.terminal_slope(episode.states[-1]) / (M * plant.horizon)
-        return slope
+        return plant.cost.at_end(episode.states[-1])[1] / (M * plant.horizon)
 
     def _pulled_back(self, k: int, z: Array, a: Array, eta: Array) -> tuple[Array, Array]:
         """dJ/dz_k and dJ/da_k for a given action, from dJ/dz_{k+1}."""

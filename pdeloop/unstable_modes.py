@@ -156,8 +156,7 @@ def _moved(plant: Plant, states: Array, actions: Array) -> Array:
     """What displacements from the target and actions lead to a step later, by central differences."""
     plus, _ = plant.evaluate(plant.field_target + states, actions)
     minus, _ = plant.evaluate(plant.field_target - states, -actions)
-    change: Array = 0.5 * (plus - minus)
-    return change
+    return 0.5 * (plus - minus)
 
 
 def _product(plant: Plant, v: Array) -> Array:

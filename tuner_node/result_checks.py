@@ -114,5 +114,4 @@ def _actions(law: Law, theta: Array, states: Array, actions: Array) -> Array:
     if not law.has_gains(theta):
         return along(law, theta, states, actions)
     K_a, K_b = np.hsplit(law.gains(theta), 2)
-    expected: Array = states @ law.model.U @ K_a.T + K_b @ law.model.s_r
-    return expected
+    return states @ law.model.U @ K_a.T + K_b @ law.model.s_r

@@ -29,7 +29,7 @@ from pdeloop.solver.memory import StepSettings
 from pdeloop.solver.pointwise import NotCompiledError
 from pdeloop.solver.workers import ParallelStep
 
-_NUMBERS = (
+NUMBERS = (
     "n_z",
     "n_a",
     "sample_time",
@@ -39,6 +39,7 @@ _NUMBERS = (
     "action_weight",
     "divergence_bound",
 )
+"""Parameters of a problem that are arguments of the same name."""
 
 
 class SpectralPlant(BatchPlant):
@@ -193,7 +194,7 @@ class SpectralPlant(BatchPlant):
     @property
     def definition(self) -> Definition:
         """Its parameters and the source of its equation; see `Definition`."""
-        values = {name: getattr(self, name) for name in _NUMBERS} | {"actuator_width": self.width}
+        values = {name: getattr(self, name) for name in NUMBERS} | {"actuator_width": self.width}
         # Defaults are omitted so that fingerprints from older versions stay valid.
         if self.shape != "equation":
             values["actuator_shape"] = self.shape
@@ -227,7 +228,7 @@ class SpectralPlant(BatchPlant):
         """With half the integration time; None where the step is exact."""
         if isinstance(self.equation, LinearEquation):
             return None
-        given = {name: getattr(self, name) for name in (*_NUMBERS, "width", "shape", "positions")}
+        given = {name: getattr(self, name) for name in (*NUMBERS, "width", "shape", "positions")}
         given["integration_time"] /= 2
         return SpectralPlant(self.equation, **given, cost=self._own_cost)
 

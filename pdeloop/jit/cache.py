@@ -80,8 +80,7 @@ def jit_in_closure(function: F) -> F:
     The variables of a closure are part of its key on disk. A plain function has the same key in every
     process, a Numba dispatcher does not, so the function itself is returned.
     """
-    registered: F = register_jitable(**_PART)(function)
-    return registered
+    return register_jitable(**_PART)(function)
 
 
 def inlined_njit(function: F) -> F:

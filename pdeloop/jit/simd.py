@@ -55,8 +55,7 @@ class LanesModel(models.PrimitiveModel):
 
 def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     """Numba's decorator; the result is called without the first argument, the typing context."""
-    made: Callable[..., Any] = numba_intrinsic(function)
-    return made
+    return numba_intrinsic(function)
 
 
 def pointer(builder: Any, address: Any, offset: Any, kind: Any = NUMBER) -> Any:

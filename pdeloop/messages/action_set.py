@@ -325,8 +325,7 @@ class ActionSet:
             [np.broadcast_to(self.start, (1, *applied.shape[1:])), applied[:-1]]
         )
         low, high = self.within(before)
-        found: NDArray[np.bool_] = (applied <= low) | (applied >= high)
-        return found
+        return (applied <= low) | (applied >= high)
 
     def limits(self, n_a: int) -> dict[str, Array]:
         """low and high, and with rate limits rate and start, a_{-1}, (n_a,) each."""
@@ -403,8 +402,7 @@ def _bound(side: str, given: ArrayLike | None, n_a: int) -> Array:
     bound = float_array(f"action_{side}", values)
     if bound.shape not in ((), (n_a,)) or np.isnan(bound).any():
         raise ValueError(f"action_{side} must be a number or {n_a} numbers, got {values!r}")
-    own: Array = np.broadcast_to(bound, n_a).copy() if n_a else bound.copy()
-    return own
+    return np.broadcast_to(bound, n_a).copy() if n_a else bound.copy()
 
 
 ANY_ACTION = ActionSet()

@@ -100,7 +100,10 @@ class Cost:
         self.state_weight = _weight("state_weight", state_weight, n_y)
         self.action_weight = _weight("action_weight", action_weight, n_a)
         self.terminal_weight = _weight("terminal_weight", terminal_weight, n_y)
-        _require_definite(self.action_weight)
+        weight = self.action_weight
+        least = weight.min() if weight.ndim < 2 else np.linalg.eigvalsh(weight)[0]
+        if not least > 0.0:
+            raise ValueError(f"action_weight must be positive, got {float(least):g}")
         self.target = _rows("target", target, n_y, horizon)
         self.action_target = np.broadcast_to(_finite("action_target", action_target), n_a).copy()
         self.plain = (
@@ -159,8 +162,8 @@ class Cost:
 
     def slopes(self, states: Array, actions: Array, k: int) -> tuple[Array, Array]:
         """Derivatives of the stage cost by states (M, n_z) and actions (M, n_a)."""
-        on_actions = self._action.slope(actions, self.action_target)
-        return self._state.slope(states, self.wanted(k)), on_actions
+        on_actions = self._action.along(actions, self.action_target)[1]
+        return self._state.along(states, self.wanted(k))[1], on_actions
 
     def along(self, states: Array, actions: Array, first: int) -> tuple[Array, Array, Array]:
         """The cost of H steps from step `first` on, and its derivatives by states and actions.
@@ -187,10 +190,6 @@ class Cost:
         """The cost of the last states (M, n_z), (M,), and its derivative, (M, n_z)."""
         return self._terminal.along(states, self.wanted(self.horizon))
 
-    def terminal_slope(self, states: Array) -> Array:
-        """The derivative of the cost of the last states, (M, n_z)."""
-        return self._terminal.slope(states, self.wanted(self.horizon))
-
     def residual(self, basis: Array, *, terminal: bool = False) -> Array:
         """E times columns (n_z, n), (n_r, n): Q of coordinates s, z = basis s, is its square."""
         return (self._terminal if terminal else self._state).rows(basis)
@@ -214,7 +213,8 @@ class Cost:
     @property
     def action_matrix(self) -> Array:
         """R, (n_a, n_a)."""
-        return _matrix(self.action_weight, self.n_a)
+        weight = self.action_weight
+        return weight if weight.ndim == 2 else np.diag(np.broadcast_to(weight, self.n_a))
 
     @property
     def size(self) -> tuple[float, float]:
@@ -304,12 +304,6 @@ class _Square:
         for m, own in enumerate(values):
             totals[m] += np.square((self._E * own).sum(axis=1) - aim).sum()
 
-    def slope(self, values: Array, wanted: Array) -> Array:
-        if self._E is None:
-            return 2.0 * self._weight * (values - wanted)
-        slope: Array = 2.0 * (values @ self._E.T - self.scaled(wanted)) @ self._E
-        return slope
-
     def along(self, values: Array, wanted: Array) -> tuple[Array, Array]:
         """The squares (...) of values (..., n), and their derivatives (..., n)."""
         if self._E is None:
@@ -346,12 +340,6 @@ def _weight(name: str, values: ArrayLike, size: int) -> Array:
     return weight
 
 
-def _require_definite(weight: Array) -> None:
-    least = weight.min() if weight.ndim < 2 else np.linalg.eigvalsh(weight)[0]
-    if not least > 0.0:
-        raise ValueError(f"action_weight must be positive, got {float(least):g}")
-
-
 def _root(weight: Array, name: str = "weight") -> Array:
     """W (n_r, n) with W'W = weight."""
     values, vectors = np.linalg.eigh(weight)
@@ -375,10 +363,6 @@ def _rows(name: str, values: ArrayLike, size: int, horizon: int) -> Array:
             f"for each step, got shape {np.shape(values)}"
         )
     return array
-
-
-def _matrix(weight: Array, size: int) -> Array:
-    return weight if weight.ndim == 2 else np.diag(np.broadcast_to(weight, size))
 
 
 def _packed(array: Array) -> Any:

@@ -428,8 +428,7 @@ class Grid:
             As for `equally_spaced`.
         """
         first = self.points * np.arange(len(self.components), dtype=np.int64)
-        found: NDArray[np.int64] = (first[:, None] + self.equally_spaced(count)).ravel()
-        return found
+        return (first[:, None] + self.equally_spaced(count)).ravel()
 
     def between(self, count: int) -> Array:
         """The state that readings of so many sensors suggest, as a matrix (n_z, components * count).
@@ -464,8 +463,7 @@ class Grid:
             where = np.stack(np.unravel_index(every, self.shape), axis=1) / np.array(self.shape)
             off = np.sum((where[:, None] - where[places]) ** 2, axis=2)
             rows = np.eye(count)[:, np.argmin(off, axis=1)]
-        found: Array = np.kron(np.eye(len(self.components)), rows.T)
-        return found
+        return np.kron(np.eye(len(self.components)), rows.T)
 
     def _counts(self, count: int) -> tuple[int, ...]:
         """Numbers of sensors along the axes."""

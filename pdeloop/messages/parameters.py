@@ -346,8 +346,7 @@ def recorded_values(values: Mapping[str, Any]) -> dict[str, Any]:
 def model_order(values: Mapping[str, Any]) -> int:
     """n_s of the reduced model that these parameters identify; 0: as the data suggest."""
     own = values["dmdc_order"] if values["identification"] == "dmdc" else 0
-    order: int = own or values["reduced_order"]
-    return order
+    return own or values["reduced_order"]
 
 
 def taken_by(node: str) -> tuple[Spec, ...]:

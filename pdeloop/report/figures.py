@@ -219,8 +219,7 @@ def spectrum(problem: ProblemData) -> Figure:
 def _closed_loop(model: ModelRows, policy: Array) -> Eigenvalues:
     """Eigenvalues of A + B K_a with the gains of a policy [K_a K_b], or of its rows in a vector."""
     K_a = policy.reshape(model.policy.shape)[:, : len(model.A)]
-    values: Eigenvalues = np.linalg.eigvals(model.A + model.B @ K_a)
-    return values
+    return np.linalg.eigvals(model.A + model.B @ K_a)
 
 
 def _eigenvalues(ax: Axes, found: Sequence[Eigenvalues], colour: str, shown: int) -> None:

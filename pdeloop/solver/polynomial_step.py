@@ -213,8 +213,7 @@ def _with_constant(actions: Array) -> Array:
 
 
 def _complex(planes: Array) -> NDArray[np.complex128]:
-    values: NDArray[np.complex128] = planes[..., 0, :] + 1j * planes[..., 1, :]
-    return values
+    return planes[..., 0, :] + 1j * planes[..., 1, :]
 
 
 def fine_length(n_x: int, degree: int) -> int:
@@ -285,8 +284,7 @@ def on_fine_grid(rows: Array, length: int) -> NDArray[np.complex128]:
         spectra[..., -1] *= 0.5
     spectra *= 2 * length / n_x
     values = np.fft.irfft(spectra, n=2 * length)
-    fine: NDArray[np.complex128] = values[..., ::2] + 1j * values[..., 1::2]
-    return fine
+    return values[..., ::2] + 1j * values[..., 1::2]
 
 
 def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:

@@ -118,7 +118,7 @@ def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
 
 @pytest.mark.parametrize("problem", [*PROBLEMS, "wave"])
 def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
-    """By the law, the policy, the actions and the initial fields; of a linear plant, too."""
+    """By the policy, the actions and the initial fields; of a linear plant, too."""
     plant = shipped(problem, horizon=25)
     rng = np.random.default_rng(2)
     gradients = Gradients(plant)
@@ -131,10 +131,6 @@ def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
         slope = derivative(lambda s: function(at + s * direction).cost, h)
         assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
 
-    theta = 0.1 * rng.standard_normal((plant.n_a, 5))
-    found = gradients.of_law(U, theta, seeds)
-    assert found.cost == gradients.law(U, theta, seeds).costs.mean.mean()
-    check(lambda t: gradients.of_law(U, t, seeds), theta, found.gradient)
     policy = 0.1 * rng.standard_normal((plant.n_a, 8))
     found = gradients.of_policy(U, policy, seeds)
     check(lambda p: gradients.of_policy(U, p, seeds), policy, found.gradient)
@@ -146,20 +142,19 @@ def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
 
 
 def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
-    """theta = [K_a, K_b s_r] is the projected law that runs in the loop."""
+    """It is the projected law that runs in the loop."""
     plant = shipped("burgers", horizon=40)
     rng = np.random.default_rng(3)
     U = np.linalg.qr(rng.standard_normal((plant.n_z, 3)))[0]
     policy = 0.2 * rng.standard_normal((plant.n_a, 6))
-    theta = np.column_stack([policy[:, :3], policy[:, 3:] @ (U.T @ plant.target)])
     measured = rollout(plant, projected_law(plant, U, policy), [7, 8]).costs.mean
-    found = Gradients(plant).law(U, theta, [7, 8])
-    np.testing.assert_allclose(found.costs.mean, measured, rtol=1e-11)
+    found = Gradients(plant).of_policy(U, policy, [7, 8])
+    assert found.cost == pytest.approx(measured.mean(), rel=1e-11)
 
 
 def test_a_rollout_that_diverges_costs_infinity():
     plant = shipped("kdv", horizon=30)
-    theta = np.full((plant.n_a, 5), 1e3)
+    policy = np.full((plant.n_a, 8), 1e3)
     U = np.linalg.qr(np.random.default_rng(0).standard_normal((plant.n_z, 4)))[0]
-    cost, gradient, _ = Gradients(plant).of_law(U, theta, [0])
+    cost, gradient, _ = Gradients(plant).of_policy(U, policy, [0])
     assert cost == np.inf and not gradient.any()
