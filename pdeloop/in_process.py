@@ -8,6 +8,7 @@ pure functions from the same float64 arrays; only the transport is missing.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,10 @@ from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from pdeloop.messages import model_rows
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from pdeloop.messages.topics import CostColumn, StartColumn, noise_seeds
 from pdeloop.method.laws.registry import law_kind, laws_of
 from tuner_node.batch import Batch, BatchResult, NoModelError, most_environments
+from tuner_node.chunk import Chunk, ChunkQueue, gathered
 from tuner_node.pair import cut
 from tuner_node.training import Training
 
@@ -58,29 +60,11 @@ class LocalPair:
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. NoModelError if exploration gives no model though no rollout diverged."""
         plant, batch = self.plant, batch.within(max_batch)
-        max_batch = most_environments(max_batch, plant.state_size, plant.horizon)
-        most = max(max_batch // batch.together, 1) * batch.together
-        parts = [
-            self._episode(
-                Batch(
-                    batch.rows[i : i + most],
-                    None if batch.policies is None else batch.policies[i : i + most],
-                    batch.trajectories,
-                )
-            )
-            for i in range(0, len(batch.rows), most)
-        ]
-        models = [part.models for part in parts if part.models is not None]
-        if len(models) < len(parts):  # as over topics
-            models = []
-        return BatchResult(
-            np.concatenate([part.costs for part in parts]),
-            batch.joined(models),
-            self.fingerprint,
-            [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
-            self.plant.target,
-            frozenset([self.plant.horizon]),
-        )
+        largest = most_environments(max_batch, plant.state_size, plant.horizon)
+        chunks = ChunkQueue(batch, largest, pairs=1).waiting
+        for chunk in chunks:
+            self._carry_out(chunk, batch)
+        return gathered(chunks, batch, self.fingerprint, plant.target)
 
     def roll_out(self, batch: Batch) -> EpisodeRecord:
         """The episode of a batch; states and actions of one that is exploratory or asks for them."""
@@ -88,23 +72,24 @@ class LocalPair:
         keep = batch.exploratory or batch.trajectories
         return rollout(self.plant, self.law(batch), seeds, noise_seeds(batch.rows), keep=keep)
 
-    def _episode(self, batch: Batch) -> BatchResult:
-        episode = self.roll_out(batch)
-        table, seen = episode.costs.rows(), None
+    def _carry_out(self, chunk: Chunk, batch: Batch) -> None:
+        policies = None if batch.policies is None else batch.policies[chunk.rows]
+        episode = self.roll_out(replace(batch, rows=batch.rows[chunk.rows], policies=policies))
+        chunk.costs, chunk.steps = episode.costs.rows(), self.plant.horizon
         if batch.trajectories:
-            seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
-        if not batch.exploratory or (table[:, CostColumn.ENDED] != COMPLETED).any():
-            return BatchResult(table, trajectories=seen)
-        numbers = batch.rows[:, StartColumn.MODEL].astype(int).tolist()
+            ended = chunk.costs[:, CostColumn.ENDED]
+            chunk.trajectories = cut(episode.states, episode.actions, ended)
+        if not (batch.exploratory and chunk.completed):
+            return
+        numbers = batch.rows[chunk.rows, StartColumn.MODEL].astype(int).tolist()
         try:
-            models = design_each(
+            chunk.models = design_each(
                 episode.states, episode.actions, numbers, self.plant.target, self._settings
             )
         except np.linalg.LinAlgError:
             raise
         except ValueError as error:
             raise NoModelError(f"no reduced model: {error}") from error
-        return BatchResult(table, models, trajectories=seen)
 
     def law(self, batch: Batch) -> Law:
         """Every environment's policy on the model that it belongs to, or its excitation."""
