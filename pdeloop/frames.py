@@ -22,7 +22,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.report import planes
 from pdeloop.report.places import beside, mark_places, moving_target
-from pdeloop.report.style import FIELD_MAP, image
+from pdeloop.report.style import field_image
+from viewer_node.picture import middle
 
 DOTS = 100
 """Pixels of an inch."""
@@ -105,7 +106,7 @@ class Frames:
         if self._moving is not None:
             target = grid.fields(self._moving[step])
             for picture, values in zip(self._pictures, target, strict=False):
-                picture.set_data(planes.middle(values))
+                picture.set_data(middle(values))
         for (bars, ax), own in zip(self._bars, actions, strict=True):
             for bar, value in zip(bars, own, strict=True):
                 bar.set_height(value)
@@ -157,10 +158,10 @@ class Frames:
         _, own, axis = self._plant.grid.parts[component]
         whole = self._fields[column, :, own].T
         end = self._plant.sample_time * (whole.shape[1] - 1)
-        low, high = field_range(self._fields[..., own], self._span(component))
+        limits = field_range(self._fields[..., own], self._span(component))
         so_far = np.full_like(whole, np.nan)
         extent = (0.0, end, 0.0, axis.length)
-        drawn = image(ax, so_far, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
+        drawn = field_image(ax, so_far, extent, limits)
         ax.set_facecolor("0.88")
         ax.set(ylabel=axis.label, xlabel="t (s)")
 
@@ -169,7 +170,7 @@ class Frames:
             drawn.set_data(so_far)
 
         if column == len(self._fields) - 1 and self._moving is None:
-            beside(ax, self._target(component), (low, high), axis.length)
+            beside(ax, self._target(component), limits, axis.length)
         return show
 
     def _plane(self, ax: Axes, component: int) -> Show:
@@ -191,7 +192,7 @@ class Frames:
                 if least < low or most > high:
                     low, high = min(least, low), max(most, high)
                     picture.set_clim(low, high)
-            picture.set_data(planes.middle(values))
+            picture.set_data(middle(values))
 
         return show
 

@@ -17,7 +17,7 @@ from pdeloop.messages.colour_scale import field_range
 from pdeloop.method.laws import Affine
 from pdeloop.report import figures, places, planes
 from pdeloop.report.data import ProblemData, of_run
-from pdeloop.report.style import FIELD_MAP, STYLE, image
+from pdeloop.report.style import STYLE, field_image
 
 __all__ = [
     "plot_behaviour",
@@ -68,34 +68,23 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
         for i, (name, own, axis) in enumerate(parts):
             ax, extent = maps[each * i], (0.0, times[-1], 0.0, axis.length)
             field, target = episode.fields[:, environment, own], plant.field_target[own]
-            low, high = field_range(field, target if moving is None else moving[:, own])
+            limits = field_range(field, target if moving is None else moving[:, own])
             if moving is not None:
                 goal = maps[each * i + 1]
-                wanted: Any = image(
-                    goal,
-                    moving[: steps + 1, own].T,
-                    extent,
-                    origin="lower",
-                    cmap=FIELD_MAP,
-                    vmin=low,
-                    vmax=high,
-                )
+                wanted = field_image(goal, moving[: steps + 1, own].T, extent, limits)
                 goal.set_ylabel(axis.label)
                 figure.colorbar(wanted, ax=goal, label=f"target of {name}", pad=0.01)
-            drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
+            drawn = field_image(ax, field.T, extent, limits)
             if moving is None:
-                places.beside(ax, target, (low, high), axis.length)
+                places.beside(ax, target, limits, axis.length)
             ax.set_ylabel(axis.label)
             figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
         applied = episode.applied[:, environment]
-        limits = places.action_range([applied], plant.action_set)
-        picture: Any = places.held_actions(below, times, applied, plant.action_set, limits)
+        limits, size = places.action_range([applied], plant.action_set), 8
+        picture: Any = places.held_actions(below, times, applied, plant.action_set, limits, size)
         if picture is not None:
             figure.colorbar(picture, ax=below, label="$a_j(t)$", pad=0.01)
-        if text := places.share_text(applied, plant.action_set):
-            below.set_title(text, loc="right", fontsize=8, color="0.4", pad=2)
         places.name_actions(below, plant.n_a)
-        below.set_xlabel("t (s)")
     return figure
 
 

@@ -94,12 +94,9 @@ def shape_of(grid: Grid, state: Array, ranges: Sequence[Range], *, beside: bool 
     lines = [np.stack([axis.points, state[own]], axis=1) for _, own, axis in grid.parts]
     if len(lines) == 1:
         return Shape(lines[0])
-    return Shape(np.concatenate([_pairs(line) for line in lines]), pairs=True)
-
-
-def _pairs(line: Array) -> Array:
-    """The two ends of each piece of a line."""
-    return np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 2)
+    # The two ends of each piece.
+    pairs = [np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 2) for line in lines]
+    return Shape(np.concatenate(pairs), pairs=True)
 
 
 def _cells(grid: Grid, state: Array, ranges: Sequence[Range], beside: bool) -> Shape:

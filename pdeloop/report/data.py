@@ -22,6 +22,7 @@ from pdeloop.in_process import LocalPair
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import checked_array, unpack_arrays
 from pdeloop.messages.arrays import Array
+from pdeloop.messages.controllers import CONTROLLERS
 from pdeloop.messages.cost import measured_cost
 from pdeloop.messages.model_rows import ModelRows
 from pdeloop.method.laws.registry import law_kind, laws_of
@@ -48,6 +49,13 @@ class Behaviour:
     actions: Array
     cost: float
     diverged: int
+
+    @property
+    def title(self) -> str:
+        """The controller's name, and its cost or where it diverged."""
+        lost = self.diverged >= 0
+        told = f"diverged at step {self.diverged}" if lost else f"mean stage cost {self.cost:.3g}"
+        return f"{CONTROLLERS[self.controller].name}\n{told}"
 
 
 @dataclass(frozen=True)

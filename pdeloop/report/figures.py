@@ -22,10 +22,10 @@ from pdeloop.report import places, planes
 from pdeloop.report.data import Curve, ProblemData
 from pdeloop.report.style import (
     COLOURS,
-    FIELD_MAP,
     GAIN_MAP,
     LINES,
     NAMES,
+    field_image,
     image,
     panels,
     plain_log,
@@ -53,15 +53,10 @@ def behaviour(problem: ProblemData) -> Figure:
     limits = places.action_range([b.actions for b in shown], plant.action_set)
     times = problem.first.values["sample_time"] * np.arange(len(shown[0].states))
     for column, b in enumerate(shown):
-        outcome = f"mean stage cost {b.cost:.3g}"
-        outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
-        grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
+        grid[0, column].set_title(b.title)
         picture: Any = places.held_actions(
             grid[fields, column], times, b.actions, plant.action_set, limits
         )
-        grid[fields, column].set_xlabel("t (s)")
-        if text := places.share_text(b.actions, plant.action_set):
-            grid[fields, column].set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
         for ax in grid[:, column]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
     places.name_actions(grid[fields, 0], plant.n_a)
@@ -89,18 +84,18 @@ def _maps(
     fields = [b.states[:, own] for b in problem.behaviours]
     target = problem.plant.field_target[own]
     moving = places.moving_target(problem.plant)
-    low, high = field_range(np.stack(fields), target if moving is None else moving[:, own])
+    limits = field_range(np.stack(fields), target if moving is None else moving[:, own])
     fields += [] if moving is None else [moving[:, own]]
     for ax, values in zip(axes, fields, strict=True):
         ax.set_facecolor("0.9")
         extent = (0.0, end, 0.0, axis.length)
-        drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
+        drawn = field_image(ax, values.T, extent, limits)
         ax.set_xlabel("t (s)")
     axes[0].set_ylabel(axis.label)
     if _numbered(axis):
         axes[0].yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     if moving is None:
-        places.beside(axes[-1], target, (low, high), axis.length)
+        places.beside(axes[-1], target, limits, axis.length)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 

@@ -132,7 +132,6 @@ Drawn = Iterator[tuple[str, str, str, Figure]]
 
 
 def _shared(problems: Sequence[ProblemData]) -> Drawn:
-    """The figures over all problems."""
     learned = [problem for problem in problems if problem.curves]
     if learned:
         seeds = max(len(problem.first.seeds) for problem in learned)
@@ -161,7 +160,6 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
 
 
 def _of_problem(problem: ProblemData) -> Drawn:
-    """The figures of one problem."""
     name, seed = problem.name, problem.first.seeds[problem.shown]
     if not problem.behaviours:
         return
@@ -266,7 +264,6 @@ Table = tuple[Sequence[str], list[tuple[str, ...]]]
 
 
 def _facts(data: ReportData) -> list[tuple[str, str]]:
-    """The facts about the reported runs."""
     first = data.problems[0]
     seeds, values = first.first.seeds, first.first.values
     if data.study is not None:
@@ -331,7 +328,6 @@ def _results(problems: Sequence[ProblemData], table: Sequence[dict[str, dict[str
 
 
 def _budget(problems: Sequence[ProblemData]) -> Table:
-    """The rollouts of a seed by purpose."""
     rows = []
     for problem in problems:
         for name, run in problem.runs.items():

@@ -12,7 +12,7 @@ from pde_sim_node.plant import Plant
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.grid import Grid
-from pdeloop.report.style import FIELD_MAP, image
+from pdeloop.report.style import field_image
 
 HEIGHT = 0.06
 """Share of a curve's axes that the actuators' supports take."""
@@ -64,15 +64,7 @@ def beside(ax: Axes, target: Array, limits: tuple[float, float], length: float) 
     """The target of a field on one axis, as a strip in its colours to the right of `ax`."""
     strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))
     extent = (0.0, 1.0, 0.0, length)
-    image(
-        strip,
-        target[:, None],
-        extent,
-        origin="lower",
-        cmap=FIELD_MAP,
-        vmin=limits[0],
-        vmax=limits[1],
-    )
+    field_image(strip, target[:, None], extent, limits)
     strip.set(xticks=[], yticks=[])
     strip.set_xlabel("target", fontsize=7, labelpad=3)  # above, the title of `ax` may be wide
 
@@ -121,16 +113,25 @@ def action_range(parts: list[Array], allowed: ActionSet) -> tuple[float, float]:
 
 
 def held_actions(
-    ax: Axes, times: Array, applied: Array, allowed: ActionSet, limits: tuple[float, float]
+    ax: Axes,
+    times: Array,
+    applied: Array,
+    allowed: ActionSet,
+    limits: tuple[float, float],
+    fontsize: float = 7,
 ) -> object | None:
-    """Draw the actions (T, n_a) of one environment; the picture, for a colour bar, if it is one."""
+    """Draw the actions (T, n_a) of one environment; the picture, for a colour bar, if it is one.
+
+    fontsize: of the share of actions at a bound, above them.
+    """
     n_a = applied.shape[1]
+    ax.set_xlabel("t (s)")
     ax.set_xlim(0.0, float(times[-1]))
+    if text := share_text(applied, allowed):
+        ax.set_title(text, loc="right", fontsize=fontsize, color="0.4", pad=2)
     if n_a > FEW:
         extent = (0.0, float(times[-1]), 0.5, n_a + 0.5)
-        drawn: object = image(
-            ax, applied.T, extent, origin="lower", cmap=FIELD_MAP, vmin=limits[0], vmax=limits[1]
-        )
+        drawn: object = field_image(ax, applied.T, extent, limits)
         ax.set_facecolor("0.9")
         step = max(1, -(-n_a // 12))
         ax.set_yticks(range(1, n_a + 1, step))

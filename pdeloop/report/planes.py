@@ -15,7 +15,8 @@ from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
 from pdeloop.messages.grid import Grid
 from pdeloop.report import places
-from pdeloop.report.style import FIELD_MAP, NAMES
+from pdeloop.report.style import FIELD_MAP
+from viewer_node.picture import middle
 
 if TYPE_CHECKING:
     from pdeloop.episode import EpisodeRecord
@@ -51,10 +52,8 @@ def behaviour(problem: ProblemData) -> Figure:
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
     limits = places.action_range([b.actions for b in shown], plant.action_set)
     for column, b in enumerate(shown):
-        outcome = f"mean stage cost {b.cost:.3g}"
-        outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
-        axes[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
-        _held(axes[-1, column], times, b.actions, plant, limits)
+        axes[0, column].set_title(b.title)
+        places.held_actions(axes[-1, column], times, b.actions, plant.action_set, limits)
     places.name_actions(axes[-1, 0], plant.n_a)
     axes[-1, -1].set_axis_off()
     return figure
@@ -82,7 +81,8 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
     below = figure.add_subplot(len(components) + 1, 1, len(components) + 1)
     times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
     applied = record.applied[:, environment]
-    _held(below, times, applied, plant, places.action_range([applied], plant.action_set))
+    limits = places.action_range([applied], plant.action_set)
+    places.held_actions(below, times, applied, plant.action_set, limits)
     places.name_actions(below, plant.n_a)
     return figure
 
@@ -126,24 +126,7 @@ def plane(ax: Axes, grid: Grid, state: Array, component: int, low: float, high: 
     )
 
 
-def middle(values: Array) -> Array:
-    """A component on its last two axes; of others the middle."""
-    while values.ndim > 2:
-        values = values[len(values) // 2]
-    return values
-
-
 def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
-    """Range of the colours of a component."""
     values = np.concatenate([part.ravel() for part in parts])
     moving, own = places.moving_target(plant), plant.grid.part(component)
     return field_range(values, plant.field_target[own] if moving is None else moving[:, own])
-
-
-def _held(
-    ax: Axes, times: Array, applied: Array, plant: Plant, limits: tuple[float, float]
-) -> None:
-    places.held_actions(ax, times, applied, plant.action_set, limits)
-    if text := places.share_text(applied, plant.action_set):
-        ax.set_title(text, loc="right", fontsize=7, color="0.4", pad=2)
-    ax.set_xlabel("t (s)")

@@ -70,6 +70,17 @@ def image(ax: Axes, values: Array, extent: tuple[float, float, float, float], **
     return ax.imshow(values, aspect="auto", interpolation="nearest", extent=extent, **more)
 
 
+def field_image(
+    ax: Axes,
+    values: Array,
+    extent: tuple[float, float, float, float],
+    limits: tuple[float, float],
+) -> Any:
+    """Draw a matrix in the colours of fields between these limits, its first row below."""
+    low, high = limits
+    return image(ax, values, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
+
+
 def plain_log(ax: Axes, ratio: float) -> None:
     """A logarithmic axis over this ratio, its ticks written as plain numbers."""
     ax.set_yscale("log")
