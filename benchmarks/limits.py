@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pde_sim_node.build import build_equation, build_plant
-from pdeloop.episode import mean_field_cost
+from pde_sim_node.plant import MEAN_FIELD
+from pdeloop.episode import rollout
 from pdeloop.messages.files import read_json
 from pdeloop.messages.parameters import PROBLEM
 from pdeloop.messages.spec import Spec
@@ -32,7 +33,7 @@ def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> 
     """What is kept of the costs for a problem, by evaluation seed."""
     return {
         "parameters": _parameters(values),
-        "no_control_cost": mean_field_cost(build_plant(values)),
+        "no_control_cost": _without_control(values),
         "open_loop": dict(open_loop),
     }
 
@@ -56,9 +57,17 @@ def find(values: Mapping[str, Any], folder: Path = FOLDER) -> NDArray[np.float64
     kept = {spec.name: spec.default for spec in _plant_parameters()} | known["parameters"]
     if len(costs) != values["evaluation_fields"] or kept != _parameters(values):
         return None
-    now = mean_field_cost(build_plant(values))
+    now = _without_control(values)
     same = abs(now / known["no_control_cost"] - 1) <= AGREEMENT
     return np.array(costs, dtype=np.float64) if same else None
+
+
+def _without_control(values: Mapping[str, Any]) -> float:
+    """The mean stage cost from the mean initial field."""
+    plant = build_plant(values)
+    none = np.zeros((1, plant.n_a))
+    episode = rollout(plant, lambda k, z: none, [MEAN_FIELD], np.arange(1), keep=False)
+    return float(episode.costs.mean[0])
 
 
 def _plant_parameters() -> list[Spec]:

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
 from pde_sim_node.dynamics import Dynamics
-from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
+from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.messages.action_set import ANY_ACTION
 from pdeloop.messages.arrays import Array, float_array
 from pdeloop.method.design.lqt import Gains
 
-__all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
+__all__ = ["EpisodeRecord", "Law", "finite_array", "projected_law", "rollout"]
 
 Law: TypeAlias = Callable[[int, Array], Array]
 """(k, z_k of shape (M, state_size)) -> a_k of shape (M, n_a)."""
@@ -143,13 +143,6 @@ def rollout(
     return EpisodeRecord(
         states, fields, actions, plant.episode_costs(), applied, stage_costs, drawn
     )
-
-
-def mean_field_cost(plant: Plant, law: Law | None = None) -> float:
-    """The mean stage cost from the mean initial field, under a law or without control."""
-    none = np.zeros((1, plant.n_a))
-    episode = rollout(plant, law or (lambda k, z: none), [MEAN_FIELD], np.arange(1), keep=False)
-    return float(episode.costs.mean[0])
 
 
 def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike | Gains) -> Law:

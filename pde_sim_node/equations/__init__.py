@@ -29,7 +29,6 @@ from pde_sim_node.equations.loading import EQUATIONS as EQUATIONS
 from pde_sim_node.equations.loading import OWN_EQUATIONS as OWN_EQUATIONS
 from pde_sim_node.equations.loading import allow as allow
 from pde_sim_node.equations.loading import configured_equation as configured_equation
-from pde_sim_node.equations.loading import load_equation as load_equation
 from pde_sim_node.equations.random_modes import RandomModes as RandomModes
 from pde_sim_node.equations.schrodinger import Schrodinger as Schrodinger
 from pde_sim_node.equations.wave import Wave as Wave

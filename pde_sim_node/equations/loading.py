@@ -7,7 +7,6 @@ Which code may be run: `pdeloop.messages.own_code`.
 import os
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 from pde_sim_node.equations.allen_cahn import AllenCahn
 from pde_sim_node.equations.base import Equation
@@ -65,28 +64,7 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
         The name is code that is not allowed, nothing of that name can be loaded, or it is not a
         complete `Equation`.
     """
-    return complete(name, OWN_EQUATIONS.configured(name, environment))
-
-
-def load_equation(name: str) -> type[Equation]:
-    """The equation class that ``name`` stands for. This executes code, whatever its origin.
-
-    Parameters
-    ----------
-    name
-        A key of `EQUATIONS`, the name of an entry point of the group ``pdeloop.equations``,
-        ``package.module:ClassName``, or ``path/to/file.py:ClassName``.
-
-    Raises
-    ------
-    ValueError
-        Nothing of that name can be loaded, or it is not a complete `Equation`.
-    """
-    return complete(name, OWN_EQUATIONS.load(name))
-
-
-def complete(name: str, found: Any) -> type[Equation]:
-    """Return the class that was found if it is a complete equation; else a ValueError."""
+    found = OWN_EQUATIONS.configured(name, environment)
     own = name.rpartition(":")[2]
     if not (isinstance(found, type) and issubclass(found, Equation)):
         raise ValueError(f"equation {shown(name)}: {own} must be a subclass of Equation")

@@ -15,7 +15,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.serialization import deserialize_message, serialize_message
 
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.equations import EQUATIONS, load_equation
+from pde_sim_node.equations import EQUATIONS, OWN_EQUATIONS
 from pde_sim_node.node import physical_specs
 from pdeloop.messages.parameters import NODES, table, taken_by, with_names
 from pdeloop.messages.problem import completed, find_problem, load_parameters, shipped_problems
@@ -181,7 +181,7 @@ def test_the_documents_table_of_equations_is_that_of_the_classes():
     rows = dict(re.findall(r"^\| `([\w-]+)` \| (.*) \|$", section, re.MULTILINE))
     assert list(rows) == list(EQUATIONS)
     for name, row in rows.items():
-        own = {field.name: field.default for field in fields(load_equation(name))}
+        own = {field.name: field.default for field in fields(OWN_EQUATIONS.load(name))}
         del own["length"]  # a parameter of every problem
         assert {word: float(x) for word, x in re.findall(r"`(\w+)` ([-\d.]+)", row)} == own
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pde_sim_node.equations import Burgers, Equation, load_equation
+from pde_sim_node.equations import OWN_EQUATIONS, Burgers, Equation
 from tests.support.spectral_plants import FISHER, FISHER_GRID, PROBLEMS, make
 
 GAUSSIAN = """
@@ -25,7 +25,7 @@ def test_actuators_of_any_shape_at_any_place(tmp_path: Path) -> None:
     path = tmp_path / "fisher.py"
     path.write_text(FISHER + GAUSSIAN)
     grid = FISHER_GRID | {"n_a": 2, "width": 0.1, "sample_time": 1e-6, "integration_time": 1e-6}
-    plant = make(load_equation(f"{path}:Fisher")(), **grid)
+    plant = make(OWN_EQUATIONS.load(f"{path}:Fisher")(), **grid)
     z, _ = plant.evaluate(np.zeros((1, 32)), np.array([[1.0, -2.0]]))
     away = np.abs(np.arange(32)[:, np.newaxis] / 32 - [0.2, 0.7])
     shapes = np.exp(-0.5 * (np.minimum(away, 1 - away) / 0.1) ** 2)
@@ -97,7 +97,7 @@ def test_actuators_that_cannot_be_placed_are_refused(options: dict, words: str) 
 def test_actuators_of_an_equations_own_are_not_moved_without_a_shape(tmp_path: Path) -> None:
     path = tmp_path / "fisher.py"
     path.write_text(FISHER + GAUSSIAN)
-    own = load_equation(f"{path}:Fisher")()
+    own = OWN_EQUATIONS.load(f"{path}:Fisher")()
     grid = FISHER_GRID | {"n_a": 2, "width": 0.1}
     with pytest.raises(ValueError, match="fisher has actuators of its own"):
         make(own, **grid, positions=[0.2, 0.7])

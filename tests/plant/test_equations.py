@@ -13,6 +13,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.equations import (
     ALLOWED,
     EQUATIONS,
+    OWN_EQUATIONS,
     AllenCahn,
     Burgers,
     CahnHilliard,
@@ -28,7 +29,6 @@ from pde_sim_node.equations import (
     Wave,
     allow,
     configured_equation,
-    load_equation,
 )
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
 from pdeloop.messages.problem import load_parameters
@@ -245,14 +245,14 @@ def heat(tmp_path: Path) -> Path:
 def test_an_equation_is_found_by_name_file_or_module(
     heat: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert load_equation("kdv") is KortewegDeVries
-    assert load_equation("pde_sim_node.equations:Burgers") is Burgers
-    kind = load_equation(f"{heat}:Heat")
+    assert OWN_EQUATIONS.load("kdv") is KortewegDeVries
+    assert OWN_EQUATIONS.load("pde_sim_node.equations:Burgers") is Burgers
+    kind = OWN_EQUATIONS.load(f"{heat}:Heat")
     assert issubclass(kind, Equation)
     assert kind.name == "heat"
-    assert load_equation(f"{heat}:Heat") is kind
+    assert OWN_EQUATIONS.load(f"{heat}:Heat") is kind
     monkeypatch.chdir(heat.parent)
-    assert load_equation("heat.py:Heat") is kind
+    assert OWN_EQUATIONS.load("heat.py:Heat") is kind
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,8 @@ def test_a_name_that_leads_nowhere_is_refused(heat: Path, name: str, words: str)
     lacking.write_text("import no_such")
     modules = set(sys.modules)
     with pytest.raises(ValueError, match=words):
-        load_equation(name.format(heat=heat, broken=broken, lacking=lacking))
+        name = name.format(heat=heat, broken=broken, lacking=lacking)
+        configured_equation(name, {ALLOWED: name})
     assert not any("broken" in module for module in set(sys.modules) - modules)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pde_sim_node.equations import load_equation
+from pde_sim_node.equations import OWN_EQUATIONS
 from tests.support.interpreter import python
 from tests.support.spectral_plants import FISHER, FISHER_GRID, make, unforced
 
@@ -18,7 +18,7 @@ def test_an_equation_of_the_users_own(tmp_path: Path) -> None:
     path = tmp_path / "fisher.py"
     for strength in (1.0, 2.0):
         path.write_text(FISHER.replace("1.0", str(strength), 1))
-        z = unforced(make(load_equation(f"{path}:Fisher")(), **FISHER_GRID), 1)
+        z = unforced(make(OWN_EQUATIONS.load(f"{path}:Fisher")(), **FISHER_GRID), 1)
         exact = 1 / (strength + (10 - strength) * np.exp(-1.0))
         np.testing.assert_allclose(z, exact, atol=1e-8)
 
@@ -26,9 +26,9 @@ def test_an_equation_of_the_users_own(tmp_path: Path) -> None:
 def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> None:
     path = tmp_path / "fisher.py"
     program = (
-        "import sys; from pde_sim_node.equations import load_equation;"
+        "import sys; from pde_sim_node.equations import OWN_EQUATIONS;"
         "from pdeloop.solver.pointwise import pointwise_loop;"
-        "pointwise_loop(load_equation(sys.argv[1]).nonlinearity)"
+        "pointwise_loop(OWN_EQUATIONS.load(sys.argv[1]).nonlinearity)"
     )
 
     def compiles() -> bool:
@@ -84,5 +84,5 @@ def test_a_flawed_equation_is_refused(tmp_path: Path, old: str, new: str, words:
     assert old in FISHER
     path.write_text(FISHER.replace(old, new))
     with pytest.raises(ValueError, match=words) as refused:
-        make(load_equation(f"{path}:Fisher")(), **FISHER_GRID)
+        make(OWN_EQUATIONS.load(f"{path}:Fisher")(), **FISHER_GRID)
     assert "\n" not in str(refused.value)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from pde_sim_node.build import build_plant
-from pde_sim_node.equations import ALLOWED, Equation, load_equation
+from pde_sim_node.equations import ALLOWED, OWN_EQUATIONS, Equation
 from pdeloop.cli import main
 from pdeloop.messages.model_rows import unpack
 from pdeloop.messages.problem import load_parameters
@@ -131,7 +131,7 @@ def test_a_pde_of_ones_own_is_offered_by_its_package() -> None:
     assert f'[project.entry-points."pdeloop.equations"]\n{name} = "{value}"' in PAGE
     (module,) = project["tool"]["setuptools"]["py-modules"]
     assert issubclass(
-        load_equation(f"{EXAMPLES}/swift_hohenberg/{value.replace(module, module + '.py')}"),
+        OWN_EQUATIONS.load(f"{EXAMPLES}/swift_hohenberg/{value.replace(module, module + '.py')}"),
         Equation,
     )
 
