@@ -66,7 +66,10 @@ class Comparison:
                     row["folder"],
                     str(row["seeds"]),
                     " to ".join(map(str, dict.fromkeys([*counted[:1], *counted[-1:]]))) or "-",
-                    *(_number(costs[name], ".4g") for name in ("none", "lqt", "adapted")),
+                    *(
+                        "diverged" if costs[name] is None else f"{costs[name]:.4g}"
+                        for name in ("none", "lqt", "adapted")
+                    ),
                     "-" if below is None else f"{below:z.1f} %",
                     "" if first is None else _against(first),
                 ]
@@ -91,7 +94,10 @@ class Comparison:
             # Of two methods that differ each has its own settings.
             if None not in values or name.partition("_settings.")[0] not in self.differing
         ]
-        rows = [[name, *map(_short, values)] for name, values in named[:SHOWN]]
+        rows = []
+        for name, values in named[:SHOWN]:
+            texts = ("-" if value is None else str(value) for value in values)
+            rows.append([name, *(t if len(t) <= 30 else f"{t[:27]}..." for t in texts)])
         if len(named) > SHOWN:
             rows.append([f"{len(named) - SHOWN} more", *("" for _ in self.runs)])
         return rows
@@ -139,18 +145,9 @@ def _mean(costs: Array) -> float | None:
     return float(means.mean()) if np.isfinite(means).all() else None
 
 
-def _number(value: float | None, form: str) -> str:
-    return "diverged" if value is None else format(value, form)
-
-
 def _against(first: dict[str, Any]) -> str:
     text = f"{first['percent']:+z.1f} %"
     if first["interval"] is not None:
         low, high = first["interval"]
         text += f" ({low:+z.1f} to {high:+z.1f})"
     return text
-
-
-def _short(value: object) -> str:
-    text = "-" if value is None else str(value)
-    return text if len(text) <= 30 else f"{text[:27]}..."

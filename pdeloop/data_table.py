@@ -177,7 +177,6 @@ def _lines(text: str) -> tuple[str, Iterator[tuple[int, list[str]]]]:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """The cells of a line."""
     return line.split() if separator == " " else next(csv.reader([line], delimiter=separator), [])
 
 

@@ -132,7 +132,11 @@ def law_of(
     ParameterError for a seed that the run does not have.
     """
     m, policy = run.index(seed), run.theta(which, seed)
-    model, law, limit = run.models[m], _loaded(run, m), ActionSet.of(run.values)
+    model, limit = run.models[m], ActionSet.of(run.values)
+    try:
+        law = run.laws[m]
+    except ValueError:  # code that is not allowed, or is not there any more
+        law = None
     step = float(run.values["sample_time"])
     name = f"the {which} law of {run.values['problem']}, seed {run.seeds[m]}"
     kind, theta = str(run.values["law"]), policy.ravel()
@@ -144,14 +148,6 @@ def law_of(
     gains, n_s = law.gains(theta), model.U.shape[1]
     own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())
     return GainLaw(own, limit, step, name)
-
-
-def _loaded(run: FinishedRun, m: int) -> Law | None:
-    """The law of a seed; None if it is code that is not allowed, or is not there any more."""
-    try:
-        return run.laws[m]
-    except ValueError:
-        return None
 
 
 def curve_csv(run: FinishedRun) -> bytes:

@@ -55,7 +55,7 @@ def seconds_of(texts: Sequence[str], rows: Sequence[int]) -> Array:
     if form == ":":
         return _through_midnight(_read(texts, rows, lambda *_: (2000, 1, 1)))
     if form == "year":
-        return _since(_read(texts, rows, _year_month_day))
+        return _since(_read(texts, rows, lambda *date: tuple(map(int, date))))
     if form == ".":
         return _since(_read(texts, rows, _day_month_year))
     return _by_order(texts, rows)
@@ -104,10 +104,6 @@ def _form(text: str) -> str:
         return ""
     mark = "." if named else match["mark"]
     return mark if len(match["third"]) in ((2, 4) if mark == "." else (4,)) else ""
-
-
-def _year_month_day(first: str, second: str, third: str) -> tuple[int, int, int]:
-    return int(first), int(second), int(third)
 
 
 def _day_month_year(first: str, second: str, third: str) -> tuple[int, int, int]:

@@ -186,7 +186,8 @@ def delay_text(
         if move:
             way = "earlier" if move < 0 else "later"
             least = "at least " if any(best[j] in found.at_end for j in own) else ""
-            parts.append(f"{names} {least}{_rows(abs(move))} {way}")
+            rows = "one row" if abs(move) == 1 else f"{abs(move)} rows"
+            parts.append(f"{names} {least}{rows} {way}")
     why = []
     if max(best) > 0:
         times = "" if sample_time is None else f" of {max(best) * sample_time:.3g} s"
@@ -211,7 +212,3 @@ def delay_text(
 def _value(delays: Delays) -> str:
     """Delays as --input-delay takes them."""
     return ",".join(map(str, delays[:1] if len({*delays}) == 1 else delays))
-
-
-def _rows(count: int) -> str:
-    return "one row" if count == 1 else f"{count} rows"

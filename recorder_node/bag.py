@@ -97,7 +97,6 @@ class BagWriter:
             self._add(channel)
 
     def _add(self, channel: Channel) -> None:
-        """Declare a topic."""
         kind, (text, hashed) = channel.type, definition(channel.type)
         if kind not in self._schemas:
             self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", text.encode())

@@ -159,7 +159,6 @@ class RecorderNode:
         self._recording.pause()
 
     def _report(self, now: float) -> Status:
-        """The status of the recording at time `now` (monotonic s)."""
         recording, matched = self._recording, self._status is not None
         return Status(
             Level.OK if matched else Level.WARN,

@@ -40,6 +40,7 @@ class TunerDiagnostics:
         level, message = self._state(now, absent)
         paid, budget = (sum(counts) for counts in training.progress.values())
         costs = dispatcher.last_costs
+        adapted = next((row["cost"] for row in reversed(training.history) if "cost" in row), None)
         return Status(
             level,
             message,
@@ -53,7 +54,7 @@ class TunerDiagnostics:
                 "episode": dispatcher.newest_episode,
                 "episodes under way": len(dispatcher.episodes()),
                 "last cost": float(np.mean(costs)) if costs is not None and len(costs) else None,
-                "adapted cost": self._last("cost"),
+                "adapted cost": None if adapted is None else float(adapted),
                 "cost without control": session.baseline("none"),
                 "cost with LQT": session.baseline("lqt"),
                 "episodes repeated": repeated,
@@ -84,9 +85,3 @@ class TunerDiagnostics:
         if now - self._repeated_at < RECENT:
             return Level.WARN, f"{where}; an episode had to be repeated"
         return Level.OK, where
-
-    def _last(self, name: str) -> float | None:
-        """The newest number of that name in the history."""
-        found = (row[name] for row in reversed(self._session.training.history) if name in row)
-        value = next(found, None)
-        return float(value) if value is not None else None

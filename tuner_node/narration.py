@@ -241,7 +241,11 @@ def mispredicted(summary: Row) -> list[str]:
     lines = []
     for who, row in _last(summary, "judging"):
         cost, predicted = row.get("cost"), row.get("predicted")
-        if cost and predicted and (off := _missed(row) / cost) > FAR_OFF:
+        if not (cost and predicted):
+            continue
+        # Each cost, or, of a chaotic plant, their mean.
+        off = row.get("missed", abs(predicted - cost)) / cost
+        if off > FAR_OFF:
             lines.append(
                 f"{who}of the last law the model predicts {predicted:.4g}, the plant shows {cost:.4g} "
                 f"(rollouts are missed by {100 * off:.2g} % of that): the model does not hold where it "
@@ -268,12 +272,6 @@ def _last(summary: Row, role: str) -> list[tuple[str, Row]]:
     rows = {row["seed"]: row for row in summary.get("history", []) if row.get("role") == role}
     several = summary["seeds"] > 1
     return [(f"seed {seed}: " if several else "", rows[seed]) for seed in sorted(rows)]
-
-
-def _missed(row: Row) -> float:
-    """By how much a model missed costs: each one, or, of a chaotic plant, their mean."""
-    off: float = row.get("missed", abs(row["predicted"] - row["cost"]))
-    return off
 
 
 def reasons(summary: Row) -> list[str]:
@@ -329,9 +327,10 @@ def warnings(summary: Row) -> list[str]:
     found += misjudged_noise(summary)
     if pair := _not_repeated(summary):
         then, now = pair
+        change = f" ({100 * (now - then) / then:+.2g} %)" if then else ""
         found.append(
             f"the same law from the same initial field cost {then:.4g}, and {now:.4g} when it ran "
-            f"again at the end{_share_of(now - then, then)}: the plant is no function of state, action "
+            f"again at the end{change}: the plant is no function of state, action "
             "and seed (it drifts, is a machine, or draws random numbers of its own), so a difference "
             "in cost of that size is no gain; `pdeloop check` tests its steps"
         )
@@ -372,11 +371,6 @@ def _not_repeated(summary: Row) -> tuple[float, float] | None:
     pairs = [(own["then"], own["now"]) for own in summary.get("repeated", []) if own]
     changed = [pair for pair in pairs if abs(pair[1] - pair[0]) > REPEATS * abs(pair[0])]
     return max(changed, key=lambda pair: abs(pair[1] - pair[0]), default=None)
-
-
-def _share_of(change: float, of: float) -> str:
-    """A change in percent, in brackets; empty: of nothing."""
-    return f" ({100 * change / of:+.2g} %)" if of else ""
 
 
 def misjudged_noise(summary: Row) -> list[str]:
@@ -448,7 +442,6 @@ def _spread(costs: Sequence[float | None]) -> str:
 
 
 def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
-    """The rollouts of a seed by purpose."""
     spent = {name: span([seed[name] for seed in rollouts]) for name in rollouts[0]}
     each = " per seed" if len(rollouts) > 1 else ""
     return (

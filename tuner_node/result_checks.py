@@ -110,7 +110,6 @@ def check_law(
 
 
 def _actions(law: Law, theta: Array, states: Array, actions: Array) -> Array:
-    """The law's actions along a trajectory."""
     if not law.has_gains(theta):
         return along(law, theta, states, actions)
     K_a, K_b = np.hsplit(law.gains(theta), 2)

@@ -354,7 +354,8 @@ class Training:
         failed = []
         for m, none, lqt in zip(self.pending, results[::CHECK], results[1::CHECK], strict=True):
             good = not lqt.diverged and lqt.cost < none.cost
-            again = not good and self._can_explore_again(m)
+            more = self.attempts[m] + 1 < self.settings.identification_attempts
+            again = not good and more and self._can_pay_for_exploration(m)
             seed = self.settings.all_seeds[m]
             rows.append(event_rows.checked(seed, none, lqt, good=good, again=again))
             self.worse[m] = not good
@@ -367,11 +368,6 @@ class Training:
         else:
             self._start_adapting()
         return rows
-
-    def _can_explore_again(self, m: int) -> bool:
-        """True if there are attempts left, and rollouts for another one and a step afterwards."""
-        more = self.attempts[m] + 1 < self.settings.identification_attempts
-        return more and self._can_pay_for_exploration(m)
 
     def _can_pay_for_exploration(self, m: int) -> bool:
         settings = self.settings

@@ -90,8 +90,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
         raise ValueError("its number of steps is out of range")
     training.attempts = checked_array(arrays, "attempts", "i", (seeds,)).tolist()
     training.pending = checked_array(arrays, "pending", "i", (None,)).tolist()
-    if "void" in arrays:  # not in those of older versions
-        training.void = checked_array(arrays, "void", "i", (seeds,)).tolist()
+    training.void = checked_array(arrays, "void", "i", (seeds,)).tolist()
     training.history = parse_json(str(checked_array(arrays, "history", "U", ())))
     training.worse = checked_array(arrays, "worse", "b", (seeds,)).tolist()
     n_z = None

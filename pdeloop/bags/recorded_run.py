@@ -188,7 +188,10 @@ class RecordedRun:
         pair = LocalPair(self._values, self._pair.plant)
         pair.follow(training)
         unseen = dict(self._rollouts)
-        lost = _Lost(self._rollouts, self._complete, everything=not self._continues(claims))
+        first = min(self._numbers, default=0)
+        # A bag that begins with a later start of the tuner: another one has the rest.
+        continues = claims is None and first // EPISODES_PER_START > 1 and not gaps({first})
+        lost = _Lost(self._rollouts, self._complete, everything=not continues)
         while unseen or (claims is not None and not claims.reached(training)):
             if (batch := training.next_batch()) is None:
                 break
@@ -221,11 +224,6 @@ class RecordedRun:
             told = f"; the bag has nothing of {gaps_text(between)}" if between else ""
             self._report.missing.append(f"{self._name}: {missing}{told}")
         return True
-
-    def _continues(self, claims: RunClaims | None) -> bool:
-        """True if the bag begins with a later start of the tuner, so that another one has the rest."""
-        first = min(self._numbers, default=0)
-        return claims is None and first // EPISODES_PER_START > 1 and not gaps({first})
 
     def _miss_unfollowed(self) -> None:
         """Name what is missing where no training shows what was asked for."""

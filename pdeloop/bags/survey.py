@@ -239,7 +239,11 @@ def check(folder: Path, told: Metadata, found: Survey) -> Findings:
         if name not in files:
             findings.missing.append(f"the file {shown(name)[1:-1]}, which {METADATA} names{many}")
         else:
-            _check_file(files[name], told.by_file.get(name, Extent()), findings)
+            file = files[name]
+            if not file.file.finished:
+                findings.missing.append(f"the end of {name}: it is cut off")
+            own = told.by_file.get(name, Extent())
+            _check_extent(name, file.messages, file.first, file.last, own, findings)
     for name, times in Counter(told.files).items():
         if times > 1:
             findings.differences.append(f"{METADATA} names {shown(name)[1:-1]} {times} times")
@@ -267,13 +271,6 @@ def repeated(found: Survey) -> list[str]:
         if file.messages and (other := first.setdefault(file.digest, file.name)) != file.name:
             texts.append(f"{file.name} holds the same messages as {other}")
     return texts
-
-
-def _check_file(file: FileSurvey, told: Extent, findings: Findings) -> None:
-    """Compare one file with its description."""
-    if not file.file.finished:
-        findings.missing.append(f"the end of {file.name}: it is cut off")
-    _check_extent(file.name, file.messages, file.first, file.last, told, findings)
 
 
 def _check_whole(told: Metadata, found: Survey, findings: Findings) -> None:

@@ -20,7 +20,7 @@ from pdeloop.bags.headers import ClockTimes
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.recorded_run import RecordedRun
 from pdeloop.bags.report import Report
-from pdeloop.bags.run_claims import RunClaims, claims_of
+from pdeloop.bags.run_claims import claims_of
 from pdeloop.bags.survey import by_run
 from pdeloop.messages.documents import parse_json
 from pdeloop.messages.files import FileError, read_bounded
@@ -64,7 +64,9 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
             published=all(run.publishes_clock for run in runs.values()),
         )
     for number, run in runs.items():
-        run.finish(_claims_about(number, runs, claims))
+        # A folder that names no run is about the only one in the bag.
+        about = (c for c in claims if c.run == number or (c.run is None and len(runs) == 1))
+        run.finish(next(about, None))
     for claim in claims:
         if claim.result is None and not claim.unreadable and claim.finished:
             report.missing.append(f"result.json of the run in {claim.folder}")
@@ -128,11 +130,3 @@ def _whole_runs(bags: Sequence[Bag]) -> list[Path]:
         with suppress(BagError):  # it is not the folder of a run
             found += [folder] if {bag.path.resolve() for bag in bags_of(folder)} <= paths else []
     return found
-
-
-def _claims_about(
-    number: int, runs: Mapping[int, RecordedRun], claims: Sequence[RunClaims]
-) -> RunClaims | None:
-    """The claims about a run; a folder that names no run is about the only one in the bag."""
-    found = (c for c in claims if c.run == number or (c.run is None and len(runs) == 1))
-    return next(found, None)

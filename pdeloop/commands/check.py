@@ -15,7 +15,7 @@ from pdeloop.messages.parameters import flags
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
-    from pdeloop.problem_check import Finding
+    pass
 
 ROLES = ("plant", "controller", "tuner")
 OF_A_NODE = {
@@ -114,18 +114,13 @@ def _check(options: argparse.Namespace) -> int:
     for finding in found:
         findings.append(finding)
         if not options.json:
-            print(f"{_mark(finding):4} {finding.name}: {finding.text}", flush=True)
+            mark = "BAD" if not finding.good else "note" if finding.note else "ok"
+            print(f"{mark:4} {finding.name}: {finding.text}", flush=True)
     if options.json:
         print_json([asdict(finding) for finding in findings])
     elif options.picture is not None:
         print(f"picture in {options.picture}")
     return 0 if findings and all(finding.good for finding in findings) else 1
-
-
-def _mark(finding: Finding) -> str:
-    if not finding.good:
-        return "BAD"
-    return "note" if finding.note else "ok"
 
 
 def _number(kind: type[int] | type[float], least: float, most: float) -> Callable[[str], float]:

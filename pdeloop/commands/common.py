@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from pdeloop.messages.own_code import identity
 from pdeloop.messages.parameters import LAW, OPTIMIZER, PROBLEM, TUNER, flags
 from pdeloop.messages.problem import shipped_problems
-from pdeloop.messages.spec import ParameterError
+from pdeloop.messages.spec import ParameterError, Spec
 
 if TYPE_CHECKING:
     from pdeloop.finished_run import FinishedRun
@@ -160,24 +161,16 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
             metavar=None if spec.choices else _METAVAR.get(spec.type, "X"),
             help=f"{spec.description} [{own}{spec.default}]".replace("%", "%%"),
         )
-        if spec is OPTIMIZER:
-            action.completer = _optimizers  # type: ignore[attr-defined]
-        elif spec is LAW:
-            action.completer = _laws  # type: ignore[attr-defined]
+        if spec in (OPTIMIZER, LAW):
+            action.completer = partial(_offered, spec)  # type: ignore[attr-defined]
 
 
-def _optimizers(prefix: str, **_: object) -> list[str]:
-    """The names of the optimisers, for the completion of the shells."""
+def _offered(spec: Spec, prefix: str, **_: object) -> list[str]:
+    """The names of the optimisers or laws, for the completion of the shells."""
     from pdeloop.method.adapt.registry import OWN_OPTIMIZERS
-
-    return OWN_OPTIMIZERS.offered()
-
-
-def _laws(prefix: str, **_: object) -> list[str]:
-    """The names of the laws, for the completion of the shells."""
     from pdeloop.method.laws.registry import OWN_LAWS
 
-    return OWN_LAWS.offered()
+    return (OWN_OPTIMIZERS if spec is OPTIMIZER else OWN_LAWS).offered()
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:

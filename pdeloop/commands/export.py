@@ -152,7 +152,6 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _model_file(name: str, run: FinishedRun, which: str, seed: int | None) -> bytes:
-    """The content of one of `MODEL_FILES`."""
     from pdeloop import model_files
     from pdeloop.export import law_of
     from pdeloop.law_form import law_form

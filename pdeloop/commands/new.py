@@ -70,7 +70,8 @@ def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
             raise ParameterError(f"'{name}' is a shipped plant{another}")
     if module in {problem.replace("-", "_") for problem in shipped_problems()}:
         raise ParameterError(f"'{name}' is a shipped problem{another}")
-    if iskeyword(module) or _is_module(module):
+    known = find_spec(module)  # a folder without code does not count
+    if iskeyword(module) or (known is not None and known.origin is not None):
         raise ParameterError(f"Python already has '{module}'{another}")
     if iskeyword(kind) or hasattr(builtins, kind):
         raise ParameterError(f"its class would be '{kind}', which Python already has{another}")
@@ -79,12 +80,6 @@ def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
         raise ParameterError(f"its class would be '{kind}', which its own file imports{another}")
     if module == "conftest" or module.startswith("test_"):
         raise ParameterError(f"pytest would take {module}.py for a file of its own{another}")
-
-
-def _is_module(name: str) -> bool:
-    """True if Python would find another module of this name; a folder without code does not count."""
-    found = find_spec(name)
-    return found is not None and found.origin is not None
 
 
 def add(commands: Commands) -> None:

@@ -167,7 +167,6 @@ class ArrayCodec:
         return self._templates[shape]
 
     def _parse(self, raw: bytes) -> _Layout:
-        """The layout of the message in `raw`."""
         if len(raw) < 8 or raw[0] != 0 or raw[1] not in (0, 1):
             raise FrameError("expected CDR bytes, got something else")
         order = "<" if raw[1] else ">"

@@ -466,7 +466,6 @@ class Grid:
         return np.kron(np.eye(len(self.components)), rows.T)
 
     def _counts(self, count: int) -> tuple[int, ...]:
-        """Numbers of sensors along the axes."""
         if count > self.points:
             raise ValueError(f"sensors must be at most the {self.points} grid points, got {count}")
         lengths = [axis.length for axis in self.axes] or [1.0]

@@ -159,7 +159,6 @@ class OwnCode:
         return None
 
     def _load_entry_point(self, name: str) -> Any:
-        """Load the entry point of that name."""
         from importlib.metadata import entry_points  # a tenth of a short command's time
 
         found = {entry.value: entry for entry in entry_points(group=self.group, name=name)}
@@ -247,17 +246,12 @@ def called(name: str, function: Callable[..., Any], *given: Any, module: str = "
     OwnCodeError if it fails; one sentence with the line.
     """
     try:
-        if _is_shipped(function):
-            return function(*given)
+        if (getattr(function, "__module__", None) or "").partition(".")[0] in _SHIPPED:
+            return function(*given)  # known not to take long
         with LONG_CALLS.during(name):
             return function(*given)
     except FAILURES as error:
         raise OwnCodeError(f"{name} fails: {located(error, module)}") from error
-
-
-def _is_shipped(function: Callable[..., Any]) -> bool:
-    """True for code of this project, which is known not to take long."""
-    return (getattr(function, "__module__", None) or "").partition(".")[0] in _SHIPPED
 
 
 def located(error: BaseException, module: str = "") -> str:

@@ -77,19 +77,15 @@ class ModelFailure:
         """Raises ValueError when `text` is not the JSON of a failure."""
         try:
             fields = parse_json(text[:10_000])
+            reason = printable(" ".join(str(fields["reason"])[:MAX_REASON].split()))
             return ModelFailure(
                 run=int(fields["run"]),
                 episode=int(fields["episode"]),
                 retry=bool(fields["retry"]),
-                reason=_one_line(str(fields["reason"])),
+                reason=reason[:MAX_REASON],
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
-
-
-def _one_line(text: str) -> str:
-    """The beginning of a text from the network, as it may be printed."""
-    return printable(" ".join(text[:MAX_REASON].split()))[:MAX_REASON]
 
 
 NOT_SIGNED = 0.0

@@ -88,7 +88,6 @@ class MonitorNode:
         return self._loop.run()
 
     def _begin(self, namespace: str | None) -> None:
-        """Show the loop in `namespace`."""
         if self._reader is not None:
             self._reader.close()
         self._namespace = namespace
@@ -127,7 +126,6 @@ class MonitorNode:
                 self._take_parameters(peer.values or {})
 
     def _serve(self, request: object) -> None:
-        """Carry out a request of the page."""
         if isinstance(request, ShowLoop):
             self._given = True
             self._begin(request.namespace)
@@ -177,7 +175,6 @@ class MonitorNode:
         return sorted(found)
 
     def _controls(self, by_role: dict[str, list[Endpoint]]) -> list[dict[str, Any]]:
-        """Services that the nodes of the loop offer."""
         offered: dict[str, set[str]] = {}
         for name, types in self._node.get_service_names_and_types():
             node, _, verb = name.rpartition("/")

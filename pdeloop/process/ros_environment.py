@@ -129,7 +129,6 @@ def with_servers_there(environment: Mapping[str, str]) -> tuple[dict[str, str], 
 
 
 def _open_ports() -> set[int]:
-    """Ports of this machine's UDP sockets."""
     found = set()
     for table in ("udp", "udp6"):
         try:

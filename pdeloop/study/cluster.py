@@ -237,7 +237,6 @@ class Cluster(Workers):
         self._events.append(event)
 
     def _meet(self, at: str, environment: Mapping[str, str]) -> None:
-        """Know the worker at this address."""
         kind = environment["processor"]
         same = [each for each, own in self.environments.items() if own == environment]
         if not same and kind in self.environments:  # with other versions
@@ -459,7 +458,6 @@ def _check_versions(versions: Mapping[str, str], own: str) -> None:
 
 
 def _version_at(address: str, security: Mapping[str, Any]) -> str:
-    """The version of Dask of the scheduler there."""
     from distributed.comm.addressing import get_address_host_port
     from distributed.core import rpc
 

@@ -573,7 +573,6 @@ def _split(environment: Mapping[str, str]) -> tuple[dict[str, str], str]:
 
 
 def _group(name: str) -> tuple[str, str]:
-    """Problem and seed of a training."""
     problem, _, seed = name.split("/")
     return problem, seed
 

@@ -171,13 +171,11 @@ def code_of(parameters: Mapping[str, Any]) -> int:
         kinds.append(law_kind(parameters["law"], parameters))
     if ":" in parameters["optimizer"]:
         kinds.append(kind_of(parameters))
-    own = [base for kind in kinds for base in kind.__mro__ if not _shipped(base.__module__)]
+    shipped = ("pdeloop", *sys.stdlib_module_names)
+    bases = (base for kind in kinds for base in kind.__mro__)
+    own = [base for base in bases if base.__module__.partition(".")[0] not in shipped]
     sources = json.dumps([source_of(base) for base in own])
     return int(hashlib.sha256(sources.encode()).hexdigest()[:12], 16) if own else 0
-
-
-def _shipped(module: str) -> bool:
-    return module.partition(".")[0] in ("pdeloop", *sys.stdlib_module_names)
 
 
 def _opened(

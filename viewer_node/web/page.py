@@ -59,17 +59,17 @@ def axes_of(values: Mapping[str, Any]) -> Axes:
         grid = Grid.parse(str(values["grid"]))
     except (KeyError, ValueError):
         if sensors:
-            return [_numbers("sensor")]
+            return [_axis("sensor")]
         length = float(values.get("length") or 0.0)
-        return [_axis("x (m)", length)] if length > 0 else [_numbers("grid point")]
+        return [_axis("x (m)", length)] if length > 0 else [_axis("grid point")]
     if sensors and (len(grid.axes) != 1 or sensors > grid.points):
-        return [_numbers("sensor")]
+        return [_axis("sensor")]
     told = [_axis(axis.label, axis.length, _ends(axis)) for axis in grid.axes[-2:]]
     if sensors:  # they are at the points of Grid.equally_spaced
         first, spacing, n = told[0]["ends"][0], grid.axes[0].spacing, grid.points
         ends = (n // (2 * sensors), (2 * sensors - 1) * n // (2 * sensors))
         told[0]["ends"] = [first + i * spacing for i in ends]
-    return told or [_numbers("number")]
+    return told or [_axis("number")]
 
 
 def _ends(axis: Axis) -> list[float]:
@@ -78,14 +78,12 @@ def _ends(axis: Axis) -> list[float]:
     return [first, first + (axis.size - 1) * axis.spacing]
 
 
-def _axis(label: str, length: float, ends: list[float] | None = None) -> dict[str, Any]:
-    """ends: places of the first and last point; None: one spacing before the end, as on a ring."""
+def _axis(label: str, length: float = 0.0, ends: list[float] | None = None) -> dict[str, Any]:
+    """An axis; length 0: it counts.
+
+    ends: places of the first and last point; None: one spacing before the end, as on a ring.
+    """
     return {"label": label, "length": length, "ends": ends}
-
-
-def _numbers(label: str) -> dict[str, Any]:
-    """An axis that counts."""
-    return _axis(label, 0.0)
 
 
 def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -105,8 +103,6 @@ def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
 def bounds_of(values: Mapping[str, Any]) -> dict[str, list[float | None]] | None:
     """Bounds of each actuator from a plant's parameters, None where it has none; None without any.
 
-    Examples
-    --------
     >>> bounds_of({"n_a": 2, "action_bounds": [0.0, 0.0, 4.0, 1e300, 0.0]})
     {'low': [0.0, 0.0], 'high': [4.0, None]}
     """
@@ -150,7 +146,6 @@ class Page:
         self._status: str | None = None
         self._of_plant: dict[str, Any] = {}
         """Its parameters that say where things are."""
-        """The target of each step, where it moves."""
         self._colours: dict[int, Range] = {}
         self._coloured = float("-inf")
         self._counts: deque[tuple[float, int, int]] = deque()
@@ -227,10 +222,11 @@ class Page:
                 self._counts.popleft()
             since, rounds, episodes = self._counts[0]
             elapsed = max(now - since, RATE_WINDOW / 10)
+            searching = self.place["domain"] is None
             status = {
                 "part": "status",
                 "place": self.place,
-                "state": self._state(now),
+                "state": "searching" if searching else view.state_of_loop(now),
                 "paused": view.operation.paused(now),
                 "stopping": view.operation.stopping,
                 "requests": view.operation.requests(now),
@@ -296,7 +292,6 @@ class Page:
         yield "episode", samples, partial(self._episode, shown)
 
     def _panels(self) -> list[int]:
-        """The components that are shown."""
         count = min(len(self.view.components), MAX_COMPONENTS)
         return list(range(count)) if count <= MOST_PANELS else [min(self.component, count - 1)]
 
@@ -356,9 +351,6 @@ class Page:
         drawn = [shown.picture(z, i) for z in (shown.z, shown.z_first) for i in panels]
         return _pack(header, np.concatenate([fields.ravel(), actions.ravel(), *drawn]))
 
-    def _state(self, now: float) -> str:
-        return "searching" if self.place["domain"] is None else self.view.state_of_loop(now)
-
 
 def _kept(shown: EpisodeSamples) -> int:
     """Components of which there are samples."""
@@ -366,7 +358,6 @@ def _kept(shown: EpisodeSamples) -> int:
 
 
 def _pack(header: Mapping[str, Any], values: NDArray[np.floating]) -> bytes:
-    """A message with numbers."""
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     return struct.pack("<I", len(text)) + text + values.astype("<f4").tobytes()
