@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pde_sim_node.build import build_plant
 from pdeloop.evaluation import another_loop
 from pdeloop.finished_run import FinishedRun
-from pdeloop.messages.files import write_atomically
+from pdeloop.messages.files import write_atomically, writing_to
 from pdeloop.method.seeds import Purpose, derive, evaluation_noise
 from pdeloop.report.data import ProblemData, behaviours
 from pdeloop.report.style import COLOURS, NAMES
@@ -93,10 +93,8 @@ def writes(path: Path) -> None:
 def write(path: Path, drawn: Pictures) -> None:
     """Write pictures as the GIF or MP4 that the file's name says; see `writes`."""
     content = _gif(drawn) if path.suffix.lower() == ".gif" else _mp4(drawn)
-    try:
+    with writing_to(path, RunFolderError):
         write_atomically(path, content)
-    except OSError as error:
-        raise RunFolderError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _gif(drawn: Pictures) -> bytes:

@@ -25,7 +25,7 @@ from pdeloop.log_effects import delay_text, fed_back, require_effects, require_m
 from pdeloop.messages.action_set import ActionSet
 from pdeloop.messages.array_files import packed_arrays
 from pdeloop.messages.arrays import Array
-from pdeloop.messages.files import write_atomically
+from pdeloop.messages.files import write_atomically, writing_to
 from pdeloop.messages.model_rows import ModelRows, pack
 from pdeloop.messages.parameters import as_recorded, model_order, recorded_values, table
 from pdeloop.messages.spec import ParameterError
@@ -426,10 +426,8 @@ def save(found: Identified, path: Path) -> None:
     if found.field is not None and found.field.fitted is not None:
         own = found.field.fitted.model.arrays()
         arrays |= {f"field_{name}": values for name, values in own.items()}
-    try:
+    with writing_to(path, ParameterError):
         write_atomically(path, packed_arrays(arrays))
-    except OSError as error:
-        raise ParameterError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _usable(episode: RecordedEpisode) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from tensorboardX import SummaryWriter
 
 from pdeloop.finished_run import FinishedRun
+from pdeloop.messages.files import writing_to
 from pdeloop.messages.spec import ParameterError
 
 _IDS = ("event", "seed", "rollouts")
@@ -42,13 +43,13 @@ def write_events(run: FinishedRun, folder: Path) -> None:
     """
     if folder.exists() or folder.is_symlink():
         raise ParameterError(f"{folder} exists; expected a new folder")
-    try:
-        with tempfile.TemporaryDirectory(dir=folder.parent) as parent:
-            whole = Path(parent) / "events"
-            for m, seed in enumerate(run.seeds):
-                with SummaryWriter(str(whole / f"seed{seed}")) as writer:
-                    for name, value, rollouts in scalars(run, m):
-                        writer.add_scalar(name, value, rollouts)
-            whole.rename(folder)
-    except OSError as error:
-        raise ParameterError(f"cannot write {folder}: {error.strerror}") from error
+    with (
+        writing_to(folder, ParameterError),
+        tempfile.TemporaryDirectory(dir=folder.parent) as parent,
+    ):
+        whole = Path(parent) / "events"
+        for m, seed in enumerate(run.seeds):
+            with SummaryWriter(str(whole / f"seed{seed}")) as writer:
+                for name, value, rollouts in scalars(run, m):
+                    writer.add_scalar(name, value, rollouts)
+        whole.rename(folder)

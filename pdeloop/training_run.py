@@ -348,8 +348,11 @@ def _train_over_topics(
         environment, remarks = transport.environment()
         for remark in remarks:
             display.line(f"  {remark}")
-        if recorder is not None and (text := large_bag(folder, transport.record_every)):
-            display.line(f"  {text}")
+        if recorder is not None:
+            from recorder_node.recording import large_bag  # here, as it needs the extra `record`
+
+            if text := large_bag(RunFolder(folder).values(), transport.record_every):
+                display.line(f"  {text}")
         waiting = Waiting(list(children.values()), display.line)
         supervisor = Supervisor(
             list(children.values()), "tuner_node", domain, logs, display.line, environment
@@ -378,13 +381,6 @@ def _train_over_topics(
     if recorder is not None:
         names_of_bags = ", ".join(str(bag) for bag in bags)
         display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)
-
-
-def large_bag(folder: Path, every: int) -> str:
-    """A sentence where the bag of the run in `folder` will be large."""
-    from recorder_node.recording import large_bag  # here, as it needs the extra `record`
-
-    return large_bag(RunFolder(folder).values(), every)
 
 
 class Waiting:

@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from pdeloop.messages.files import writing_to
 from pdeloop.messages.frames import ArrayCodec, FrameError
 from pdeloop.messages.topics import ARRAYS, MODEL_FAILED, START, STATE, Topic
 from recorder_node.bag import BagError, BagWriter, Channel
@@ -140,9 +141,7 @@ class Recording(BagWriter):
         text = json.dumps({str(run): self._notes[str(run)]}).encode() + b"\0"
         when = self._last if self.messages else time.time_ns()
         self.write(PARAMETERS_TOPIC, when, CDR + len(text).to_bytes(4, "little") + text)
-        try:
+        with writing_to(f"to {self.path}", BagError):
             part = self.path / f"{PARAMETERS}.part"  # not synchronised, as that could take long
             part.write_text(json.dumps(self._notes, indent=1))
             part.replace(self.path / PARAMETERS)
-        except OSError as error:
-            raise BagError(f"cannot write to {self.path}: {error.strerror}") from error

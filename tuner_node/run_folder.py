@@ -38,6 +38,7 @@ from pdeloop.messages.files import (
     read_json,
     try_lock,
     write_atomically,
+    writing_to,
 )
 from pdeloop.messages.frames import MAX_ID
 from pdeloop.messages.parameter_file import yaml_text
@@ -139,10 +140,8 @@ class RunFolder:
     def made_and_locked(self) -> Iterator[None]:
         """Make the folder, if it can hold a new training, and keep other processes from it."""
         self.refuse_another()
-        try:
+        with writing_to(f"to {self.path}", RunFolderError):
             make_folder(self.path)
-        except OSError as error:
-            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
         with self.locked():
             yield
 
@@ -152,14 +151,12 @@ class RunFolder:
         RunFolderError if the folder holds one by now, or cannot be written.
         """
         self.refuse_another(briefly=True)  # who has just begun one here waits for the lock
-        try:
+        with writing_to(f"to {self.path}", RunFolderError):
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             # parameters.yaml comes last and whole: where it is, there is a run.
             self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
             text = yaml_text(kept, "resolved parameters of this run")
             write_atomically(self.path / "parameters.yaml", text.encode())
-        except OSError as error:
-            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
 
     def reopen(self, parameters: Mapping[str, Any]) -> RunIdentity:
         """Continue the training here. RunFolderError if there is none, or with other parameters."""
@@ -246,10 +243,8 @@ class RunFolder:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from working on the run. RunFolderError if one does."""
-        try:
+        with writing_to(f"to {self.path}", RunFolderError):
             file = open_own(self.path / "lock", 0)
-        except OSError as error:
-            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
         with file:
             try:
                 free = try_lock(file)

@@ -87,7 +87,7 @@ def add(commands: common.Commands) -> None:
 
 def _export(options: argparse.Namespace) -> int:
     from pdeloop.export import curve_csv, law_of
-    from pdeloop.messages.files import write_atomically
+    from pdeloop.messages.files import write_atomically, writing_to
 
     files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
     files["--parquet"] = options.parquet, (".parquet",)
@@ -133,10 +133,8 @@ def _export(options: argparse.Namespace) -> int:
 
         contents[options.parquet] = parquet(run)
     for path, content in contents.items():
-        try:
+        with writing_to(path, ParameterError):
             write_atomically(path, content)
-        except OSError as error:
-            raise ParameterError(f"cannot write {path}: {error.strerror}") from error
         print(f"written to {path}")
     if options.minari is not None:
         from pdeloop.data_sets import write_minari

@@ -8,6 +8,8 @@ import errno
 import fcntl
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -35,6 +37,15 @@ def write_atomically(path: Path, *content: bytes | memoryview) -> None:
         part.unlink()
         raise
     sync_folder(path.parent)
+
+
+@contextmanager
+def writing_to(place: object, refusal: type[Exception]) -> Iterator[None]:
+    """An OSError in the block, of a full disk or no permission, becomes a refusal in one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise refusal(f"cannot write {place}: {error.strerror}") from error
 
 
 def write_part(path: Path, *content: bytes | memoryview) -> Path:

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from pdeloop.animation import pictures, write
 from pdeloop.finished_run import field_means
-from pdeloop.messages.files import make_own_folder, write_atomically
+from pdeloop.messages.files import make_own_folder, write_atomically, writing_to
 from pdeloop.report import figures
 from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import NAMES, STYLE, darken
@@ -69,7 +69,7 @@ def report(data: ReportData, out: Path | None, *, animate: bool = False) -> Path
     """
     target = out or data.folder / "report"
     page = target / "index.html"
-    try:
+    with writing_to(f"the report to {target}", RunFolderError):
         if out:
             out.mkdir(parents=True, exist_ok=True)
         else:
@@ -82,8 +82,6 @@ def report(data: ReportData, out: Path | None, *, animate: bool = False) -> Path
             ]
         moving = [_moving(target, problem) for problem in data.problems if animate]
         write_atomically(page, _page(data, shared, own, moving).encode())
-    except OSError as error:
-        raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
     return page
 
 

@@ -31,6 +31,7 @@ from pdeloop.messages.files import (
     read_json,
     try_lock,
     write_atomically,
+    writing_to,
 )
 from pdeloop.study.description import Study, StudyError
 
@@ -149,12 +150,10 @@ class Results:
     def extract(self, name: str, folder: Path) -> Path:
         """Write a training's run folder, `folder`/PROBLEM/VARIANT/SEED."""
         place = folder / name
-        try:
+        with writing_to(f"to {place}", StudyError):
             make_folder(place)
             for file, content in self.files(name).items():  # result.json last
                 write_atomically(place / file, content)
-        except OSError as error:
-            raise StudyError(f"cannot write to {place}: {error.strerror}") from error
         return place
 
     def add(self, ended: Iterable[Ended]) -> None:
