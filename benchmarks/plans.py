@@ -84,7 +84,7 @@ def step_time(own: Planner, z: Array, steps: int) -> float:
     z, plan, took = z[None], np.zeros((1, own.steps, len(own.b))), []
     for k in range(1, steps + 2):  # the search from several starts is at step 0
         began = time.process_time()
-        a, plan = own.step(plan, z, k)
+        a, plan, _ = own.step(plan, z, k)
         took.append(time.process_time() - began)
         plan, z = own.shifted(plan), own.model.step(z, a)
     return float(np.median(took[1:]))

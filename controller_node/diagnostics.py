@@ -49,6 +49,7 @@ class ControllerDiagnostics:
                 "states that had to wait": responder.counters["states that had to wait"],
                 "models identified": responder.counters["models identified"],
                 "identifications failed": responder.counters["identifications failed"],
+                "plans that fell back": responder.counters["plans that fell back"],
                 "last cost": responder.last_cost,
                 "plant paused": self.plant_paused,
             },

@@ -18,6 +18,7 @@ from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.frames import digest
 from pdeloop.method.laws.base import Law, Parts
+from pdeloop.method.laws.predictive import Predictive
 from pdeloop.method.laws.registry import action, arithmetic_of_laws, updated
 
 
@@ -68,6 +69,11 @@ class LawBatch:
         """True if the law has a memory, if only of its last action."""
         remembers = self._laws[0].memory_size > 0 or self._action_set.rated
         return remembers and self.compiled is None
+
+    @property
+    def fallen(self) -> int:
+        """Steps so far at which a law that plans fell back on the law that it began as."""
+        return sum(law.fallen for law in self._laws if isinstance(law, Predictive))
 
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take theta of each environment for the next episode.

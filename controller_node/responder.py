@@ -216,6 +216,7 @@ class Responder:
                 actions = answering.law.actions(frame.step, frame.values)
             except MemoryUnknownError as error:
                 return [self._unknown(frame, error)]
+            self.counters["plans that fell back"] = answering.law.fallen
             if answering.law.remembers and not self._has_room(frame.run, 0):
                 answering.law.forget_answers()
         else:

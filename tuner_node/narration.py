@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pdeloop.method.adapt.replay import ALONG
+from pdeloop.method.adapt.verdict import PREDICTIVE
 
 Row = Mapping[str, Any]
 COSTLIER = 3
@@ -206,18 +207,29 @@ def _acting(summary: Row) -> list[str]:
     """Which law acts, what it saves, and what a step costs, where plans were possible."""
     lines = []
     every = list(zip(summary.get("acting", []), summary.get("outcome", []), strict=False))
+    last = {row["seed"]: row for row in summary.get("history", []) if "plan_falls" in row}
     for name in dict.fromkeys(own["law"] for own, _ in every):
-        known = [(own, outcome) for own, outcome in every if own["law"] == name]
+        seeds = [m for m, (own, _) in enumerate(every) if own["law"] == name]
         first, step = (
-            f"{span((1e3 * own[key] for own, _ in known), '.2g')} ms"
+            f"{span((1e3 * every[m][0][key] for m in seeds), '.2g')} ms"
             for key in ("first_step", "step")
         )
-        which = f" for {len(known)} of {len(every)} seeds" if len(every) > 1 else ""
-        (_, outcome), *others = known
-        told = outcome["verdict"] == "better" and not others and outcome["reason"]
-        why = f" ({told})" if told else ""
+        which = f" for {len(seeds)} of {len(every)} seeds" if len(every) > 1 else ""
+        rows = [last[seed] for m in seeds if (seed := summary["seed"] + m) in last]
+        why, outcome = "", every[seeds[0]][1]
+        if len(seeds) == 1 and outcome["verdict"] == "better" and outcome["reason"]:
+            why = f" ({outcome['reason']})"
+        elif len(seeds) > 1 and len(rows) == len(seeds) and name == PREDICTIVE:
+            saved = span((100 * row["plan_saves"] for row in rows), ".2g")
+            why = f" (on the model it saves {saved} % of the cost of the law that it began as)"
+        fell = [100 * row["plan_falls"] for row in rows]
+        back = ""
+        if name == PREDICTIVE and any(fell):
+            back = (
+                f"; at {span(fell, '.2g')} % of steps on the model it fell back on that law's plan"
+            )
         took = f"a step takes {step}, the first one {first}"
-        lines.append(f"  the law that acts is {name}{which}{why}; {took}")
+        lines.append(f"  the law that acts is {name}{which}{why}; {took}{back}")
     return lines
 
 

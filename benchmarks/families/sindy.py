@@ -117,7 +117,7 @@ def planned_law(model: PolynomialModel, plant: Plant) -> Law:
     def law(k: int, states: Array) -> Array:
         nonlocal plan
         plan = plan if k else np.zeros((len(states), STEPS, n_a))
-        actions, plan = planner.step(plan, states, k)
+        actions, plan, _ = planner.step(plan, states, k)
         plan = planner.shifted(plan)
         return actions
 

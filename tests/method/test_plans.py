@@ -113,7 +113,7 @@ def test_of_a_linear_plant_it_is_the_regulator_of_the_riccati_equation(around: b
     K = -linalg.solve(0.5 * np.eye(N_A) + B.T @ P @ B, B.T @ P @ A)
     own = planner(model, cost, around=around, K=0.9 * K, b=np.zeros(N_A), steps=3, first=60)
     z = np.random.default_rng(5).standard_normal((2, N_Z))
-    a, _ = own.step(np.zeros((2, 3, N_A)), z, 0)
+    a, *_ = own.step(np.zeros((2, 3, N_A)), z, 0)
     np.testing.assert_allclose(a, z @ K.T, rtol=1e-3, atol=1e-3)
 
 
@@ -199,10 +199,11 @@ def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where
     model = linear()
     own = planner(model)
     z = np.random.default_rng(7).standard_normal((1, N_Z))
-    a, _ = own.step(np.full((1, 12, N_A), 1e200), z, 1)
-    assert np.abs(a).max() < 100
+    a, _, fell = own.step(np.full((1, 12, N_A), 1e200), z, 1)
+    assert np.abs(a).max() < 100 and fell.all()
     lost = planner(LinearModel("linear", np.full((N_Z, N_Z), 1e200), model.B, model.constant))
-    a, plan = lost.step(np.zeros((1, 12, N_A)), z, 1)
+    a, plan, fell = lost.step(np.zeros((1, 12, N_A)), z, 1)
+    assert fell.all()
     np.testing.assert_allclose(a, z @ lost.K.T + lost.b)
     assert not plan.any()
 
@@ -216,6 +217,6 @@ def test_a_target_over_time_is_foreseen() -> None:
     acted = np.zeros(T)
     z, plan = np.zeros((1, 1)), np.zeros((1, 12, N_A))
     for k in range(T):
-        a, plan = own.step(plan, z, k)
+        a, plan, _ = own.step(plan, z, k)
         plan, z, acted[k] = own.shifted(plan), model.step(z, a), a[0, 0]
     assert acted[T // 2 - 1] > 0.05 > abs(acted[0])

@@ -98,6 +98,22 @@ def test_what_theta_holds_is_the_planner_and_zeros_at_its_end_mean_nothing(
     assert (acted >= -0.5).all() and (acted[:, 0] <= 0.4).all()
 
 
+def test_steps_at_which_the_law_that_it_began_as_has_the_better_plan_are_counted() -> None:
+    """A plan of large numbers in the memory is worse than none."""
+    own, batch = law(), LawBatch([law()], np.ones(N_Z))
+    batch.set(theta(law())[None])
+    parts, memory = own.parts(theta(own)), own.memory_start()
+    for k in range(3):
+        a = action(own, parts, STATES[k], memory, k)
+        assert np.array_equal(batch.actions(k, STATES[k : k + 1])[0], a)
+        memory = updated(own, parts, STATES[k], memory, a, k)
+    before, memory[:10] = own.fallen, 1e3
+    assert batch.fallen == before
+    action(own, parts, STATES[3], memory, 3)
+    action(own, parts, STATES[3], memory, 3)  # once for one state
+    assert own.fallen == before + 1
+
+
 def test_theta_holds_which_law_a_plan_deviates_from() -> None:
     own = law()
     found = own.planner(own.parts(theta(own, regulated=True)))
@@ -125,7 +141,7 @@ def test_it_plans_within_rate_limits_from_the_action_before() -> None:
     assert planner.action_set == allowed
     plan, last, expected = np.zeros((1, 10, N_A)), None, []
     for k, z in enumerate(STATES):
-        last, plan = planner.step(plan, planner.after(z[None], last), k)
+        last, plan, _ = planner.step(plan, planner.after(z[None], last), k)
         plan = planner.shifted(plan)
         expected.append(last[0])
     acted = actions_of(own, whole)
@@ -310,6 +326,7 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
         assert np.array_equal(other.policy, own.policy) and other.done == own.done
     assert sum("could_save" in row for row in rows) == (kind is Eager)
     assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
+    assert 0.0 <= rows[-2]["plan_falls"] < 1.0 and rows[-2]["plan_saves"] > 0.0
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
 
 

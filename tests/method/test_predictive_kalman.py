@@ -87,7 +87,7 @@ def test_a_plan_starts_from_the_estimate_and_its_memory_is_that_of_the_episode(r
     x, S = (part[None] for part in FILTER.start)
     for k, y in enumerate(READINGS):
         x, S = FILTER.measured(x, S, y[None])
-        a, plan = planner.step(plan, planner.after(x, a), k)
+        a, plan, _ = planner.step(plan, planner.after(x, a), k)
         plan = planner.shifted(plan)
         for asked in (law, made(allowed)[0]):  # another controller that is given the same states
             assert same_bits(action(asked, parts, y, memory, k), a[0])

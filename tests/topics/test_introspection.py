@@ -53,6 +53,7 @@ VALUES = {
         "states that had to wait",
         "models identified",
         "identifications failed",
+        "plans that fell back",
         "plant paused",
     },
     "tuner_node": {

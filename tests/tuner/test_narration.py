@@ -268,3 +268,25 @@ def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_l
     outcome = [own | {"early": ""}, own]
     lines = closing_lines("kdv", summary(changed=[True, True], outcome=outcome), "")
     assert f"  seed 1: {why}" in lines
+
+
+def test_of_laws_that_plan_it_is_told_what_they_save_and_how_often_they_fall_back():
+    acting = [{"law": "predictive", "first_step": 0.1, "step": n * 1e-3} for n in (2, 3)]
+    acting.append({"law": "affine", "first_step": 1e-6, "step": 1e-6})
+    history = [{"seed": m, "plan_saves": 0.1 * (m + 1), "plan_falls": 0.02 * m} for m in range(2)]
+    outcome = [{"verdict": "better", "reason": "why", "early": ""}] * 3
+    costs = {name: [cost] * 3 for name, cost in {"none": 4.0, "lqt": 2.0, "adapted": 1.0}.items()}
+    given = {"changed": [True] * 3, "outcome": outcome, "history": history, "costs": costs}
+    lines = closing_lines("kdv", summary(seeds=3, **given, acting=acting), "")
+    assert (
+        "  the law that acts is predictive for 2 of 3 seeds (on the model it saves 10 to 20 % of the "
+        "cost of the law that it began as); a step takes 2 to 3 ms, the first one 1e+02 ms; at 0 to 2 % of "
+        "steps on the model it fell back on that law's plan"
+    ) in lines
+    given = {"changed": [True], "outcome": outcome[:1], "history": history[:1]}
+    (line,) = (
+        line
+        for line in closing_lines("kdv", summary(seeds=1, **given, acting=acting[:1]), "")
+        if "the law that acts" in line
+    )
+    assert line.endswith("predictive (why); a step takes 2 ms, the first one 1e+02 ms")

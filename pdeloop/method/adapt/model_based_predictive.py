@@ -58,7 +58,7 @@ from pdeloop.method.adapt.verdict import (
 )
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Affine
-from pdeloop.method.laws.plans import Planner, planned, seen_with_noise, simulated
+from pdeloop.method.laws.plans import Flags, Planner, planned, seen_with_noise, simulated
 from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
 from pdeloop.method.models.base import FieldModel
 from pdeloop.method.models.sensed import SensedModel
@@ -250,8 +250,9 @@ class ModelBasedPredictive(Optimizer):
         if known is None:
             return "no law on an estimate stays finite on the model"
         fields, before = self._simulated(belief, self._affine.policy)
-        planner, costs = self._planner(belief, known, fields)
+        planner, costs, fell = self._planner(belief, known, fields)
         row["plan_steps"], row["plan_saves"] = planner.steps, share_saved(costs, before)
+        row["plan_falls"] = fell
         if not np.sum(costs) < np.sum(before):
             return "on the model no plan is better"
         try:
@@ -281,22 +282,25 @@ class ModelBasedPredictive(Optimizer):
             starts=settings.starts,
         )
 
-    def _planner(self, belief: Belief, policy: Array, fields: Array) -> tuple[Planner, Array]:
-        """The plans to use, and their costs from initial fields."""
+    def _planner(
+        self, belief: Belief, policy: Array, fields: Array
+    ) -> tuple[Planner, Array, float]:
+        """The plans to use, their costs from initial fields, and the share of steps that fall back."""
         plain, own = self._plain(belief, policy, fields), self._law.settings.steps
         lengths = [own] if own else sorted({min(n, self._law.longest) for n in LENGTHS})
 
-        def tried(planner: Planner) -> tuple[float, Planner, Array]:
-            costs = self._costs(belief, policy, planner, fields)
-            return float(np.sum(costs)), planner, costs
+        def tried(planner: Planner) -> tuple[float, Planner, Array, float]:
+            fallen = list[Flags]()
+            costs = self._costs(belief, policy, planner, fields, fallen)
+            return float(np.sum(costs)), planner, costs, float(np.mean(fallen))
 
-        def worth(each: tuple[float, Planner, Array]) -> float:
+        def worth(each: tuple[float, Planner, Array, float]) -> float:
             """Without a cost to go, which keeps a plant at its target, plans have to be cheaper."""
             return each[0] * (1.0 + SHORTER * (each[1].terminal != plain.terminal))
 
         best = min((tried(replace(way, steps=lengths[0])) for way in ways_of(plain)), key=worth)
         every = [best, *(tried(replace(best[1], steps=steps)) for steps in lengths[1:])]
-        most = min(total for total, _, _ in every) * (1.0 + SHORTER)
+        most = min(own[0] for own in every) * (1.0 + SHORTER)
         return next((own[1:] for own in every if own[0] <= most), best[1:])
 
     def _check(self, theta: Array) -> None:
@@ -306,12 +310,14 @@ class ModelBasedPredictive(Optimizer):
     def _costs_of(self, theta: Array, belief: Belief, fields: Array) -> Array:
         """Costs of the law that plans from initial fields on the model."""
         planner = self._law.planner(self._law.parts(theta))
-        return self._costs(belief, theta, planner, fields)
+        return self._costs(belief, theta, planner, fields, [])
 
-    def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
-        """Costs of plans from initial fields on the model."""
+    def _costs(
+        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallen: list[Flags]
+    ) -> Array:
+        """Costs of plans from initial fields on the model; fallen: as in `planned`."""
         noise = belief.loop(self._context).noise
-        return simulated(planner, fields, seen_with_noise(planned(planner), noise))[0]
+        return simulated(planner, fields, seen_with_noise(planned(planner, fallen), noise))[0]
 
     def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
@@ -432,12 +438,15 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         assert isinstance(belief.model, SensedModel)
         return sensed_loop(self._context, belief.model)
 
-    def _costs(self, belief: Belief, policy: Array, planner: Planner, fields: Array) -> Array:
+    def _costs(
+        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallen: list[Flags]
+    ) -> Array:
         law = self._kalman
         known = law.filter(law.parts(np.ravel(policy)[: law.size]))
         if known is None:
+            fallen.append(np.ones(len(fields), dtype=np.bool_))
             return np.full(len(fields), np.inf)
-        act = from_estimates(planned(planner), known, self._loop(belief).noise)
+        act = from_estimates(planned(planner, fallen), known, self._loop(belief).noise)
         return simulated(planner, fields, act)[0]
 
     def _seeds(self) -> list[int]:

@@ -87,7 +87,7 @@ class ModelBasedNeural(ModelBasedPredictive):
         """The law with the network of this model; or why there is none."""
         policy, context, own = self._affine.policy, self._context, self._neural
         fields, _ = self._simulated(belief, policy)
-        planner, _ = self._planner(belief, policy, fields)
+        planner, *_ = self._planner(belief, policy, fields)
         K, b = own.feedback(own.without.parts(np.ravel(policy)))
         loop, every = belief.loop(context), self._affine.fields
         costs, states, _ = simulated(planner, every, self._acts(planner, policy, loop.noise))

@@ -121,13 +121,13 @@ class Planner:
         last = self.action_set.start if actions is None else actions
         return np.hstack([z, np.broadcast_to(last, (len(z), self.model.n_a))])
 
-    def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array]:
+    def step(self, plan: Array, z: Array, k: int) -> tuple[Array, Array, Flags]:
         """Actions (M, n_a) at step k from states z (M, n_z), and the improved plan (M, H, n_a).
 
         The search begins from the rest of the plan of the step before, or the affine law's own where
-        that is cheaper; where no plan is finite, this law acts.
+        that is cheaper; where no plan is finite, this law acts. The third are the rows (M,) of either.
         """
-        H = self.length(k)
+        H, fell = self.length(k), np.zeros(len(z), dtype=np.bool_)
         if k == 0:
             plan, J = self.begin(z)
         else:
@@ -145,7 +145,7 @@ class Planner:
         after = z[:, self.model.n_z :] if self.action_set.rated else None
         a = self.action_set.project(np.where(lost[:, None], of_law, base + plan[:, 0]), after=after)
         plan = np.where(lost[:, None, None], 0.0, plan)
-        return a, plan
+        return a, plan, fell | lost
 
     def shifted(self, plan: Array) -> Array:
         """A plan (M, H, n_a) without its first action, and with a zero at the end."""
@@ -257,18 +257,24 @@ class Planner:
     def _affine_plan(self, z: Array, k: int, H: int) -> Array:
         """The plans (M, H, n_a) with which the affine law acts on the model."""
         none = np.zeros((len(z), H, self.model.n_a))
-        K, b = self._feedback
-        if K is self.K:
+        if self._feedback[0] is self.K:
             return none
         states, _, found = rolled(
             self._sweep, self.model.n_a, z, *self._given(none, k, self.K, self.b)
         )
+        return self.deviations(states, found)
+
+    def deviations(self, states: Array, actions: Array) -> Array:
+        """The plans (M, H, n_a) with these states (M, H + 1, n_z) and actions, around a constant law.
+
+        Zero where they are not finite.
+        """
+        found = actions
         if self.around:
             with np.errstate(all="ignore"):
-                law = self._law(states[:, :-1].reshape(-1, states.shape[2]), k, K, b)
-                found = found - law.reshape(found.shape)
-        found[~np.isfinite(found).all(axis=(1, 2))] = 0.0
-        return found
+                law = self._law(states[:, :-1].reshape(-1, states.shape[2]), 0, *self._feedback)
+                found = actions - law.reshape(actions.shape)
+        return np.where(np.isfinite(found).all(axis=(1, 2), keepdims=True), found, 0.0)
 
     def _rolled(self, z: Array, v: Array, k: int) -> tuple[Array, Array]:
         """States (M, H + 1, n_z) and applied actions of plans."""
@@ -327,14 +333,19 @@ class Planner:
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
 
 
-def planned(planner: Planner) -> Act:
-    """The first actions of plans, each of which begins with the rest of the one before."""
+def planned(planner: Planner, fallen: list[Flags] | None = None) -> Act:
+    """The first actions of plans, each of which begins with the rest of the one before.
+
+    fallen: to which each step adds the rows (M,) where the affine law's plan was better.
+    """
     plan: Array = np.zeros((0, 0, 0))
 
     def act(z: Array, before: Array, k: int) -> Array:
         nonlocal plan
-        a, plan = planner.step(plan, planner.after(z, before), k)
+        a, plan, fell = planner.step(plan, planner.after(z, before), k)
         plan = planner.shifted(plan)
+        if fallen is not None:
+            fallen.append(fell)
         return a
 
     return act

@@ -63,6 +63,8 @@ class Predictive(Extended):
     worth: ClassVar[float] = 0.0
     """Share of the cost of the law that it begins as that must be to be had on the model before
     rollouts are kept for a law that plans; 0: they always are."""
+    fallen: int = 0
+    """Steps so far at which the plan of `without` was better; for diagnostics, and of no effect."""
 
     def __init__(self, model: Any, horizon: int) -> None:
         super().__init__(model, horizon)
@@ -220,7 +222,8 @@ class Predictive(Extended):
             plan = own[: H * self.n_a].reshape(1, H, self.n_a)[:, : planner.steps]
             last = own[None, H * self.n_a :] if k else None
             start = self._state(theta, z, first, k)
-            a, plan = planner.step(plan, planner.after(start, last), k)
+            a, plan, fell = planner.step(plan, planner.after(start, last), k)
+            self.fallen += int(fell[0])
             known = self._plans[key] = a[0], plan[0]
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
