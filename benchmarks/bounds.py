@@ -9,7 +9,9 @@ limits and measurement noise count, and with exact derivatives:
   coordinates until it gains nothing more, from the first law or from zero, whichever leads further,
 - the inputs of least cost for known initial fields, without noise, as a_k = K_a U^T z_k + b + v_k
   around that law, by L-BFGS on all v_k: where the plant is unstable, the cost is a gentler function of
-  v than of a. It is a local optimum: on chaotic and front-forming plants controllers can do better.
+  v than of a. It is a local optimum, and there are many on chaotic and front-forming plants: of each
+  field the cheapest of several descents counts, which begin at that law, at drawn inputs, and at
+  receding-horizon control of the plant itself, around that law or the LQ law of the whole state.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ from pdeloop.messages.cost import Cost
 from pdeloop.messages.parameters import INSTRUMENTS
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import ModelBasedSettings, curvature_of, improve
+from pdeloop.method.adapt.model_based_predictive import around, rests
 from pdeloop.method.adapt.verdict import cheapest
+from pdeloop.method.laws.plans import Planner, planned, simulated
+from pdeloop.method.laws.predictive import LONGEST
 from pdeloop.method.seeds import Purpose, derive
 from pdeloop.process.one_thread import one_thread
 
@@ -66,6 +71,8 @@ ROUNDS = 6
 """Descents from one law at most, each in the coordinates of the one before."""
 INPUTS_TOLERANCE = 2e-3
 """Of `descend`, for the inputs."""
+INPUTS_ITERATIONS = 400
+"""Of plans of whole episodes, at most."""
 
 
 def evaluation_seeds(seed: int, fields: int) -> list[int]:
@@ -84,8 +91,9 @@ def bounds_of(case: Case, seed: int, held_out: Sequence[int]) -> dict[str, Array
         own = initial_fields(plant, evaluation_seeds(TRAINING_SEED, case.law_fields))
         theta = best_law(loop, first, own)
         affine = law_costs(plant, loop, theta, held_out)
-        inputs, _ = best_inputs(loop, theta, initial_fields(plant, held_out))
-    return {"affine": affine, "limit": inputs}
+        known = initial_fields(plant, held_out)
+        inputs, _ = best_inputs(loop, theta, known)
+    return {"affine": affine, "limit": np.minimum(inputs, planned_inputs(loop, theta, known))}
 
 
 def loop_of(values: Mapping[str, Any], optimizer: str) -> tuple[Plant, ClosedLoop, Array]:
@@ -190,6 +198,35 @@ def best_inputs(
     )
     inputs = admissible.project(found.x) if admissible.zero_mean else found.x
     return inputs_cost(loop, theta, inputs, fields)[0], found
+
+
+def planned_inputs(loop: ClosedLoop, theta: Array, fields: Array) -> Array:
+    """The cost of the best inputs that plans on the plant lead to, from each of the fields, (F,).
+
+    Those are plans of whole episodes from several starts, and receding ones of LONGEST steps. Both are
+    improved until they gain nothing more.
+    """
+    T, (K, b) = loop.horizon, (theta[:, :-1] @ loop.U.T, loop.constant_feature * theta[:, -1])
+    plain = Planner(
+        loop.model,
+        loop.cost,
+        loop.action_set,
+        np.ascontiguousarray(K),
+        b,
+        around=True,
+        steps=T,
+        terminal=rests(loop.model, loop.cost, fields),
+        first=INPUTS_ITERATIONS,
+    )
+    least: Array = np.full(len(fields), np.inf)
+    for way in around(plain):
+        start = way.after(fields)
+        whole = way.begin(start)[1]
+        receding = replace(way, steps=min(LONGEST, T), first=Planner.first)
+        costs, states, actions = simulated(receding, fields, planned(receding))
+        further = way.improved(way.deviations(states, actions), start, 0, INPUTS_ITERATIONS)[1]
+        least = np.minimum.reduce([least, whole / T, costs, further / T])
+    return least
 
 
 def _mean(costs: Array, gradient: Array) -> tuple[float, Array]:

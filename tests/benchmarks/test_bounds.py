@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from benchmarks import bounds
-from benchmarks.bounds import best_inputs, inputs_cost, plain_cost
+from benchmarks.bounds import best_inputs, inputs_cost, plain_cost, planned_inputs
 from benchmarks.families.cases import Case
 from benchmarks.families.plants import CoupledPendulums, RandomLinear
 from benchmarks.true_model import TrueModel
+from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.messages.action_set import ActionSet
+from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from tests.support.small import SMALL
 
@@ -43,6 +45,7 @@ def test_the_best_inputs_of_a_linear_plant_are_those_of_the_riccati_recursion() 
     law = 0.02 * np.random.default_rng(2).standard_normal((plant.n_a, 5))
     for theta in (np.zeros_like(law), law):  # whatever law they are found around
         np.testing.assert_allclose(best_inputs(loop, theta, fields)[0], least, rtol=1e-3)
+        np.testing.assert_allclose(planned_inputs(loop, theta, fields), least, rtol=1e-3)
 
 
 def test_inputs_have_an_exact_gradient() -> None:
@@ -63,6 +66,37 @@ def test_saturating_inputs_cost_more_and_no_more_than_the_law() -> None:
     cost, _ = best_inputs(limited, theta, fields)
     assert (cost > best_inputs(free, theta, fields)[0]).all()
     assert (cost < limited.costs(theta, fields)).all()
+    np.testing.assert_allclose(planned_inputs(limited, theta, fields), cost, rtol=1e-3)
+
+
+class Well(Dynamics):
+    """A particle in a valley beside its target, with a hill between them and a wider way round."""
+
+    n_z, n_a, horizon, target, action_weight = 2, 2, 16, np.array([2.0, 0.0]), 0.1
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return np.array([0.0, 0.0])
+
+    def step(self, z: Array, a: Array) -> Array:
+        return z + 0.2 * a + self._push(z)[0]
+
+    def pull_back(self, z: Array, a: Array, y: Array) -> tuple[Array, Array]:
+        return y + np.einsum("...i,...ij->...j", y, self._push(z)[1]), 0.2 * y
+
+    def _push(self, z: Array) -> tuple[Array, Array]:
+        """Of the hill at (1, 0), and its derivative."""
+        away = z - np.array([1.0, 0.0])
+        height = 8.0 * np.exp(-6.0 * np.sum(away**2, axis=-1))[..., None]
+        outer = -12.0 * away[..., :, None] * away[..., None, :]
+        return height * away, height[..., None] * (np.eye(2) + outer)
+
+
+def test_several_starts_find_the_way_round_that_a_descent_from_one_misses() -> None:
+    """By symmetry no descent from a law without a sideways action leaves the straight line."""
+    loop, fields = loop_on(Well(), 2, Well.horizon), np.zeros((1, 2))
+    theta = np.array([[-1.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+    straight, around = best_inputs(loop, theta, fields)[0], planned_inputs(loop, theta, fields)
+    assert around < 0.5 * straight
 
 
 def test_limits_and_noise_count() -> None:
