@@ -280,8 +280,8 @@ def test_of_laws_that_plan_it_is_told_what_they_save_and_how_often_they_fall_bac
     lines = closing_lines("kdv", summary(seeds=3, **given, acting=acting), "")
     assert (
         "  the law that acts is predictive for 2 of 3 seeds (on the model it saves 10 to 20 % of the "
-        "cost of the law that it began as); a step takes 2 to 3 ms, the first one 1e+02 ms; at 0 to 2 % of "
-        "steps on the model it fell back on that law's plan"
+        "cost of the law that it began as); a step takes 2 to 3 ms, the first one 1e+02 ms; at 0 "
+        "to 2 % of steps on the model it fell back on that law's plan"
     ) in lines
     given = {"changed": [True], "outcome": outcome[:1], "history": history[:1]}
     (line,) = (
