@@ -161,6 +161,12 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
                 f"axis, between at most {SENSED_MOST} sensors of which only the last readings are "
                 "known; give --law extended_kalman"
             )
+        cost = Cost.parse(values["cost"])
+        if estimates and not (cost is None or cost.plain):
+            raise ParameterError(
+                f"the law '{law.name}' plans between few sensors only for a constant target and "
+                "weights q and r, but the plant has another cost; give --law extended_kalman"
+            )
         if law.settings.steps > values["horizon"]:
             raise ParameterError(
                 f"parameter 'law_settings.steps' is {law.settings.steps}; expected at most the steps "

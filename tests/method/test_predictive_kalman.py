@@ -39,6 +39,7 @@ from tests.support.estimated import (
     rows_of,
 )
 from tests.support.small import same_bits
+from tuner_node.build import kind_of, law_of
 
 Array = np.ndarray
 RNG = np.random.default_rng(4)
@@ -208,3 +209,12 @@ def test_a_law_that_plans_has_the_one_of_few_sensors_in_its_place() -> None:
         pdeloop.train("burgers", law="predictive", sensor_delays=2, **few)
     with pytest.raises(ParameterError, match="on a periodic axis, between at most 32 sensors"):
         pdeloop.train("burgers", law="auto", sensors=40, n_z=64)
+    moving = np.linspace(0.0, 1.0, 31)[:, None] * np.ones(64)
+    for law, cost in (("auto", {"target": moving}), ("predictive", {"state_weight": np.eye(64)})):
+        problem = pdeloop.problem("burgers", cost=cost, horizon=30, **few)
+        with pytest.raises(
+            ParameterError, match="constant target and weights q and r, but the plant"
+        ):
+            pdeloop.train(problem, law=law)
+    values = pdeloop.problem("burgers", law="auto", cost={"target": 0.5}, **few).values
+    assert law_of(values, kind_of(values)).name == "auto_kalman"
