@@ -208,6 +208,14 @@ def test_the_affine_law_acts_where_no_plan_is_finite_and_its_plan_is_taken_where
     assert not plan.any()
 
 
+def test_a_search_begins_however_long_its_first_step_has_to_be() -> None:
+    """Without a cost to go cheap actions alone give a length that is far too long."""
+    cost = Cost(N_Z, N_A, T, action_weight=0.01, target=0.3)
+    own = planner(linear(), cost, around=False, terminal=False)
+    z, none = np.random.default_rng(8).standard_normal((2, N_Z)), np.zeros((2, 12, N_A))
+    assert (own.improved(none, z, 0, 30)[1] < 0.6 * own.costs(none, z, 0)).all()
+
+
 def test_a_target_over_time_is_foreseen() -> None:
     """It is worth moving before the target does."""
     rows = np.repeat([0.0, 1.0], T // 2)[:, None] * np.ones(1)

@@ -49,9 +49,9 @@ from pdeloop.method.models.sweep import Sweep, rolled, sweep_of
 
 MEMORY = 10
 """Pairs of L-BFGS."""
-ARMIJO, SHORTER, TRIALS = 1e-4, 0.3, 8
+ARMIJO, SHORTER, TRIALS, FIRST_TRIALS = 1e-4, 0.3, 8, 16
 """Of the line search: the share of the slope that a step must gain, the factor of the next trial, and
-trials at most."""
+trials at most, later and at first: without a cost to go nothing tells how long a first step is."""
 WAVES = 5
 """Cosines of a plan that is drawn."""
 BEFORE = 15
@@ -212,7 +212,7 @@ class Planner:
             if not len(todo):
                 break
             new_v, new_J, new_g = v.copy(), J.copy(), g.copy()
-            for _ in range(TRIALS):
+            for _ in range(TRIALS if pairs else FIRST_TRIALS):
                 if not len(todo):
                     break
                 trial = v[todo] - t[todo, None, None] * d[todo]
