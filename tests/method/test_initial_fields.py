@@ -11,10 +11,8 @@ import pytest
 
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.closed_loop import ClosedLoop
-from pdeloop.method.adapt.improve import (
-    any_state_serves,
-    is_chaotic,
-)
+from pdeloop.method.adapt.improve import any_state_serves, initial_fields, is_chaotic
+from pdeloop.method.adapt.trajectories import Record
 
 N_Z = 12
 Map = Callable[[np.ndarray], np.ndarray]
@@ -78,3 +76,14 @@ def test_a_stable_plant_is_not_chaotic_where_its_model_runs_away_from_some_field
     costs = loop.costs(loop.no_control, fields)
     assert np.isinf(costs[-1]) and costs[-2] > 2.0 * costs[:-2].sum()
     assert not is_chaotic(loop, fields)
+
+
+def test_a_field_that_noise_measures_anew_is_the_same_one() -> None:
+    """Rollouts of several laws from the field of one seed; -1 is no seed."""
+    seeds = 7, 8, 7, 7, -1, -1
+    records = [
+        Record(np.zeros((1, 2)), 1.0, FIELDS[:2] + 0.01 * i, np.zeros((1, 1)), i, seed)
+        for i, seed in enumerate(seeds)
+    ]
+    found = initial_fields(records)
+    np.testing.assert_array_equal(found, [FIELDS[0] + 0.01 * i for i in (0, 1, 4, 5)])

@@ -365,9 +365,13 @@ def choose_fraction(costs: Array, confidence: float) -> tuple[int, Estimate]:
 
 
 def initial_fields(records: Sequence[Record]) -> Array:
-    """The measured initial fields, each once, (n, n_z)."""
-    fields = [record.states[0] for record in records]
-    return np.stack(list({field.tobytes(): field for field in fields}.values()))
+    """The measured initial fields, (n, n_z), each once, also where noise makes measurements differ."""
+    found, seeds = dict[bytes, Array](), set[int]()
+    for record in records:
+        if record.field_seed < 0 or record.field_seed not in seeds:
+            found.setdefault(record.states[0].tobytes(), record.states[0])
+        seeds.add(record.field_seed)
+    return np.stack(list(found.values()))
 
 
 def begin_alike(records: Sequence[Record]) -> bool:
