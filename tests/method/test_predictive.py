@@ -22,6 +22,8 @@ from pdeloop.method.adapt.base import Context, Rollout, RolloutResult, Trajector
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import ModelBased
 from pdeloop.method.adapt.model_based_predictive import (
+    DRAWN,
+    MEASURED,
     ModelBasedPredictive,
 )
 from pdeloop.method.laws import Law, Predictive
@@ -328,6 +330,18 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
     assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
     assert 0.0 <= rows[-2]["plan_falls"] < 1.0 and rows[-2]["plan_saves"] > 0.0
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
+
+
+def test_what_is_to_be_had_is_measured_on_fields_that_no_law_was_trained_on() -> None:
+    own = optimizer()
+    while own._affine.belief is None:
+        own.tell([measured(own._law, rollout) for rollout in own.ask()])
+    fields, costs = own._simulated(own._affine.belief, own._affine.policy)
+    trained = {field.tobytes() for field in own._affine.fields}
+    known = [field.tobytes() in trained for field in fields]
+    assert known == [True] * MEASURED + [False] * DRAWN and np.isfinite(costs).all()
+    again, _ = own._simulated(own._affine.belief, own._affine.policy)
+    assert np.array_equal(again, fields)
 
 
 @pytest.mark.parametrize("name", ["judged", "plans"])

@@ -38,6 +38,7 @@ from pdeloop.method.adapt.base import (
 from pdeloop.method.adapt.belief import Belief
 from pdeloop.method.adapt.improve import ModelBasedSettings
 from pdeloop.method.adapt.model_based import ModelBased
+from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
     SensedLoop,
@@ -69,12 +70,14 @@ LENGTHS = (20, 40, 80)
 """Steps H of the plans that are tried."""
 SHORTER = 0.02
 """Share of the cost that a plan of half the steps, or one with a cost to go, may be worse."""
-FEW = 4
-"""Measured initial fields from which plans are simulated."""
+MEASURED, DRAWN = 2, 4
+"""Measured initial fields from which plans are simulated, and drawn ones: a law may suit the fields
+that it was trained on, and no others."""
 RESTS = 0.01
 """The target is an equilibrium of the model if a step from there moves the state by at most this share
 of its mean distance from it."""
 _OWN = "own."
+_STREAM = 0x504C414E  # "PLAN"
 _NUMBERS = {"kept": "i", "share": "f", "judged": "b", "plans": "b"}
 """What is one number or text of a checkpoint, and its NumPy kind."""
 
@@ -200,7 +203,8 @@ class ModelBasedPredictive(Optimizer):
             least = np.minimum(way.begin(way.after(fields))[1] / horizon, least)
         self._share = share_saved(least, before)
         if self._share > self._law.worth and not self._affine.done:  # is that of affine laws, too?
-            _, before = self._simulated(belief, self._affine.last_law())
+            loop = belief.loop(self._context)
+            before = loop.costs(loop.theta(self._affine.last_law()), fields)
             self._share = share_saved(np.minimum(least, before), before)
         row["could_save"] = self._share
         if self._share > self._law.worth and not self._affine.done:
@@ -213,10 +217,19 @@ class ModelBasedPredictive(Optimizer):
         return ""
 
     def _simulated(self, belief: Belief, policy: Array) -> tuple[Array, Array]:
-        """A few measured initial fields, and an affine law's costs from them on the model."""
+        """A few initial fields from which an affine law stays finite on the model, and its costs.
+
+        All of them where it does from none.
+        """
         loop, every = belief.loop(self._context), self._affine.fields
-        fields = every[np.unique(np.linspace(0, len(every) - 1, FEW).round().astype(int))]
-        return fields, loop.costs(loop.theta(policy), fields)
+        known = every[np.unique(np.linspace(0, len(every) - 1, MEASURED).round().astype(int))]
+        rng = np.random.default_rng([self._seed, _STREAM, self._affine.count])
+        periodic = self._context.periodic
+        drawn = mixtures(every, DRAWN, rng, belief.components, periodic=periodic)
+        fields = np.concatenate([known, drawn])
+        costs = loop.costs(loop.theta(policy), fields)
+        finite = np.isfinite(costs) | ~np.isfinite(costs).any()
+        return fields[finite], costs[finite]
 
     def _begin_judging(self, row: Row) -> None:
         """Make the law that plans, or say why there is none."""
@@ -253,6 +266,8 @@ class ModelBasedPredictive(Optimizer):
         planner, costs, fell = self._planner(belief, known, fields)
         row["plan_steps"], row["plan_saves"] = planner.steps, share_saved(costs, before)
         row["plan_falls"] = fell
+        if not np.isfinite(np.sum(costs)):
+            return "on the model no plan stays finite"
         if not np.sum(costs) < np.sum(before):
             return "on the model no plan is better"
         try:
