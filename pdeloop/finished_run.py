@@ -380,6 +380,8 @@ def reduction(costs: Array, lqt: Array) -> Reduction | None:
     of the percentile bootstrap: the seeds are drawn again with replacement, each with both its costs.
     Efron, Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13.
 
+    Examples
+    --------
     >>> import numpy as np
     >>> found = reduction(np.array([[1.0], [6.0]]), np.array([[2.0], [8.0]]))
     >>> round(found.ratio_of_means, 2), round(found.mean_of_ratios, 2)

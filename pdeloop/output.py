@@ -44,6 +44,8 @@ def drop_unwritable() -> None:
 def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:
     """The rows of a table as lines, the columns side by side; the first `names` are words.
 
+    Examples
+    --------
     >>> aligned([("problem", "cost"), ("kdv", "33.71")])
     ['problem   cost', 'kdv      33.71']
     """

@@ -44,6 +44,8 @@ def rows_of(n_z: int, components: int = 1, lengths: tuple[int, ...] = ()) -> NDA
     They are evenly spaced, at most ROWS in each of the first MAX_COMPONENTS components. Of components
     of different lengths equally many are kept, so that points of the shorter ones are there twice.
 
+    Examples
+    --------
     >>> rows_of(6, components=2).tolist()
     [0, 1, 2, 3, 4, 5]
     >>> len(rows_of(1000))
@@ -69,6 +71,8 @@ def plane_of(grid: Grid) -> tuple[NDArray[np.intp], tuple[int, int]]:
 
     Of more than two axes it is the middle.
 
+    Examples
+    --------
     >>> from pdeloop.messages.grid import Axis
     >>> points, shape = plane_of(Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))))
     >>> points.tolist(), shape

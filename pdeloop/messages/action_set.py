@@ -163,6 +163,8 @@ class ActionSet:
     def of(values: Mapping[str, Any]) -> ActionSet:
         """The set of `action_limit`, `action_bounds`, `exploration_mean` and `exploration_scale`.
 
+        Examples
+        --------
         >>> both = {"n_a": 2, "action_limit": 3.0, "action_bounds": [0.0, -1.0, 4.0, 2.0, 0.0]}
         >>> ActionSet.of(both).project(np.array([[9.0, -9.0]]))
         array([[ 3., -1.]])
@@ -195,6 +197,8 @@ class ActionSet:
 
         The action itself if it is a standard deviation from its bounds; else two of them from there.
 
+        Examples
+        --------
         >>> ActionSet(3, 0.0, 8.0).inside(np.array([0.0, 1.5, 9.0]))
         array([2. , 1.5, 6. ])
         """
@@ -269,6 +273,8 @@ class ActionSet:
     def applied(self, requested: Array) -> Array:
         """The actions (T, ..., n_a) that are applied for requested ones of the steps of an episode.
 
+        Examples
+        --------
         >>> ActionSet(1, rate=0.5).applied(np.array([[2.0], [2.0], [-1.0]])).ravel()
         array([0.5, 1. , 0.5])
         """
@@ -293,6 +299,8 @@ class ActionSet:
         All are (..., n_a); after: as for `project`. At a bound the derivative is that from inside, at a
         rate limit that from the side to which -y points.
 
+        Examples
+        --------
         >>> ActionSet(high=1.0).pull_back(np.array([0.5, 5.0]), np.array([3.0, 3.0]))[0]
         array([3., 0.])
         """
@@ -327,6 +335,8 @@ class ActionSet:
     def free(self, n_a: int) -> Array:
         """Orthonormal directions (n_a, n) in which actions can move: all, or those of mean zero.
 
+        Examples
+        --------
         >>> ActionSet(2, zero_mean=True).free(2).round(3).tolist()
         [[0.707], [-0.707]]
         """
@@ -340,6 +350,8 @@ class ActionSet:
     def explored(self, draws: Array) -> Array:
         """The exploratory actions P(m + D x) of draws x of N(0, v I), (..., n_a).
 
+        Examples
+        --------
         >>> heater = ActionSet(low=0.0, high=4.0)
         >>> heater.explored(np.array([-1.0, 0.0, 9.0])), heater.exploration_variance
         (array([1., 2., 4.]), 0.25)

@@ -107,6 +107,8 @@ def boxes_of(grid: Grid, supports: Array) -> list[Box]:
     grid: of the state; a plain vector counts as one axis of its numbers; supports (n_z, n_a): how each
     actuator acts on each number of a state.
 
+    Examples
+    --------
     >>> supports = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 2.0], [1.0, 0.0]])
     >>> for box in boxes_of(Grid.interval(4.0, 4), supports):
     ...     print(box.sides)
@@ -160,6 +162,8 @@ def parse(text: str) -> list[Box]:
 
     ValueError if the text does not describe boxes.
 
+    Examples
+    --------
     >>> parse(text_of([Box(1, ((0.0, 0.5),))]))
     [Box(component=1, sides=((0.0, 0.5),))]
     """

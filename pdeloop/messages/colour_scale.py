@@ -53,6 +53,8 @@ def field_range(values: NDArray[np.floating], target: NDArray[np.floating]) -> t
     values: of a component, of any shape; values that are not finite are ignored; target: its target, of
     any shape; empty if it is not known.
 
+    Examples
+    --------
     >>> field_range(np.array([4.0, 4.0, np.nan]), np.array([2.0, 2.0]))
     (0.0, 4.0)
     >>> field_range(np.zeros(5), np.array([-1.0, 4.0]))
@@ -76,6 +78,8 @@ def colours(levels: NDArray[np.floating]) -> NDArray[np.uint8]:
     levels (...): from 0, the lowest value, to 1, the highest; beyond that it is cut off. NaN is not
     allowed. Returns (..., 3): red, green, blue.
 
+    Examples
+    --------
     >>> colours(np.array([0.0, 0.5, 7.0])).tolist()
     [[5, 48, 97], [247, 247, 247], [103, 0, 31]]
     """

@@ -241,6 +241,8 @@ class Cost:
     def parse(cls, texts: Sequence[str]) -> Cost | None:
         """The cost of a parameter, None where it is empty; ValueError if the texts are none.
 
+        Examples
+        --------
         >>> cost = Cost.parse(Cost(2, 1, 9, action_weight=[3.0]).texts)
         >>> cost.action_weight
         array([3.])

@@ -12,6 +12,8 @@ MAX_SHOWN = 200
 def printable(text: str) -> str:
     r"""A text with its non-printable characters, such as a terminal's escape sequences, escaped.
 
+    Examples
+    --------
     >>> printable("red " + chr(27) + "[31m")
     'red \\x1b[31m'
     """
@@ -56,6 +58,8 @@ def shown(value: object) -> str:
 
     Nothing is written out in full and cut afterwards: a value from a file may stand for gigabytes.
 
+    Examples
+    --------
     >>> shown({"horizon": 80, "start": "lqt"})
     "{'horizon': 80, 'start': 'lqt'}"
     >>> len(shown(["x" * 10**6] * 10**6)) <= MAX_SHOWN + 3

@@ -103,6 +103,8 @@ def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
 def bounds_of(values: Mapping[str, Any]) -> dict[str, list[float | None]] | None:
     """Bounds of each actuator from a plant's parameters, None where it has none; None without any.
 
+    Examples
+    --------
     >>> bounds_of({"n_a": 2, "action_bounds": [0.0, 0.0, 4.0, 1e300, 0.0]})
     {'low': [0.0, 0.0], 'high': [4.0, None]}
     """
