@@ -36,9 +36,8 @@ from pdeloop.method.adapt.base import (
     require_results,
 )
 from pdeloop.method.adapt.belief import Belief
-from pdeloop.method.adapt.improve import ModelBasedSettings
+from pdeloop.method.adapt.improve import ModelBasedSettings, mixtures
 from pdeloop.method.adapt.model_based import ModelBased
-from pdeloop.method.adapt.renewal import mixtures
 from pdeloop.method.adapt.replay import costs_by_field
 from pdeloop.method.adapt.sensed_loop import (
     SensedLoop,
