@@ -91,25 +91,18 @@ def add_products(rows: Array, matrix: Array, totals: Array) -> None:
                 totals[m, j] += value * matrix[i, j]
 
 
-def fit_linear(
-    samples: Samples, *, kind: str, ridge: float, weights: Array | None = None
-) -> LinearModel | None:
-    """Least squares on the change of the state, about the means; ridge: of normalised columns.
-
-    weights (N,): of the steps; all alike without them.
-    """
+def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | None:
+    """Least squares on the change of the state, about the means; ridge: of normalised columns."""
     n_z, change = samples.before.shape[1], samples.after - samples.before
     columns = np.hstack([samples.before, samples.actions])
-    share = np.ones((1, 1)) if weights is None else weights[:, None] / np.mean(weights)
-    # An offset is nothing to hold at zero.
-    mean, moved = (share * columns).mean(axis=0), (share * change).mean(axis=0)
-    columns = np.sqrt(share) * (columns - mean)
+    mean, moved = columns.mean(axis=0), change.mean(axis=0)  # an offset is nothing to hold at zero
+    columns = columns - mean
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale[:n_z] = np.sqrt(np.mean(scale[:n_z] ** 2))
     scale = np.where(scale > 0.0, scale, 1.0)
     columns = columns / scale
     gram = columns.T @ columns / len(columns) + ridge * np.eye(len(scale))
-    moment = columns.T @ (np.sqrt(share) * (change - moved)) / len(columns)
+    moment = columns.T @ (change - moved) / len(columns)
     found = np.linalg.solve(gram, moment) / scale[:, None]
     if not np.isfinite(found).all():
         return None
@@ -189,9 +182,7 @@ def _products(rows: Array, matrix: Array) -> Array:
     return totals
 
 
-def fit_low_rank(
-    samples: Samples, *, kind: str, most: int, weights: Array | None = None
-) -> ProjectedModel | None:
+def fit_low_rank(samples: Samples, *, kind: str, most: int) -> ProjectedModel | None:
     """Least squares in at most `most` POD modes of the data, as many as the data determine."""
     n_a = samples.actions.shape[1]
     few = samples.thinned(_SNAPSHOTS).before
@@ -205,7 +196,7 @@ def fit_low_rank(
         return None
     V = np.linalg.qr(few.T @ mixtures[:, : min(kept, largest)])[0]
     steps = Samples(samples.before @ V, samples.actions, samples.after @ V)
-    inner = fit_linear(steps, kind=kind, ridge=_LOW_RANK_RIDGE, weights=weights)
+    inner = fit_linear(steps, kind=kind, ridge=_LOW_RANK_RIDGE)
     return None if inner is None else ProjectedModel(inner, V.T, V)
 
 

@@ -38,7 +38,6 @@ from pdeloop.method.models.base import (
     samples_of,
     saturated,
     usable,
-    weighing,
 )
 from pdeloop.method.models.finite_difference import (
     features_of,
@@ -56,7 +55,7 @@ from pdeloop.method.models.noise import (
 )
 from pdeloop.method.models.polynomial import LARGEST_STATE, fit_polynomial
 from pdeloop.method.models.spectral import Form, fit_spectral
-from pdeloop.method.reduce.reduced_model import Samples, turns
+from pdeloop.method.reduce.reduced_model import turns
 from pdeloop.process.one_thread import one_thread
 
 BETTER = 3.0
@@ -279,8 +278,6 @@ CHAOTIC_GROWTH = 20.0
 """Least ratio of the errors on whole rollouts and on pieces of a chaotic plant."""
 NEAR = (10.0, 3.0, 1.0)
 """Distances from the target, relative to the largest of initial states, of beginnings."""
-AT_TARGET = 0.25
-"""The distance within which steps count alike for a linear model at the target, likewise."""
 
 PREDICTED = 0.5
 """E of a model without noise, relative to the share of the noise, below which there is no noise."""
@@ -473,7 +470,6 @@ class Selection:
         if whole is not None and not whole.predicts:
             found.append(self._of_pieces(rollouts, scale, whole))
         best = min((own for own in found if own), key=lambda own: own.judged, default=None)
-        best = best or self._at_target(rollouts, scale)
         return best or self._near(rollouts, scale, linear=True) or whole
 
     def _one_step(self, fitted: FittedModel) -> float:
@@ -531,61 +527,6 @@ class Selection:
                 found.append(fitted)
         good = [own for own in found if own and own.predicts and self._one_step(own) <= ONE_STEP]
         return min(good, key=lambda own: own.judged, default=None)
-
-    def _at_target(self, rollouts: list[Measured], scale: Scale) -> FittedModel | None:
-        """A linear model of the steps near the target; None where it does not predict them.
-
-        Its errors grow as the square of the distance d, so that a step has the weight
-        1 / (1 + (d / h)^4), with h a share of the largest distance of an initial state.
-        """
-        own = [limited(rollout, self.action_set) for rollout in rollouts]
-        own = with_clean(own, self.noise, line=self.line) if self.noise else usable(own)
-        seen = weighing(self.weights)
-
-        def away(states: Array) -> Array:
-            found: Array = np.linalg.norm(seen(states - self.target), axis=1)
-            return found
-
-        h = AT_TARGET * max((float(away(each.known[:1])[0]) for each in own), default=0.0)
-        if not (h > 0.0 and np.isfinite(h)):
-            return None
-
-        def weights(samples: Samples) -> Array:
-            far = np.maximum(away(samples.before), away(samples.after)) / h
-            return 1.0 / (1.0 + far**4)
-
-        def fit(parts: Sequence[Measured], _: float) -> FieldModel | None:
-            samples = samples_of(parts)
-            given: dict[str, Any] = {"kind": LINEAR, "weights": weights(samples)}
-            if len(self.target) > DENSE:
-                return fit_low_rank(samples, most=_LINEAR_MODES, **given)
-            return fit_linear(samples, ridge=_LINEAR_RIDGE, **given)
-
-        kind, sums = Kind(LINEAR, fit, (len(self.target), 0)), np.zeros(2)
-        parts = (
-            own
-            if len(own) > 1
-            else [part for each in own for part in pieces(each, self.settings.folds)]
-        )
-        for others, left in turns(parts, self.settings.folds):
-            model, samples = fitted(kind, others), samples_of(left)
-            if model is None:
-                return None
-            with np.errstate(all="ignore"):
-                missed = samples.after - model.step(samples.before, samples.actions)
-                changed = samples.after - samples.before
-                sums += [
-                    weights(samples) @ np.sum((x / scale.units) ** 2, axis=1)
-                    for x in (missed, changed)
-                ]
-        model = fitted(kind, own)
-        error = 0.0 if self.noise else float(np.sqrt(sums[0] / max(sums[1], 1e-300)))
-        if model is None or not error <= ACCEPTED_NOISY:
-            return None
-        known = [(LINEAR, error)]
-        return FittedModel(
-            model, error, known, Accuracy(error, error), rollouts, ACCEPTED_NOISY, near=error
-        )
 
 
 def _moved(rollouts: Sequence[Measured]) -> list[bool]:
