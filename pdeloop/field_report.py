@@ -53,16 +53,16 @@ def summary(field: FieldLaw) -> dict[str, Any]:
         "kind": fitted and fitted.model.kind,
         "error": fitted and fitted.error,
         "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
-        "own_error": fitted and fitted.own.simulated,
-        "one_step_error": fitted and fitted.own.one_step,
-        "regression_error": field.regression.simulated,
-        "regression_one_step_error": field.regression.one_step,
+        "own_error": fitted and _number(fitted.own.simulated),
+        "one_step_error": fitted and _number(fitted.own.one_step),
+        "regression_error": _number(field.regression.simulated),
+        "regression_one_step_error": _number(field.regression.one_step),
         "believed": field.rows is not None,
         "judges": list(field.judges),
         "linearised": field.remark,
         "noise": field.noise,
-        "predicted_cost": field.cost,
-        "predicted_cost_of_regression": field.other_cost,
+        "predicted_cost": _number(field.cost),
+        "predicted_cost_of_regression": _number(field.other_cost),
         "doubtful": field.doubtful,
         "law": "field" if field.better else "regression",
     }
@@ -106,6 +106,10 @@ def text(field: FieldLaw) -> list[str]:
             "no control"
         )
     return lines
+
+
+def _number(cost: float) -> float | None:
+    return cost if np.isfinite(cost) else None
 
 
 def _cost(cost: float) -> str:

@@ -192,10 +192,10 @@ class Identified:
             "constant": [] if self.model.d is None else self.model.d.tolist(),
             "spectral_radius": float(np.abs(poles).max()),
             "stable": stability(*self.pole[1:]),
-            "spectral_radius_interval": list(self.pole[1:]),
-            "effects_uncertain": list(self.uncertain),
+            "spectral_radius_interval": [_finite(end) for end in self.pole[1:]],
+            "effects_uncertain": [_finite(part) for part in self.uncertain],
             "residuals": self.residuals and self.residuals.summary(),
-            "fit": {name: fit.tolist() for name, fit in self.fits},
+            "fit": {name: [_finite(own) for own in fit.tolist()] for name, fit in self.fits},
             "rank": determined.rank,
             "unknowns": determined.unknowns,
             "smallest_singular_value": determined.smallest_singular_value,
@@ -319,6 +319,10 @@ class Identified:
             *loop.text(self.channels, self.sample_time),
             f"to apply the law elsewhere: {law}{every}{names}",
         ]
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _table(rows: Sequence[Mapping[str, float]], order: int) -> list[str]:

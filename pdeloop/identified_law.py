@@ -74,7 +74,7 @@ class ClosedLoop:
             "spectral_radius": self.radius,
             "steps": len(self.actions),
             "settled_step": self.settled,
-            "distance_left": self.left,
+            "distance_left": self.left if np.isfinite(self.left) else None,
             "action_range": self.taken.tolist(),
             "recorded_range": self.recorded.tolist(),
         }
