@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from pdeloop import rollout
 from pdeloop.messages.action_set import ANY_ACTION, ActionSet
 from pdeloop.messages.cost import Cost
 from pdeloop.method.adapt.base import Context, Record, Trajectory
-from pdeloop.method.adapt.replay import law_about_target
+from pdeloop.method.adapt.replay import designed_again, law_about_target
 from pdeloop.method.design.lqt import track
 from pdeloop.method.reduce.reduced_model import ReducedModel
 from tests.support.small import FEW_FITS
@@ -57,6 +59,28 @@ def test_there_is_no_law_of_few_samples_or_of_another_cost() -> None:
     record = _record(0)
     other = Cost(2, 1, 40, output=np.eye(2)[:1], target=np.zeros(1))
     assert law_about_target(_context(record, cost=other), [record]) is None
+
+
+def test_a_first_law_that_diverges_is_designed_again_from_what_it_did() -> None:
+    """A valve with a dead zone: an exploration within it leaves B unknown, large actions do not."""
+    offset = np.array([0.02, 0.01])
+
+    def rolled(size: float) -> Record:
+        actions = size * np.random.default_rng(3).standard_normal((60, 1))
+        x = [np.array([0.5, 0.2])]
+        for a in actions:
+            x.append(A @ x[-1] + B @ (np.sign(a) * np.maximum(np.abs(a) - 0.5, 0.0)) + offset)
+        return Record(np.zeros((1, 4)), np.inf, np.array(x), actions)
+
+    explored, diverged = rolled(0.3), rolled(50.0)
+    known = _context(explored)
+    found = designed_again(known, [explored, diverged])
+    expected = track(ReducedModel(A, B, np.eye(2), d=offset), state_weight=1.0, action_weight=0.1)
+    assert found is not None
+    np.testing.assert_allclose(found[:, :2], expected.K_a, rtol=0.02)
+    np.testing.assert_allclose(found, expected.policy_for(TARGET), atol=0.1)
+    resting = designed_again(replace(known, target=np.zeros(2)), [explored, diverged])
+    assert resting is not None and np.array_equal(resting[:, :2], found[:, :2])
 
 
 @pytest.mark.filterwarnings("ignore::pdeloop.IdentifiabilityWarning")

@@ -70,6 +70,8 @@ _REPEATS = 1e-9
 """Relative difference of the costs of one law up to which its rollouts are the same one."""
 _TRIES = 8
 """Laws about the target after which no further one is tried if none of them costs less."""
+_AGAIN = 2
+"""First laws that are designed again whatever the one before cost."""
 WELL_KNOWN = "more than {} fields would not change the law"
 """Why rollouts are left."""
 _MIXTURE_STREAM = 0x4D4958  # "MIX"
@@ -536,15 +538,38 @@ class ModelBased(Optimizer):
         row["reason"] = f"{why}: {replay.ALONG}"
         if final:
             return
-        found, usable = None, [record for record in records if record.usable]
-        if model is not None and usable:
+        again = self._designed_again(best)
+        if again is not None:
+            row["reason"] = (
+                f"{why}, and the first law diverged: a law designed on all of them follows"
+            )
+            progress.policy, progress.trust = again, 0.0
+            return
+        found = None
+        if model is not None:
             loop = model.loop(self._context)
-            along = loop.replays_of(usable)
-            found = replay.step(loop, along, best, self._settings, progress.trust)
+            usable = [record for record in records if record.usable]
+            if usable:
+                found = replay.step(
+                    loop, loop.replays_of(usable), best, self._settings, progress.trust
+                )
         if found is None:
             row["reason"] = f"{why}, and no step along them stays finite"
         else:
             progress.policy, row["steps"] = found
+
+    def _designed_again(self, best: Array) -> Array | None:
+        """A first law of all that was measured, while each one diverged or cost less than the last."""
+        laws = by_law(self._records.all())
+        own = [rolled for rolled in laws if not np.array_equal(rolled[0].policy, self._none)]
+        costs = [float(np.mean([record.cost for record in rolled])) for rolled in own]
+        affine = self._context.with_constants is None
+        lost = affine and len(costs) > 0 and not np.isfinite(costs[0])
+        if not lost or (best.any() and not np.array_equal(best, self._first)):
+            return None
+        if len(costs) > _AGAIN and not costs[-1] < costs[-2]:
+            return None
+        return replay.designed_again(self._context, self._measurements())
 
     def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         """Take the law of least cost on a model; final: by the last update."""

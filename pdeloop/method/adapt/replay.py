@@ -33,7 +33,7 @@ from pdeloop.messages.arrays import Array
 from pdeloop.method.adapt.base import Context, Record, by_law, of_law
 from pdeloop.method.adapt.closed_loop import ClosedLoop
 from pdeloop.method.adapt.improve import FIRST_GAIN, ModelBasedSettings, curvature_of, improve
-from pdeloop.method.design.lqt import track
+from pdeloop.method.design.lqt import Gains, track
 from pdeloop.method.models.base import Measured, samples_of
 from pdeloop.method.models.selection import limited
 from pdeloop.method.reduce.reduced_model import ReducedModel
@@ -113,25 +113,43 @@ def law_about_target(context: Context, records: Sequence[Record]) -> Array | Non
         return None
     if W is not None and np.linalg.matrix_rank(np.diag(W) if W.ndim == 1 else W) < len(context.U):
         return None
+    K = _tracking(context, records, products=True)
+    return None if K is None else np.hstack([K.K_a, -K.K_a])
+
+
+def designed_again(context: Context, records: Sequence[Record]) -> Array | None:
+    """[K_a K_b] of LQ tracking on x' = A x + B a + d, by regression of all that was measured."""
+    gains = _tracking(context, records, products=False)
+    if gains is None:
+        return None
+    s_r = context.U.T @ context.target
+    return gains.policy_for(s_r) if s_r.any() else gains.policy  # which has no constant part
+
+
+def _tracking(context: Context, records: Sequence[Record], *, products: bool) -> Gains | None:
+    """LQ tracking on A and B of a regression, of x with products, or of s with a constant term d."""
     U, n_s = context.U, context.U.shape[1]
     rollouts = [Measured(record.states, record.actions) for record in records]
     samples = samples_of([limited(rollout, context.action_set) for rollout in rollouts])
     rows, columns = np.triu_indices(n_s)
     a, n = samples.actions, n_s + samples.actions.shape[1]
-    x, after = ((states - context.target) @ U for states in (samples.before, samples.after))
+    origin = context.target if products else 0.0
+    x, after = ((states - origin) @ U for states in (samples.before, samples.after))
     unit = float(np.sqrt(np.mean(x**2, axis=0).max())) or 1.0
     x, after = x / unit, after / unit
-    features = np.hstack([x, a, x[:, rows] * x[:, columns]])
+    more = x[:, rows] * x[:, columns] if products else np.ones((len(x), 1))
+    features = np.hstack([x, a, more])
     if len(samples) < features.shape[1]:
         return None
-    ridge = np.full(features.shape[1], _PRODUCT_RIDGE)
+    ridge = np.full(features.shape[1], _PRODUCT_RIDGE if products else 0.0)
     ridge[:n] = _LINEAR_RIDGE
     gram = features.T @ features / len(x) + np.diag(ridge)
     try:
         found = np.linalg.solve(gram, features.T @ after / len(x))
-        model = ReducedModel(found[:n_s].T, unit * found[n_s:n].T, U)
+        d = np.zeros(n_s) if products else unit * found[n]
+        model = ReducedModel(found[:n_s].T, unit * found[n_s:n].T, U, d=d)
         q, r = context.state_weight, context.action_weight
-        K = track(model, state_weight=q, action_weight=r, cost=cost).K_a
+        gains = track(model, state_weight=q, action_weight=r, cost=context.cost)
     except (np.linalg.LinAlgError, ValueError):
         return None
-    return np.hstack([K, -K]) if np.isfinite(K).all() else None
+    return gains if np.isfinite(gains.policy).all() else None
