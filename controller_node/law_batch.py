@@ -46,6 +46,7 @@ class LawBatch:
         self, laws: Sequence[Law], target: ArrayLike, action_set: ActionSet = ANY_ACTION
     ) -> None:
         self._laws, self._action_set = list(laws), action_set
+        self._planning = [law for law in laws if isinstance(law, Predictive)]
         rated = action_set.rated
         bases, within = [law.model.U for law in laws], ANY_ACTION if rated else action_set
         self._projected = ProjectedLaw(bases, target, within)
@@ -71,9 +72,9 @@ class LawBatch:
         return remembers and self.compiled is None
 
     @property
-    def fallen(self) -> int:
+    def fallbacks(self) -> int:
         """Steps so far at which a law that plans fell back on the law that it began as."""
-        return sum(law.fallen for law in self._laws if isinstance(law, Predictive))
+        return sum(law.fallbacks for law in self._planning)
 
     def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
         """Take theta of each environment for the next episode.

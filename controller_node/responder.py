@@ -212,11 +212,12 @@ class Responder:
             self.counters["states that had to wait"] += 1
             return []
         if answering.law is not None:
+            before = answering.law.fallbacks
             try:
                 actions = answering.law.actions(frame.step, frame.values)
             except MemoryUnknownError as error:
                 return [self._unknown(frame, error)]
-            self.counters["plans that fell back"] = answering.law.fallen
+            self.counters["plans that fell back"] += answering.law.fallbacks - before
             if answering.law.remembers and not self._has_room(frame.run, 0):
                 answering.law.forget_answers()
         else:

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from pde_sim_node.plant import Plant
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
+from pdeloop.messages.grid import middle
 from pdeloop.report import planes
 from pdeloop.report.places import beside, mark_places, moving_target
 from pdeloop.report.style import field_image
-from viewer_node.picture import middle
 
 DOTS = 100
 """Pixels of an inch."""

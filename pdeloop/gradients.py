@@ -49,7 +49,7 @@ class CostGradient(NamedTuple):
     of_fields: Array
 
 
-def features(U: Array, target: Array, states: Array) -> Array:
+def _features(U: Array, target: Array, states: Array) -> Array:
     """[s; 1] of states (..., n_z), (..., n_s + 1).
 
     The last one is 0 where the target lies outside of U: the law then has no constant part.
@@ -141,7 +141,7 @@ class Gradients:
         s_r = basis.T @ self.plant.target
         theta = np.column_stack([gains[:, :n_s], gains[:, n_s:] @ s_r])
         target = self.plant.target
-        episode = self._roll(fields, lambda _, z: features(basis, target, z) @ theta.T)
+        episode = self._roll(fields, lambda _, z: _features(basis, target, z) @ theta.T)
         found = self._gradient(episode, theta, basis)
         by_theta = found.gradient
         by_policy = np.hstack([by_theta[:, :n_s], np.outer(by_theta[:, n_s], s_r)])
@@ -250,7 +250,7 @@ class Gradients:
                 gradient[k] = g
             else:
                 eta += g @ argument[:, :-1] @ U.T
-                gradient += g.T @ features(U, plant.target, z)
+                gradient += g.T @ _features(U, plant.target, z)
         return CostGradient(float(episode.costs.mean.mean()), gradient, eta)
 
     def _terminal_slope(self, episode: EpisodeRecord) -> Array | float:

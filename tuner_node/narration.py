@@ -207,7 +207,7 @@ def _acting(summary: Row) -> list[str]:
     """Which law acts, what it saves, and what a step costs, where plans were possible."""
     lines = []
     every = list(zip(summary.get("acting", []), summary.get("outcome", []), strict=False))
-    last = {row["seed"]: row for row in summary.get("history", []) if "plan_falls" in row}
+    last = {row["seed"]: row for row in summary.get("history", []) if "plan_fallbacks" in row}
     for name in dict.fromkeys(own["law"] for own, _ in every):
         seeds = [m for m, (own, _) in enumerate(every) if own["law"] == name]
         first, step = (
@@ -222,7 +222,7 @@ def _acting(summary: Row) -> list[str]:
         elif len(seeds) > 1 and len(rows) == len(seeds) and name == PREDICTIVE:
             saved = span((100 * row["plan_saves"] for row in rows), ".2g")
             why = f" (on the model it saves {saved} % of the cost of the law that it began as)"
-        fell = [100 * row["plan_falls"] for row in rows]
+        fell = [100 * row["plan_fallbacks"] for row in rows]
         back = ""
         if name == PREDICTIVE and any(fell):
             back = (

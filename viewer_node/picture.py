@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import colours
-from pdeloop.messages.grid import Grid
+from pdeloop.messages.grid import Grid, middle
 
 UNSEEN = (128, 128, 128)
 """Colour of steps that were not seen."""
@@ -47,13 +47,6 @@ def plane(grid: Grid, state: Array, ranges: Sequence[Range]) -> NDArray[np.uint8
         for values, limits in zip(grid.fields(state), ranges, strict=False)
     ]
     return np.concatenate(shown)
-
-
-def middle(values: Array) -> Array:
-    """A component on its last two axes; of others the middle."""
-    while values.ndim > 2:
-        values = values[len(values) // 2]
-    return values
 
 
 MOST_CELLS = 4096

@@ -7,15 +7,11 @@ import argparse
 from collections.abc import Callable
 from dataclasses import asdict
 from math import nan
-from typing import TYPE_CHECKING
 
 from pdeloop.commands import common
 from pdeloop.commands.settings import add_set, joined, read_settings
 from pdeloop.messages.parameters import flags
 from pdeloop.output import print_json
-
-if TYPE_CHECKING:
-    pass
 
 ROLES = ("plant", "controller", "tuner")
 OF_A_NODE = {

@@ -513,6 +513,13 @@ def _lengths(fields: Mapping[str, tuple[int, int]]) -> tuple[tuple[str, int], ..
     return tuple(found)
 
 
+def middle(values: Array) -> Array:
+    """A component on its last two axes; of others the middle."""
+    while values.ndim > 2:
+        values = values[len(values) // 2]
+    return values
+
+
 def axes_of(text: str) -> tuple[int, ...]:
     """Points of each axis of the grid in a text; none where that is empty, or of a plain vector."""
     return tuple(axis.size for axis in Grid.parse(text).axes) if text else ()

@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 from pde_sim_node.plant import Plant
 from pdeloop.messages.arrays import Array
 from pdeloop.messages.colour_scale import field_range
-from pdeloop.messages.grid import Grid
+from pdeloop.messages.grid import Grid, middle
 from pdeloop.report import places
 from pdeloop.report.style import FIELD_MAP
-from viewer_node.picture import middle
 
 if TYPE_CHECKING:
     from pdeloop.episode import EpisodeRecord

@@ -109,11 +109,11 @@ def test_steps_at_which_the_law_that_it_began_as_has_the_better_plan_are_counted
         a = action(own, parts, STATES[k], memory, k)
         assert np.array_equal(batch.actions(k, STATES[k : k + 1])[0], a)
         memory = updated(own, parts, STATES[k], memory, a, k)
-    before, memory[:10] = own.fallen, 1e3
-    assert batch.fallen == before
+    before, memory[:10] = own.fallbacks, 1e3
+    assert batch.fallbacks == before
     action(own, parts, STATES[3], memory, 3)
     action(own, parts, STATES[3], memory, 3)  # once for one state
-    assert own.fallen == before + 1
+    assert own.fallbacks == before + 1
 
 
 def test_theta_holds_which_law_a_plan_deviates_from() -> None:
@@ -328,7 +328,7 @@ def test_an_optimiser_continues_from_its_state_to_the_bit(
         assert np.array_equal(other.policy, own.policy) and other.done == own.done
     assert sum("could_save" in row for row in rows) == (kind is Eager)
     assert rows[-1]["rollouts"] == rollouts and rows[-1]["role"] == "judging"
-    assert 0.0 <= rows[-2]["plan_falls"] < 1.0 and rows[-2]["plan_saves"] > 0.0
+    assert 0.0 <= rows[-2]["plan_fallbacks"] < 1.0 and rows[-2]["plan_saves"] > 0.0
     assert rows[-1]["cost"] == pytest.approx(rows[-1]["predicted"], rel=0.05)
 
 

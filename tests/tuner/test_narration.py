@@ -273,7 +273,9 @@ def test_rollouts_that_were_not_used_are_said_with_the_reason_even_of_a_better_l
 def test_of_laws_that_plan_it_is_told_what_they_save_and_how_often_they_fall_back():
     acting = [{"law": "predictive", "first_step": 0.1, "step": n * 1e-3} for n in (2, 3)]
     acting.append({"law": "affine", "first_step": 1e-6, "step": 1e-6})
-    history = [{"seed": m, "plan_saves": 0.1 * (m + 1), "plan_falls": 0.02 * m} for m in range(2)]
+    history = [
+        {"seed": m, "plan_saves": 0.1 * (m + 1), "plan_fallbacks": 0.02 * m} for m in range(2)
+    ]
     outcome = [{"verdict": "better", "reason": "why", "early": ""}] * 3
     costs = {name: [cost] * 3 for name, cost in {"none": 4.0, "lqt": 2.0, "adapted": 1.0}.items()}
     given = {"changed": [True] * 3, "outcome": outcome, "history": history, "costs": costs}

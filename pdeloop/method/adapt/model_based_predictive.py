@@ -264,7 +264,7 @@ class ModelBasedPredictive(Optimizer):
         fields, before = self._simulated(belief, self._affine.policy)
         planner, costs, fell = self._planner(belief, known, fields)
         row["plan_steps"], row["plan_saves"] = planner.steps, share_saved(costs, before)
-        row["plan_falls"] = fell
+        row["plan_fallbacks"] = fell
         if not np.isfinite(np.sum(costs)):
             return "on the model no plan stays finite"
         if not np.sum(costs) < np.sum(before):
@@ -304,9 +304,9 @@ class ModelBasedPredictive(Optimizer):
         lengths = [own] if own else sorted({min(n, self._law.longest) for n in LENGTHS})
 
         def tried(planner: Planner) -> tuple[float, Planner, Array, float]:
-            fallen = list[Flags]()
-            costs = self._costs(belief, policy, planner, fields, fallen)
-            return float(np.sum(costs)), planner, costs, float(np.mean(fallen))
+            fallbacks = list[Flags]()
+            costs = self._costs(belief, policy, planner, fields, fallbacks)
+            return float(np.sum(costs)), planner, costs, float(np.mean(fallbacks))
 
         def worth(each: tuple[float, Planner, Array, float]) -> float:
             """Without a cost to go, which keeps a plant at its target, plans have to be cheaper."""
@@ -327,11 +327,11 @@ class ModelBasedPredictive(Optimizer):
         return self._costs(belief, theta, planner, fields, [])
 
     def _costs(
-        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallen: list[Flags]
+        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallbacks: list[Flags]
     ) -> Array:
-        """Costs of plans from initial fields on the model; fallen: as in `planned`."""
+        """Costs of plans from initial fields on the model; fallbacks: as in `planned`."""
         noise = belief.loop(self._context).noise
-        return simulated(planner, fields, seen_with_noise(planned(planner, fallen), noise))[0]
+        return simulated(planner, fields, seen_with_noise(planned(planner, fallbacks), noise))[0]
 
     def _judge(self, asked: Sequence[Rollout], results: Sequence[RolloutResult], row: Row) -> None:
         """Keep the affine law, unless the one that plans is better by more than chance."""
@@ -453,14 +453,14 @@ class ModelBasedPredictiveSensed(ModelBasedPredictive):
         return sensed_loop(self._context, belief.model)
 
     def _costs(
-        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallen: list[Flags]
+        self, belief: Belief, policy: Array, planner: Planner, fields: Array, fallbacks: list[Flags]
     ) -> Array:
         law = self._kalman
         known = law.filter(law.parts(np.ravel(policy)[: law.size]))
         if known is None:
-            fallen.append(np.ones(len(fields), dtype=np.bool_))
+            fallbacks.append(np.ones(len(fields), dtype=np.bool_))
             return np.full(len(fields), np.inf)
-        act = from_estimates(planned(planner, fallen), known, self._loop(belief).noise)
+        act = from_estimates(planned(planner, fallbacks), known, self._loop(belief).noise)
         return simulated(planner, fields, act)[0]
 
     def _seeds(self) -> list[int]:

@@ -333,10 +333,10 @@ class Planner:
         return (e * on_e).sum(axis=1), 2.0 * on_e[:, :-1]
 
 
-def planned(planner: Planner, fallen: list[Flags] | None = None) -> Act:
+def planned(planner: Planner, fallbacks: list[Flags] | None = None) -> Act:
     """The first actions of plans, each of which begins with the rest of the one before.
 
-    fallen: to which each step adds the rows (M,) where the affine law's plan was better.
+    fallbacks: to which each step adds the rows (M,) where the affine law's plan was better.
     """
     plan: Array = np.zeros((0, 0, 0))
 
@@ -344,8 +344,8 @@ def planned(planner: Planner, fallen: list[Flags] | None = None) -> Act:
         nonlocal plan
         a, plan, fell = planner.step(plan, planner.after(z, before), k)
         plan = planner.shifted(plan)
-        if fallen is not None:
-            fallen.append(fell)
+        if fallbacks is not None:
+            fallbacks.append(fell)
         return a
 
     return act

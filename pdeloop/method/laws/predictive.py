@@ -63,7 +63,7 @@ class Predictive(Extended):
     worth: ClassVar[float] = 0.0
     """Share of the cost of the law that it begins as that must be to be had on the model before
     rollouts are kept for a law that plans; 0: they always are."""
-    fallen: int = 0
+    fallbacks: int = 0
     """Steps so far at which the plan of `without` was better; for diagnostics, and of no effect."""
 
     def __init__(self, model: Any, horizon: int) -> None:
@@ -223,7 +223,7 @@ class Predictive(Extended):
             last = own[None, H * self.n_a :] if k else None
             start = self._state(theta, z, first, k)
             a, plan, fell = planner.step(plan, planner.after(start, last), k)
-            self.fallen += int(fell[0])
+            self.fallbacks += int(fell[0])
             known = self._plans[key] = a[0], plan[0]
             while len(self._plans) > _KEPT_PLANS:
                 self._plans.popitem(last=False)
