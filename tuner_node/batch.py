@@ -152,6 +152,8 @@ class TrainingSettings:
     """Standard deviation of the noise on every number of the states."""
     sensors: int = 0
     """Point sensors whose readings the states are; 0: the states are whole."""
+    sensor_positions: Sequence[float] = ()
+    """Of each sensor as a share of the domain; none: equally spaced."""
     actuator_positions: Sequence[float] = ()
     """Centres of the actuators as shares of the domain; none: equally spaced."""
     actuator_widths: Sequence[float] = ()
@@ -222,6 +224,7 @@ def context_of(
         action_set=settings.action_set,
         noise=settings.measurement_noise,
         sensors=settings.sensors,
+        sensor_positions=settings.sensor_positions,
         actuator_positions=settings.actuator_positions,
         actuator_widths=settings.actuator_widths,
         periodic=settings.periodic,

@@ -337,6 +337,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
     )  # readings of several steps are no field
     axes = axes_of(values["grid"])
     centres, widths = declared_actuators(values)
+    # Where they are on the grid, up to half a spacing away from equally spaced.
+    points = grid or Grid(numbers=values["n_z"])
+    positions = (points.equally_spaced(sensors) / points.points).tolist() if sensors else []
     given |= {
         "law": law,
         "cost": measured_cost(values),
@@ -345,6 +348,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
             values["exploration_variance"] or action_set.exploration_variance, variance
         ),
         "sensors": sensors,
+        "sensor_positions": positions,
         "actuator_positions": centres,
         "actuator_widths": widths,
         "periodic": not delayed and (grid is None or grid.is_circle),

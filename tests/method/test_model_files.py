@@ -23,8 +23,9 @@ def test_a_model_has_no_actuators_of_negative_width() -> None:
 @pytest.mark.parametrize("form", [*FORMS, NEIGHBOURS])
 def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
     arrays = MODELS[form]().arrays()
-    # Axes that nothing else tells the length of; the sensed model has a centre for each actuator.
-    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, "inner.B": 1}
+    # Axes that nothing else tells the length of; the sensed model has a centre for each actuator, and
+    # 64 points are also the grid of 16 sensors.
+    free = {"fewer": 0, "polynomials": 1, "U": 0, "V": 0, "inner.B": 1, "places": 0}
     free |= {} if form == "sensed" else {"B": 1}
     for name, array in arrays.items():
         for axis in range(array.ndim):
@@ -54,8 +55,8 @@ def test_arrays_that_do_not_fit_together_are_no_model(form: str) -> None:
         ("polynomial", "action_scale", np.zeros(2)),
         ("polynomial", "coefficients", np.zeros((2, 8))),
         ("sensed", "coefficients", np.zeros((3, 2, 64))),
-        ("sensed", "sensors", np.array(-1)),
-        ("sensed", "sensors", np.array(9)),
+        ("sensed", "places", np.zeros(0)),
+        ("sensed", "places", np.zeros(9)),
         ("linear", "form", np.array("quantum")),
     ],
 )

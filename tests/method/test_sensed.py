@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 import pdeloop
 from pdeloop.episode import rollout
+from pdeloop.messages.grid import Grid
 from pdeloop.method.models.base import DEFAULTS
 from pdeloop.method.models.sensed import (
     COEFFICIENTS,
@@ -25,7 +26,7 @@ from pdeloop.method.models.sensed import (
 )
 from pdeloop.method.models.sensed_fit import SENSED_REPRODUCED, fit_sensed
 from pdeloop.method.models.spectral import SpectralModel
-from tests.support.sensed import DECLARED, SENSORS, equally_spaced, readings_of
+from tests.support.sensed import DECLARED, PLACES, SENSORS, equally_spaced, places_of, readings_of
 
 Array = np.ndarray
 FIELD = 11
@@ -53,8 +54,9 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, 
     readings, actions, _, actuators = _rollouts(problem, seed)
     with threadpool_limits(1):
         noise = problem.values["measurement_noise"] * _scale(problem)
-        found = fit_sensed(list(readings), list(actions), actuators, noise)
-    model = sensed_model(found.shared, readings.shape[2], actuators, _largest(found.fields))
+        places = places_of(readings.shape[2])
+        found = fit_sensed(list(readings), list(actions), places, actuators, noise)
+    model = sensed_model(found.shared, places, actuators, _largest(found.fields))
     return model, found.fields, found.error
 
 
@@ -70,13 +72,13 @@ def _step(model: SpectralModel, z: Array, a: Array) -> Array:
 def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
     problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=18)
     readings, actions, distances, actuators = _rollouts(problem, 1000)
-    target = interpolated(problem.plant().target)
+    target = interpolated(problem.plant().target, PLACES)
 
     def off(*known: Array) -> float:
         """The relative error of the simulated distance from the target."""
         with threadpool_limits(1):
-            found = fit_sensed(list(readings), list(actions), actuators, 0.0, None, *known)
-        model = sensed_model(found.shared, SENSORS, actuators, _largest(found.fields))
+            found = fit_sensed(list(readings), list(actions), PLACES, actuators, 0.0, None, *known)
+        model = sensed_model(found.shared, PLACES, actuators, _largest(found.fields))
         z, squares = found.fields[1], []
         for action in actions[1]:
             squares.append(np.mean((z - target) ** 2))
@@ -158,7 +160,7 @@ def test_the_burgers_equation_is_found_from_fronts() -> None:
     readings, actions, _, actuators = _rollouts(problem, 1000)
     scale = np.sqrt(problem.plant().n_z / 16)
     with threadpool_limits(1):
-        found = fit_sensed(list(readings), list(actions), actuators, 0.03 * scale)
+        found = fit_sensed(list(readings), list(actions), places_of(16), actuators, 0.03 * scale)
     assert found.error < SENSED_REPRODUCED
     square = SensedEquation(found.shared, grid_points(16), actuators).symbols[1]
     # -1/2 (u^2)_x of readings that are scaled, in a sampling time of 0.05.
@@ -170,13 +172,29 @@ def test_noise_does_not_make_short_waves_grow() -> None:
     rng = np.random.default_rng(1)
     readings, actions = rng.standard_normal((1, 8, 4)), rng.standard_normal((1, 8, 2))
     with threadpool_limits(1):
-        found = fit_sensed(list(readings), list(actions), equally_spaced(2), 0.5)
+        found = fit_sensed(list(readings), list(actions), places_of(4), equally_spaced(2), 0.5)
     assert found.error > SENSED_REPRODUCED and np.isfinite(found.fields).all()
     shared = found.shared
     assert shared[TERMS.index((1, 4))] <= 0.0
     assert shared[TERMS.index((1, 4))] < 0.0 or shared[TERMS.index((1, 2))] >= 0.0
     growth = SensedEquation(shared, grid_points(4), equally_spaced(2)).symbols[0].real
     assert growth[-2] <= growth[0]
+
+
+def test_sensors_are_where_they_are_on_the_grid() -> None:
+    """Six of 64 points are 10 or 11 spacings apart: a model reads fields there."""
+    places = Grid.interval(1.0, 64).equally_spaced(6) / 64
+    model = sensed_model(np.zeros(unknowns(3)), places, DECLARED, 4.0)
+    waves, x = np.arange(1, 6)[:, None], np.arange(model.n_z) / model.n_z
+    weights = np.random.default_rng(0).standard_normal(5)
+    field, readings = (weights @ np.cos(2.0 * np.pi * waves * (at - 0.1)) for at in (x, places))
+    np.testing.assert_allclose(model.observation @ field, readings, atol=1e-10)
+    again = interpolated(readings, places)
+    np.testing.assert_allclose(model.observation @ again, readings, atol=1e-10)
+    power = np.abs(np.fft.rfft(again)) / model.n_z
+    assert power[4:].max() < 1e-12 < power[3]
+    equal = sensed_model(np.zeros(unknowns(3)), PLACES, DECLARED, 4.0)
+    assert np.array_equal(equal.observation, np.eye(64)[4::8])
 
 
 def _drawn(
@@ -192,7 +210,7 @@ def _drawn(
         shared[TERMS.index(term)] = value
     shared[COEFFICIENTS] = np.mean(strengths)
     shared[SHARED:] = np.array(strengths) - np.mean(strengths)
-    model = sensed_model(shared, SENSORS, DECLARED, 4.0)
+    model = sensed_model(shared, PLACES, DECLARED, 4.0)
     x, drawn = np.arange(model.n_z) / model.n_z, rng.uniform(-1, 1, (count, 5))
     fields = np.stack(
         [
@@ -211,7 +229,7 @@ REACTION = {(1, 0): 1.0, (1, 2): 12.0, (2, 1): -2.0, (3, 0): -1.0}
 def test_an_equation_is_found_with_its_terms_and_no_other() -> None:
     readings, actions, fields = _drawn(REACTION, 4, 0.0, [10.0] * 3)
     with threadpool_limits(1):
-        found = fit_sensed(readings, actions, DECLARED)
+        found = fit_sensed(readings, actions, PLACES, DECLARED)
     used = {TERMS[i]: found.shared[i] for i in np.flatnonzero(found.shared[: len(TERMS)])}
     assert used == pytest.approx(REACTION, rel=0.02)
     np.testing.assert_allclose(found.shared[COEFFICIENTS], 10.0, rtol=0.02)
@@ -223,7 +241,7 @@ def test_what_readings_do_not_tell_is_as_large_as_in_other_rollouts() -> None:
     """With noise, whose short waves would otherwise be those of the fields."""
     readings, actions, fields = _drawn(REACTION, 4, 0.1, [10.0] * 3)
     with threadpool_limits(1):
-        found = fit_sensed(readings, actions, DECLARED, 0.1)
+        found = fit_sensed(readings, actions, PLACES, DECLARED, 0.1)
     assert found.error < 1e-3
     # Amplitudes of up to 1 and 0.5 at the first two wavenumbers, and nothing beyond them.
     assert found.spread[1] > 0.25 and found.spread[8] < 0.1 * found.spread[1]
@@ -235,16 +253,16 @@ def test_what_readings_do_not_tell_is_as_large_as_in_other_rollouts() -> None:
 def test_a_fit_goes_on_from_an_earlier_equation() -> None:
     readings, actions, fields = _drawn(REACTION, 6, 0.1, [10.0] * 3)
     with threadpool_limits(1):
-        first = fit_sensed(readings[:4], actions[:4], DECLARED, 0.1)
+        first = fit_sensed(readings[:4], actions[:4], PLACES, DECLARED, 0.1)
         start = first.shared, first.spread
-        found = fit_sensed(readings[2:], actions[2:], DECLARED, 0.1, start)
+        found = fit_sensed(readings[2:], actions[2:], PLACES, DECLARED, 0.1, start)
     used = np.flatnonzero(first.shared[: len(TERMS)])
     assert set(np.flatnonzero(found.shared[: len(TERMS)])) <= set(used)
     assert np.linalg.norm(found.fields - fields[2:]) < 0.15 * np.linalg.norm(fields[2:])
     wrong = np.zeros(unknowns(3))
     wrong[[TERMS.index((1, 1)), COEFFICIENTS]] = 25.0, -10.0
     with threadpool_limits(1):
-        again = fit_sensed(readings[:4], actions[:4], DECLARED, 0.1, (wrong, first.spread))
+        again = fit_sensed(readings[:4], actions[:4], PLACES, DECLARED, 0.1, (wrong, first.spread))
     # One that cannot be mended is left.
     assert again.error == pytest.approx(first.error, abs=1e-3)
 
@@ -254,7 +272,7 @@ def test_terms_beyond_the_first_ones_are_found_where_these_do_not_suffice() -> N
     equation = {(1, 2): -100.0, (1, 4): -3.0, (2, 1): -10.0}
     readings, actions, _ = _drawn(equation, 3, 0.0, [10.0] * 3, steps=10)
     with threadpool_limits(1):
-        found = fit_sensed(readings, actions, DECLARED)
+        found = fit_sensed(readings, actions, PLACES, DECLARED)
     assert found.error < 1e-5
     for term, value in equation.items():
         assert found.shared[TERMS.index(term)] == pytest.approx(value, rel=0.1)

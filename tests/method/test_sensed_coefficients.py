@@ -22,7 +22,7 @@ from pdeloop.method.models.sensed import (
     unknowns,
 )
 from pdeloop.method.models.sensed_fit import Fitted, fit_sensed
-from tests.support.sensed import DECLARED, SENSORS, readings_of
+from tests.support.sensed import DECLARED, PLACES, readings_of
 
 VARYING = {
     (1, 0, 2, True): 3.0,
@@ -47,7 +47,7 @@ def _unknowns(varying: dict[tuple[int, int, int, bool], float]) -> Array:
 
 
 def _model(varying: dict[tuple[int, int, int, bool], float]) -> SensedModel:
-    return sensed_model(_unknowns(varying), SENSORS, DECLARED, 4.0)
+    return sensed_model(_unknowns(varying), PLACES, DECLARED, 4.0)
 
 
 def _batch(model: SensedModel) -> tuple[Array, Array]:
@@ -93,7 +93,7 @@ def test_the_internal_steps_follow_them() -> None:
     for scale in (0.05, 1.0):  # small fields have fewer steps
         exact = fine.step(scale * fields, actions)
         np.testing.assert_allclose(model.step(scale * fields, actions), exact, atol=2e-3)
-    varying, plain = (sensed_model(_unknowns(v), SENSORS, DECLARED, 20.0) for v in (VARYING, {}))
+    varying, plain = (sensed_model(_unknowns(v), PLACES, DECLARED, 20.0) for v in (VARYING, {}))
     assert varying.substeps > plain.substeps
     assert varying.fewer[0, 1] > plain.fewer[0, 1] == 1
 
@@ -103,7 +103,7 @@ def test_a_size_that_is_none_leaves_steps_that_can_be_made(largest: float) -> No
     """Compiled code has no room for fewer than one."""
     shared = _unknowns({(2, 0, 1, True): 50.0, (1, 2, 1, True): 9.0})
     with np.errstate(all="ignore"):
-        model = sensed_model(shared, SENSORS, DECLARED, largest)
+        model = sensed_model(shared, PLACES, DECLARED, largest)
     assert 1 <= model.substeps <= DEFAULTS.substeps
     assert np.isfinite(model.step(*(0.1 * rows for rows in _batch(model)))).all()
     with pytest.raises(ValueError, match="at least 1 internal step"):
@@ -123,7 +123,7 @@ def _fitted(varying: dict[tuple[int, int, int, bool], float], count: int, sigma:
     readings = np.stack([readings_of(model, *pair) for pair in zip(actions, fields, strict=True)])
     readings += sigma * rng.standard_normal(readings.shape)
     with threadpool_limits(1):
-        return fit_sensed(list(readings), list(actions), DECLARED, sigma)
+        return fit_sensed(list(readings), list(actions), PLACES, DECLARED, sigma)
 
 
 def test_they_are_found_where_constant_ones_do_not_suffice() -> None:

@@ -17,7 +17,7 @@ from pdeloop.method.models.sensed import (
     sensed_model,
     unknowns,
 )
-from tests.support.sensed import SENSORS
+from tests.support.sensed import PLACES, SENSORS
 from tests.support.sensed_optimiser import N_A, rows_of
 from tests.support.small import same_bits
 
@@ -40,7 +40,7 @@ CUBIC = equation(z1_x0=5.0, z1_x2=0.5, z3_x0=-5.0)
 
 
 def model_with(shared: Array, noise: float) -> SensedModel:
-    return sensed_model(shared, SENSORS, ACTUATORS, 4.0, noise=noise)
+    return sensed_model(shared, PLACES, ACTUATORS, 4.0, noise=noise)
 
 
 def field(model: SensedModel, seed: int) -> Array:
@@ -67,4 +67,4 @@ def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> Non
         [np.cos(2 * np.pi * np.arange(SENSORS) / SENSORS), np.full(SENSORS, np.nan)]
     )
     lost = Record(np.zeros(1), np.inf, readings, np.zeros((1, N_A)))
-    assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0]))
+    assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0], PLACES))

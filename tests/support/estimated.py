@@ -22,9 +22,10 @@ from pdeloop.method.models.sensed import (
     sensed_model,
     unknowns,
 )
+from tests.support.sensed import PLACES, SENSORS
 
 Array = np.ndarray
-SENSORS, N_A, T, N_S = 8, 3, 24, 6
+N_A, T, N_S = 3, 24, 6
 ACTUATORS = Actuators((np.arange(N_A) + 0.5) / N_A, np.full(N_A, 0.1))
 SPREAD = np.concatenate([[0.3], *2 * [np.r_[1.0, 0.7, 0.4, np.full(WAVES - 3, 1e-3)]]])
 FACTOR = np.diag(SPREAD)
@@ -40,7 +41,7 @@ def model_of(**terms: float) -> SensedModel:
         p, j = (int(part) for part in name[1:].split("_x"))
         shared[TERMS.index((p, j))] = value
     shared[COEFFICIENTS] = 5.0
-    model = sensed_model(shared, SENSORS, ACTUATORS, 4.0, noise=SIGMA)
+    model = sensed_model(shared, PLACES, ACTUATORS, 4.0, noise=SIGMA)
     return replace(model, spread=SPREAD)
 
 

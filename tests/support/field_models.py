@@ -22,7 +22,7 @@ from pdeloop.method.models.linear import LinearModel, ProjectedModel, ReadingsMo
 from pdeloop.method.models.polynomial import PolynomialModel
 from pdeloop.method.models.sensed import TERMS, VARIATIONS, SensedModel, sensed_model, unknowns
 from pdeloop.method.models.spectral import SpectralModel
-from tests.support.sensed import DECLARED, SENSORS
+from tests.support.sensed import DECLARED, PLACES
 
 N_A = 2
 
@@ -91,7 +91,7 @@ def sensed(**changed: Any) -> SensedModel:
     varying = {(1, 0, 2, True): 3.0, (1, 1, 1, True): 0.5, (1, 2, 1, False): 9.0}
     for variation, value in {**varying, (3, 0, 1, False): -0.4}.items():
         shared[len(TERMS) + VARIATIONS.index(variation)] = value
-    return replace(sensed_model(shared, SENSORS, DECLARED, 4.0), **changed)
+    return replace(sensed_model(shared, PLACES, DECLARED, 4.0), **changed)
 
 
 MODELS: Mapping[str, Callable[[], FieldModel]] = MappingProxyType(

@@ -11,15 +11,22 @@ from pdeloop.method.models.sensed import Actuators, SensedModel
 SENSORS = 8
 
 
+def places_of(sensors: int) -> Array:
+    return (np.arange(sensors) + 0.5) / sensors
+
+
+PLACES = places_of(SENSORS)
+
+
 def equally_spaced(n_a: int) -> Actuators:
     return Actuators((np.arange(n_a) + 0.5) / n_a, np.zeros(n_a))
 
 
 def readings_of(model: SensedModel, actions: Array, field: Array) -> Array:
     """(T, n_y), from an initial field."""
-    z, seen, every = field[None], [], model.n_z // model.sensors
+    z, seen = field[None], []
     for action in actions:
-        seen.append(z[0, every // 2 :: every])
+        seen.append(model.observation @ z[0])
         z = model.step(z, action[None])
     return np.array(seen)
 

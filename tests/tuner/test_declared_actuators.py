@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Methods are told of actuators where the plant has them."""
+"""Methods are told of actuators and sensors where the plant has them."""
 
 from __future__ import annotations
 
@@ -135,3 +135,17 @@ def test_a_plant_whose_field_is_never_modelled_between_sensors_is_not_asked() ->
     ):
         problem = pdeloop.problem(plant=Nowhere(), sensors=SENSORS, **given)
         assert not remarks_on(problem.values)
+
+
+@pytest.mark.parametrize("sensors", [6, 7, 8])
+def test_sensors_are_declared_where_the_plant_reads(sensors: int) -> None:
+    """Six sensors of 64 points are not equally spaced."""
+    problem = pdeloop.problem("kdv", sensors=sensors, n_z=64)
+    settings, plant = build_training(problem.values).settings, problem.plant()
+    x = np.arange(64) / 64
+    field = np.cos(2.0 * np.pi * x) + np.sin(6.0 * np.pi * x)
+    places = np.array(settings.sensor_positions)
+    expected = np.cos(2.0 * np.pi * places) + np.sin(6.0 * np.pi * places)
+    np.testing.assert_allclose(field[plant.positions], expected, atol=1e-12)
+    equal = (np.arange(sensors) + 0.5) / sensors
+    assert np.array_equal(places, equal) == (sensors == 8)

@@ -89,7 +89,8 @@ def test_of_sensors_are_the_newest_ones() -> None:
     """Earlier readings of the same sensors follow in a state, and are no other ones."""
     newest = noise(field(3), 0.05)
     older = np.vstack([newest[:1], newest[:-1]])
-    training = training_of(np.hstack([newest, older]), n_z=256, sensors=N, sensor_delays=2)
+    sensors = {"n_z": 256, "grid": "", "sensors": N, "sensor_delays": 2}
+    training = training_of(np.hstack([newest, older]), **sensors)
     assert seeming_noise(training, 0) == pytest.approx(0.05, rel=0.1)
 
 

@@ -154,8 +154,9 @@ class Context:
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown.
     sensors : int
-        n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
-        consist; 0: the states are whole.
+        n_y, point sensors, of whose last readings the states consist; 0: the states are whole.
+    sensor_positions : sequence of float
+        Of each as a share of a periodic domain; none: at (j + 1/2) / n_y.
     actuator_positions : sequence of float
         Centres of the actuators as shares of the domain; none: equally spaced.
     actuator_widths : sequence of float
@@ -186,6 +187,7 @@ class Context:
     action_set: ActionSet = ANY_ACTION
     noise: float = 0.0
     sensors: int = 0
+    sensor_positions: Sequence[float] = ()
     actuator_positions: Sequence[float] = ()
     actuator_widths: Sequence[float] = ()
     periodic: bool = True
@@ -247,6 +249,11 @@ class Context:
         cost = self.state_weight * np.sum(error * error)
         cost += self.action_weight * np.sum(actions * actions)
         return float(cost) / max(len(actions), 1)
+
+    @property
+    def places(self) -> Array:
+        """Of the sensors, (n_y,)."""
+        return np.array(self.sensor_positions or (np.arange(self.sensors) + 0.5) / self.sensors)
 
     def actuators(self, n_a: int) -> Actuators:
         """What is declared of the n_a actuators."""

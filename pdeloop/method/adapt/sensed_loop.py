@@ -118,10 +118,10 @@ class SensedLoop(LinearLoop):
         if record in known:  # each renewal and the verdict ask for all rollouts
             return known[record]
         if not len(record.actions) or not np.isfinite(record.states).all():
-            return interpolated(record.states[0]), np.inf
+            return interpolated(record.states[0], model.places), np.inf
         q, r = self.cost.size
-        of_cost = distance(record, q * (model.n_z // model.sensors), r, self.horizon)
-        target = self.target[model.seen]
+        of_cost = distance(record, q * model.n_z / len(model.places), r, self.horizon)
+        target = model.observation @ self.target
         given = record.acted_from, record.actions, target, of_cost, self.settings
         known[record] = initial_field(model, *given)
         return known[record]
@@ -168,6 +168,7 @@ def sensed_from(
     found = fit_sensed(
         [record.acted_from for record in chosen],
         [record.actions for record in chosen],
+        context.places,
         actuators,
         context.noise,
         start=None if before is None else (before.shared, before.spread),
@@ -179,7 +180,7 @@ def sensed_from(
         return None
     model = sensed_model(
         found.shared,
-        context.sensors,
+        context.places,
         actuators,
         _EXTRAPOLATION * float(np.abs(found.fields).max()),
         context.field_models,
@@ -191,10 +192,10 @@ def sensed_from(
 def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
     """The model under laws with an observer of the readings."""
     assert isinstance(context.law, Observer)
-    target = interpolated(context.target)
+    target = interpolated(context.target, model.places)
     return SensedLoop(
-        model.at_sensors(context.U),
-        context.plain(target, context.state_weight * model.sensors / model.n_z),
+        model.observation.T @ context.U,
+        context.plain(target, context.state_weight * len(model.places) / model.n_z),
         context.action_set,
         model=model,
         noise=model.noise,
@@ -217,7 +218,7 @@ def from_estimates(of_fields: Act, known: SensedFilter, sigma: float) -> Act:
         x, S = estimate
         lost = ~np.isfinite(x).all(axis=1)
         x[lost], S[lost] = 0.0, 0.0
-        seen = z[:, known.model.seen]
+        seen = z @ known.model.observation.T
         x, S = estimate = known.measured(x, S, seen + sigma * rng.standard_normal(seen.shape))
         a = of_fields(x, before, k)
         a[lost] = np.nan

@@ -59,14 +59,15 @@ class ExtendedKalman(Observer):
     def start(self) -> Parts:
         """The parts of `Observer`, and of the filter:
 
-        K_e (n_a, n); equation (44 + n_a,), centres (n_a,) and widths (n_a,), as for `SensedModel`;
-        integration (4,), its largest field, internal steps, their reach and its fastest growth; mean
-        (33,) and factor (33, 33) of initial fields; noise (1,), sigma.
+        K_e (n_a, n); equation (44 + n_a,), places (n_y,), centres (n_a,) and widths (n_a,), as for
+        `SensedModel`; integration (4,), its largest field, internal steps, their reach and its fastest
+        growth; mean (33,) and factor (33, 33) of initial fields; noise (1,), sigma.
         """
         n_a = self.n_a
         own = {
             "K_e": np.zeros((n_a, self.points)),
             "equation": np.zeros(unknowns(n_a)),
+            "places": np.zeros(len(self.model.U)),
             "centres": np.zeros(n_a),
             "widths": np.zeros(n_a),
             "integration": np.zeros(4),
@@ -82,8 +83,8 @@ class ExtendedKalman(Observer):
 
     def filter(self, theta: Parts) -> SensedFilter | None:
         """The filter in theta; None where its equation cannot be integrated."""
-        names = "equation", "centres", "widths", "integration", "mean", "factor", "noise"
-        return _filter(get_ident(), len(self.model.U), *(theta[name].tobytes() for name in names))
+        names = "equation", "places", "centres", "widths", "integration", "mean", "factor", "noise"
+        return _filter(get_ident(), *(theta[name].tobytes() for name in names))
 
     def theta_of(
         self, K: Array, b: Array, known: SensedFilter, settings: FieldModelSettings
@@ -98,6 +99,7 @@ class ExtendedKalman(Observer):
             "K_e": K,
             "b": b,
             "equation": model.shared,
+            "places": model.places,
             "centres": model.actuators.centres,
             "widths": model.actuators.widths,
             "integration": np.array(
@@ -148,8 +150,8 @@ class ExtendedKalman(Observer):
 
 # Every step of an episode asks for it. One thread at a time may use a model.
 @lru_cache(maxsize=64)
-def _filter(thread: int, sensors: int, *parts: bytes) -> SensedFilter | None:
-    shared, centres, widths, integration, mean, factor, noise = map(np.frombuffer, parts)
+def _filter(thread: int, *parts: bytes) -> SensedFilter | None:
+    shared, places, centres, widths, integration, mean, factor, noise = map(np.frombuffer, parts)
     largest, substeps, reach, growth = integration.tolist()
     actuators, first = Actuators(centres, np.abs(widths)), factor.reshape(FIELD_COEFFICIENTS, -1)
     try:
@@ -160,7 +162,7 @@ def _filter(thread: int, sensors: int, *parts: bytes) -> SensedFilter | None:
             sensed_growth=growth,
         )
         with np.errstate(all="ignore"):
-            model = sensed_model(shared, sensors, actuators, largest, settings)
+            model = sensed_model(shared, places, actuators, largest, settings)
             model.step(np.zeros((1, model.n_z)), np.zeros((1, model.n_a)))
     except (ValueError, ZeroDivisionError, OverflowError):
         return None

@@ -285,7 +285,7 @@ class PredictiveKalman(Predictive):
         model = self.planner(theta).model if theta["plan"].any() else None
         if not isinstance(model, SensedModel):
             return z
-        return self.kalman.prediction(self._split(memory)[0])[model.seen]
+        return model.observation @ self.kalman.prediction(self._split(memory)[0])
 
 
 class AutoKalman(PredictiveKalman):

@@ -43,7 +43,6 @@ from functools import cached_property, lru_cache
 from typing import ClassVar
 
 import numpy as np
-import scipy  # whose transforms, a tenth of a start, load when they are used
 from numpy.typing import NDArray
 
 from pdeloop.messages.array_files import checked_array
@@ -127,19 +126,23 @@ _POINTS = 64  # of the grid, at least
 
 
 def grid_points(sensors: int) -> int:
-    """Number of grid points of the field, so that the sensors at (j + 1/2) / n_y are among them."""
+    """Number of grid points of the field, so that sensors at (j + 1/2) / n_y are among them."""
     return 2 * sensors * max(1, -(-_POINTS // (2 * sensors)))
 
 
-def interpolated(readings: Array) -> Array:
-    """The field (n,) of lowest wavenumbers with these readings (n_y,)."""
-    sensors = len(readings)
-    n = grid_points(sensors)
-    spectrum = scipy.fft.rfft(readings)
-    if sensors % 2 == 0:  # half of its last wavenumber is that of minus the wavenumber
-        spectrum[-1] *= 0.5
-    field: Array = scipy.fft.irfft(spectrum / (sensors / n), n=n)
-    return np.roll(field, n // (2 * sensors))
+def interpolated(readings: Array, places: Array) -> Array:
+    """The field (n,) of lowest wavenumbers with these readings (n_y,) of sensors at places (n_y,)."""
+    n = grid_points(len(places))
+    grid, known = (_waves(at, len(places) // 2) for at in (np.arange(n) / n, places))
+    field: Array = grid @ np.linalg.lstsq(known, readings)[0]
+    return field
+
+
+def _waves(places: Array, most: int) -> Array:
+    """1, and sqrt(2) times the cosines and sines up to this wavenumber, (places, 1 + 2 most)."""
+    phase = 2.0 * np.pi * places[:, None] * np.arange(1, most + 1)
+    waves = np.sqrt(2.0) * np.hstack([np.cos(phase), np.sin(phase)])
+    return np.hstack([np.ones((len(places), 1)), waves])
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,33 +169,30 @@ class Actuators:
 
 @dataclass(frozen=True, eq=False)
 class SensedModel(SpectralModel):
-    """The equation on a grid of which every so many points are sensors, n_y in all.
+    """The equation on a grid between n_y sensors.
 
-    shared (44 + n_a,): its unknowns, in their units; noise: standard deviation of the unpredicted part
-    of a reading, including noise; spread (33,): those of the Fourier coefficients of an initial field,
-    its mean, cosines, sines; largest: largest |z| that is simulated.
+    shared (44 + n_a,): its unknowns, in their units; places (n_y,): of the sensors; noise: standard
+    deviation of the unpredicted part of a reading, including noise; spread (33,): those of the Fourier
+    coefficients of an initial field, its mean, cosines, sines; largest: largest |z| that is simulated.
     """
 
     FORM = "sensed"
-    OWN: ClassVar = {"shared": "u", "sensors": "i:", "noise": "", "spread": "33", "largest": ""}
+    OWN: ClassVar = {"shared": "u", "places": "y", "noise": "", "spread": "33", "largest": ""}
     shared: Array = field(kw_only=True)
     actuators: Actuators = field(kw_only=True)
-    sensors: int = field(kw_only=True)
+    places: Array = field(kw_only=True)
     noise: float = field(default=0.0, kw_only=True)
     spread: Array = field(default_factory=lambda: np.ones(1 + 2 * WAVES), kw_only=True)
     largest: float = field(default=0.0, kw_only=True)
 
-    @property
-    def seen(self) -> slice:
-        """The grid points that are sensors."""
-        every = self.n_z // self.sensors
-        return slice(every // 2, None, every)
-
-    def at_sensors(self, rows: Array) -> Array:
-        """Rows (n_y, m) of the sensors as rows of the grid, (n_z, m), zero elsewhere."""
-        found = np.zeros((self.n_z, rows.shape[1]))
-        found[self.seen] = rows
-        return found
+    @cached_property
+    def observation(self) -> Array:
+        """H (n_y, n): readings of fields on the grid, interpolated by their waves."""
+        n = self.n_z
+        off = np.pi * (self.places[:, None] - np.arange(n) / n)
+        with np.errstate(all="ignore"):
+            H = np.sin(n * off) / (n * np.tan(off))
+        return np.where(np.abs(np.sin(off)) < 1e-12, 1.0, np.round(H, 12))
 
     def arrays(self) -> Arrays:
         own = {name: np.asarray(getattr(self, name)) for name in self.OWN}
@@ -201,10 +201,10 @@ class SensedModel(SpectralModel):
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> SensedModel:
         whole = SpectralModel.from_arrays(arrays)
-        sensors = int(checked_array(arrays, "sensors", "i", ()))
+        own = shaped(arrays, cls.OWN)
+        sensors = len(own["places"])
         if not 1 <= sensors <= whole.n_z or whole.n_z != grid_points(sensors):
             raise ValueError(f"a model of {whole.n_z} points has {sensors} sensors")
-        own = shaped(arrays, cls.OWN)
         own["shared"] = checked_array(arrays, "shared", "f", (unknowns(whole.n_a),))
         size = (whole.n_a,)
         where = {name: checked_array(arrays, name, "f", size) for name in ("centres", "widths")}
@@ -217,14 +217,14 @@ class SensedModel(SpectralModel):
 
 def sensed_model(
     shared: Array,
-    sensors: int,
+    places: Array,
     actuators: Actuators,
     largest: float,
     settings: FieldModelSettings = DEFAULTS,
     noise: float = 0.0,
 ) -> SensedModel:
-    """The equation on the grid for this many sensors; settings: how internal steps follow `largest`."""
-    n = grid_points(sensors)
+    """The equation on the grid for these sensors; settings: how internal steps follow `largest`."""
+    n = grid_points(len(places))
     equation = SensedEquation(shared, n, actuators, settings)
     symbols, followed = equation.symbols, equation.followed(largest)
     substeps = substeps_of(followed, largest, settings)
@@ -249,7 +249,7 @@ def sensed_model(
         coefficients=equation.coefficients,
         shared=shared,
         actuators=actuators,
-        sensors=sensors,
+        places=places,
         noise=noise,
         largest=largest,
     )
@@ -436,10 +436,10 @@ class SensedFilter:
 
     def measured(self, x: Array, S: Array, y: Array) -> tuple[Array, Array]:
         """After a reading: x (M, n), S (M, 33, n) and y (M, n_y)."""
-        seen, sigma = self.model.seen, self.sigma
-        H = S[:, :, seen] / sigma
+        seen, sigma = self.model.observation.T, self.sigma
+        H = S @ seen / sigma
         G = H.swapaxes(1, 2) @ H
-        missed = (y - x[:, seen]) / sigma
+        missed = (y - x @ seen) / sigma
         # What has overflowed stays so: LAPACK takes finite numbers only.
         lost = ~(np.isfinite(G).all(axis=(1, 2)) & np.isfinite(missed).all(axis=1))
         H[lost], G[lost], missed[lost] = 0.0, 0.0, 0.0

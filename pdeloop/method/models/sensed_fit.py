@@ -238,6 +238,7 @@ class Fitted:
 def fit_sensed(
     readings: Sequence[Array],
     actions: Sequence[Array],
+    places: Array,
     actuators: Actuators,
     noise: float = 0.0,
     start: tuple[Array, Array] | None = None,
@@ -247,13 +248,13 @@ def fit_sensed(
 ) -> Fitted:
     """Fit the equation and the initial fields of rollouts of one length.
 
-    readings (T, n_y), actions (T, n_a): y_k and a_k of each; noise: standard deviation of that on
-    every reading; start: unknowns (44 + n_a,) of an earlier equation and its S (33,), to begin with in
-    place of none; target (n_y,): z_r at the sensors; distances (rollouts,): d of each, NaN where it is
-    not known.
+    readings (T, n_y), actions (T, n_a): y_k and a_k of each; places (n_y,): of the sensors; noise:
+    standard deviation of that on every reading; start: unknowns (44 + n_a,) of an earlier equation and
+    its S (33,), to begin with in place of none; target (n_y,): z_r at the sensors; distances
+    (rollouts,): d of each, NaN where it is not known.
     """
     data = _Data(
-        np.stack(readings), np.stack(actions), actuators, noise, target, distances, settings
+        np.stack(readings), np.stack(actions), places, actuators, noise, target, distances, settings
     )
     if start is not None and (fit := _continued(data, *start)).reproduces:
         return fit.found
@@ -321,7 +322,7 @@ def initial_field(
     """
     y, a, d = readings[None], actions[None], np.array([distance])
     exact = replace(settings, sensed_unresolved=0.0)  # the model's noise has that in it
-    data = _Data(y, a, model.actuators, model.noise, target, d, exact)
+    data = _Data(y, a, model.places, model.actuators, model.noise, target, d, exact)
     fit = _Fit(data, (), False, model.shared, model.spread, known=True)
     for m in (data.lengths[:_EARLY][-1], data.steps):
         fit.descend(m)
@@ -336,6 +337,7 @@ class _Data:
         self,
         y: Array,
         a: Array,
+        places: Array,
         actuators: Actuators,
         noise: float,
         target: Array | None,
@@ -343,6 +345,7 @@ class _Data:
         settings: FieldModelSettings,
     ) -> None:
         self.readings, self.actions, self.actuators, self.settings = y, a, actuators, settings
+        self.places = places
         self.rollouts, self.steps, sensors = y.shape
         # Readings that a law brings to the target say little of the size of the field before.
         self.size = float(np.sqrt(max(np.mean(y * y), np.mean(y[:, 0] ** 2)))) or 1.0
@@ -354,12 +357,13 @@ class _Data:
         near = np.pad(np.abs(y).max(axis=(0, 2)), _NEAR, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1)
         self.sizes, self.clip = _MARGIN * windows.max(axis=1), _CLIP * float(near.max())
-        waves, places = np.arange(self.n // 2 + 1), (np.arange(sensors) + 0.5) / sensors
+        waves = np.arange(self.n // 2 + 1)
         # Of the two planes of a spectrum: the field at the sensors, and its mean square.
         self.mean_square = np.tile(np.where((waves == 0) | (waves == self.n // 2), 1.0, 2.0), 2)
         phase = 2 * np.pi * waves[:, None] * places
         self.read = np.vstack([np.cos(phase), -np.sin(phase)]) * self.mean_square[:, None]
-        aim = np.fft.rfft(interpolated(np.zeros(sensors) if target is None else target)) / self.n
+        given = np.zeros(sensors) if target is None else target
+        aim = np.fft.rfft(interpolated(given, places)) / self.n
         self.target = np.concatenate([aim.real, aim.imag])
         self.distances = np.full(len(y), np.nan)
         if target is not None and distances is not None:
@@ -376,7 +380,7 @@ class _Data:
             np.concatenate([own[:, k : k + m] for k in range(0, self.steps - m + 1, m)])
             for own in (self.readings, self.actions)
         )
-        return _Data(y, a, self.actuators, self.noise, None, None, self.settings)
+        return _Data(y, a, self.places, self.actuators, self.noise, None, None, self.settings)
 
     @property
     def instability(self) -> Array:
