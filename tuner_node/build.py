@@ -24,7 +24,7 @@ from pdeloop.method.adapt.trajectories import LARGE, InCoordinates, is_large
 from pdeloop.method.laws import Affine, Law
 from pdeloop.method.laws.linear import Extended
 from pdeloop.method.laws.neural import Neural
-from pdeloop.method.laws.predictive import Predictive, PredictiveKalman
+from pdeloop.method.laws.predictive import AutoKalman, Predictive, PredictiveKalman
 from pdeloop.method.laws.registry import law_kind
 from pdeloop.method.method_settings import field_model_settings
 from pdeloop.method.models.sensed import SENSED_MOST
@@ -155,18 +155,9 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
                 f"the law '{law.name}' plans from an estimate of the field between few sensors, but "
                 "the whole state is measured; give --law predictive"
             )
-        if estimates and not between_sensors(values):
-            raise ParameterError(
-                f"the law '{law.name}' plans on the equation of a field of one component on a periodic "
-                f"axis, between at most {SENSED_MOST} sensors of which only the last readings are "
-                "known; give --law extended_kalman"
-            )
-        cost = Cost.parse(values["cost"])
-        if estimates and not (cost is None or cost.plain):
-            raise ParameterError(
-                f"the law '{law.name}' plans between few sensors only for a constant target and "
-                "weights q and r, but the plant has another cost; give --law extended_kalman"
-            )
+        unplanned = _unplanned_readings(values) if estimates else ""
+        if unplanned and not law.worth:
+            raise ParameterError(f"the law '{law.name}' {unplanned}; give --law extended_kalman")
         if law.settings.steps > values["horizon"]:
             raise ParameterError(
                 f"parameter 'law_settings.steps' is {law.settings.steps}; expected at most the steps "
@@ -178,6 +169,22 @@ def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
             "use; give --law extended_kalman, or another identification"
         )
     return law
+
+
+def _unplanned_readings(values: Mapping[str, Any]) -> str:
+    """What keeps a law from planning between few sensors; empty if nothing does."""
+    if not between_sensors(values):
+        return (
+            "plans on the equation of a field of one component on a periodic axis, between at most "
+            f"{SENSED_MOST} sensors of which only the last readings are known"
+        )
+    cost = Cost.parse(values["cost"])
+    if not (cost is None or cost.plain):
+        return (
+            "plans between few sensors only for a constant target and weights q and r, but the plant "
+            "has another cost"
+        )
+    return ""
 
 
 def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[float]]:
@@ -210,7 +217,12 @@ def declared_actuators(values: Mapping[str, Any]) -> tuple[list[float], list[flo
 
 def remarks_on(values: Mapping[str, Any]) -> list[str]:
     """What to say before a training with these parameters begins."""
-    return [*_following_remarks(values), *_resting_remarks(values), *_sensor_remarks(values)]
+    return [
+        *_following_remarks(values),
+        *_resting_remarks(values),
+        *_planning_remarks(values),
+        *_sensor_remarks(values),
+    ]
 
 
 def _following_remarks(values: Mapping[str, Any]) -> list[str]:
@@ -242,6 +254,14 @@ def _resting_remarks(values: Mapping[str, Any]) -> list[str]:
         f"no admissible action reaches the action_target of {names}, {aims}: the nearest is {ends}; "
         "give one within action_low and action_high, or other bounds"
     ]
+
+
+def _planning_remarks(values: Mapping[str, Any]) -> list[str]:
+    """What keeps the law `auto` from planning between few sensors."""
+    if law_of(values, kind_of(values)) is not AutoKalman:
+        return []
+    unplanned = _unplanned_readings(values)
+    return [f"the law 'auto' {unplanned}, so extended_kalman is trained"] if unplanned else []
 
 
 def _sensor_remarks(values: Mapping[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -39,7 +40,7 @@ from tests.support.estimated import (
     rows_of,
 )
 from tests.support.small import same_bits
-from tuner_node.build import kind_of, law_of
+from tuner_node.build import kind_of, law_of, remarks_on
 
 Array = np.ndarray
 RNG = np.random.default_rng(4)
@@ -207,14 +208,44 @@ def test_a_law_that_plans_has_the_one_of_few_sensors_in_its_place() -> None:
         pdeloop.train("burgers", law="predictive_kalman")
     with pytest.raises(ParameterError, match="plans from the whole state, but 8 sensors"):
         pdeloop.train("burgers", law="predictive", sensor_delays=2, **few)
-    with pytest.raises(ParameterError, match="on a periodic axis, between at most 32 sensors"):
-        pdeloop.train("burgers", law="auto", sensors=40, n_z=64)
-    moving = np.linspace(0.0, 1.0, 31)[:, None] * np.ones(64)
-    for law, cost in (("auto", {"target": moving}), ("predictive", {"state_weight": np.eye(64)})):
-        problem = pdeloop.problem("burgers", cost=cost, horizon=30, **few)
-        with pytest.raises(
-            ParameterError, match="constant target and weights q and r, but the plant"
-        ):
-            pdeloop.train(problem, law=law)
+    unequal, moving = (
+        np.diag(np.arange(1.0, 65.0)),
+        np.linspace(0.0, 1.0, 31)[:, None] * np.ones(64),
+    )
+    costs = {"target": moving}, {"state_weight": unequal}
+    cases: list[tuple[str, dict[str, Any]]] = [
+        ("on a periodic axis, between at most 32 sensors", {"sensors": 40, "n_z": 64}),
+        *(("constant target and weights", {"cost": own, "horizon": 30, **few}) for own in costs),
+    ]
+    for why, how in cases:
+        with pytest.raises(ParameterError, match=f"{why}.*; give --law extended_kalman"):
+            pdeloop.train(pdeloop.problem("burgers", **how), law="predictive")
+        told = remarks_on(pdeloop.problem("burgers", law="auto", **how).values)
+        assert any(re.search(f"{why}.*, so extended_kalman is trained", own) for own in told)
     values = pdeloop.problem("burgers", law="auto", cost={"target": 0.5}, **few).values
     assert law_of(values, kind_of(values)).name == "auto_kalman"
+
+
+class Rod(pdeloop.Dynamics):
+    """A rod that two heaters warm, with weights that differ from place to place."""
+
+    n_z, n_a, horizon, action_weight = 12, 2, 30, 0.1
+    state_weight = np.diag(np.linspace(1.0, 2.0, 12))
+    A = 0.4 * np.eye(12) + 0.29 * (np.eye(12, k=1) + np.eye(12, k=-1))
+    B = np.eye(12)[:, [3, 8]]
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return rng.normal(1.0, 0.2, 12)
+
+    def step(self, z: Array, a: Array) -> Array:
+        return self.A @ z + self.B @ a
+
+
+def test_where_nothing_can_be_planned_auto_trains_the_law_without_plans() -> None:
+    how: dict[str, Any] = {"sensors": 4, "rollouts": 16, "evaluation_fields": 2}
+    auto, plain = (
+        pdeloop.train(plant=Rod(), law=law, **how) for law in ("auto", "extended_kalman")
+    )
+    assert plain.costs["adapted"].mean() < plain.costs["lqt"].mean() < plain.costs["none"].mean()
+    for kind, costs in plain.costs.items():
+        assert same_bits(auto.costs[kind], costs)
