@@ -256,12 +256,8 @@ def fit_sensed(
     data = _Data(
         np.stack(readings), np.stack(actions), places, actuators, noise, target, distances, settings
     )
-    if start is not None:
-        fit = _continued(data, *start)
-        if fit.lost and fit.shared[_INSTABILITY[1]]:  # more rollouts may tell another equation
-            fit = min(fit, _of_pieces(data), key=lambda own: own.error(own.data.steps))
-        if fit.reproduces:
-            return fit.found
+    if start is not None and (fit := _continued(data, *start)).reproduces:
+        return fit.found
     first, best = _of_first_terms(data)
     for library, unequal, least in _LIBRARIES[1:]:
         error = best.error(data.steps)
@@ -276,22 +272,12 @@ def fit_sensed(
 
 
 def _continued(data: _Data, shared: Array, spread: Array) -> _Fit:
-    """A fit of the terms of an equation that begins with it.
-
-    If long waves grow: from the fields that the equation itself suggests where these leave nothing
-    unexplained, as short parts could lead away from it.
-    """
+    """A fit of the terms of an equation that begins with it."""
     own = np.flatnonzero(shared[:EQUATION]).tolist()
     fit = _Fit(data, own, bool(shared[SHARED:].any()), shared, spread)
-    if _INSTABILITY[1] not in own:
-        return fit.fitted()
-    # Rates that nearly cancel are larger than those of other equations.
-    fit.deviations = np.maximum(fit.deviations, np.abs(shared[fit.varied]))
-    kept = _Fit(data, (), False, shared, spread, known=True).over_parts(data.lengths)
-    if kept.error(data.steps) > data.unexplained:
-        return fit.fitted()
-    fit.fields = kept.fields
-    return fit.finished()
+    if _INSTABILITY[1] in own:  # rates that nearly cancel are larger than those of other equations
+        fit.deviations = np.maximum(fit.deviations, np.abs(shared[fit.varied]))
+    return fit.fitted()
 
 
 def _of_pieces(data: _Data) -> _Fit:
@@ -338,7 +324,8 @@ def initial_field(
     exact = replace(settings, sensed_unresolved=0.0)  # the model's noise has that in it
     data = _Data(y, a, model.places, model.actuators, model.noise, target, d, exact)
     fit = _Fit(data, (), False, model.shared, model.spread, known=True)
-    fit.over_parts((data.lengths[:_EARLY][-1], data.steps))
+    for m in (data.lengths[:_EARLY][-1], data.steps):
+        fit.descend(m)
     field: Array = field_of(fit.fields, data.n)[0]
     return field, fit.error(data.steps)
 
@@ -469,17 +456,7 @@ class _Fit:
                 most = min(most, _BEHIND * other.errors.get(m, np.inf))
             if self.errors[m] > most:
                 return self
-        return self.finished()
-
-    def over_parts(self, lengths: Sequence[int]) -> _Fit:
-        """This one, over parts of these lengths, one after the other."""
-        for m in lengths:
-            self.descend(m)
-        return self
-
-    def finished(self) -> _Fit:
-        """This one, over whole rollouts, and again with what it learns of the fields."""
-        data, self.sigma = self.data, self.data.sigma
+        self.sigma = data.sigma
         self.descend(data.steps)
         for _ in range(_AGAIN):
             before = self.spread
