@@ -56,7 +56,7 @@ def loop_of(model: SensedModel, n_s: int = 10) -> SensedLoop:
     U = rng.standard_normal((SENSORS, n_s))
     rows = rows_of(n_s, U)
     target, none = np.zeros(SENSORS), np.zeros((T, N_A))
-    explored = Trajectory(np.zeros((T + 1, SENSORS)), none)
+    explored = Trajectory(np.ones((T + 1, SENSORS)), none)
     context = Context(U, target, 1.0, 0.1, T, explored, sensors=SENSORS, law=Observer(rows, T))
     return sensed_loop(context, model)
 
@@ -68,3 +68,14 @@ def test_a_rollout_that_ended_early_begins_where_its_first_readings_say() -> Non
     )
     lost = Record(np.zeros(1), np.inf, readings, np.zeros((1, N_A)))
     assert same_bits(loop.beginnings([lost])[0], interpolated(readings[0], PLACES))
+
+
+def test_a_simulation_far_beyond_what_was_read_has_no_cost() -> None:
+    """Else a model that diverges without control would promise more than there is to save."""
+    field_of_ones = np.ones(loop_of(model_with(CUBIC, 0.0)).model.n_z)[None]
+    costs = []
+    for rate in (5.0, 60.0):  # the field grows to 3 and to 1.6e5 times what was read
+        loop = loop_of(model_with(equation(z1_x0=rate), 0.0))
+        costs.append(loop.costs(loop.no_control, field_of_ones)[0])
+    assert np.isfinite(costs[0])
+    assert costs[1] == np.inf

@@ -32,7 +32,7 @@ from pdeloop.method.adapt.improve import (
 from pdeloop.method.laws.extended_kalman import ExtendedKalman
 from pdeloop.method.laws.linear import Observer
 from pdeloop.method.laws.plans import Act, Planner, simulated
-from pdeloop.method.models.base import DEFAULTS, FieldModelSettings
+from pdeloop.method.models.base import DEFAULTS, FAR, FieldModelSettings
 from pdeloop.method.models.sensed import (
     SENSED_MOST,
     WAVES,
@@ -106,7 +106,7 @@ class SensedLoop(LinearLoop):
 
     def of_states(self, U: Array) -> ClosedLoop:
         """The same model under laws a = K U^T z + b of its states."""
-        return ClosedLoop(U, self.cost, self.action_set, model=self.model)
+        return ClosedLoop(U, self.cost, self.action_set, model=self.model, reach=self.reach)
 
     def beginnings(self, records: Sequence[Record]) -> Array:
         """The initial field of each rollout, as its readings tell it."""
@@ -200,6 +200,7 @@ def sensed_loop(context: Context, model: SensedModel) -> SensedLoop:
         model=model,
         noise=model.noise,
         law=context.law,
+        reach=FAR * context.largest,
         settings=context.field_models,
     )
 
